@@ -1,11 +1,11 @@
 """Signed distances between convex shapes, the points where they are nearest, and the direction between them.
 
-A shape is a core, which is a segment or a polytope, and a radius around it; or a half-space. Distances are negative
-where shapes overlap: minus the shortest way apart. The cores of capsules have a closed form. Of polytopes, the best of
-the separating axes tells how deep they overlap; the search of Gilbert, Johnson and Keerthi finds the nearest points.
+A shape is a core (a segment or a polytope) with a radius around it, or a half-space. If shapes overlap, the distance is
+negative: minus the shortest translation that separates them. Capsules have a closed form. For polytopes, the best
+separating axis gives the depth of an overlap, and the algorithm of Gilbert, Johnson and Keerthi the nearest points.
 
-What depends on iterations are integers alone: which vertices the nearest points lie between. The points are functions
-of those vertices, and derivatives are theirs.
+The iterations determine integers alone: the vertices between which the nearest points lie. The points, and their
+derivatives, are functions of these vertices.
 """
 
 from __future__ import annotations
@@ -84,10 +84,10 @@ def from_plane(point: Float[Array, "3"], normal: Float[Array, "3"], b: Core) -> 
 def between_polytopes(a: Core, b: Core, *, rounds: int = 1) -> Nearest:
     """Return the separation of two cores, at least one of which has faces.
 
-    Where they overlap, b is moved out along the best separating axis, by a little more than it takes, and the nearest
-    points of the two are then looked for. Exact if ``normals`` and ``edges`` are all there are. With edges left out the
-    depth is overestimated where edges cross; each further round improves on that. In an overlap, derivatives of
-    ``normal`` and of the points, so second derivatives of the distance, take the points as fixed to the shapes.
+    If they overlap, b is first moved out along the best separating axis, slightly farther than necessary. The answer is
+    exact if ``normals`` and ``edges`` are complete. If edges are missing, the depth is overestimated where edges cross;
+    each further round improves it. In an overlap, derivatives of ``normal`` and of the points (so second derivatives
+    of the distance) take the points as fixed to the shapes.
 
     Args:
         a: the first.
@@ -128,7 +128,7 @@ def between_polytopes(a: Core, b: Core, *, rounds: int = 1) -> Nearest:
 
 
 class _Apart(NamedTuple):
-    """A direction in which two polytopes, the second one shifted, are apart, and the vertices that are nearest then."""
+    """Separating direction of two polytopes, the second one shifted, and the vertices nearest to each other then."""
 
     axis: Float[Array, "3"]
     separation: Float[Array, ""]
@@ -145,7 +145,7 @@ def _rounded(
     radius_b: Float[Array, ""],
     otherwise: Float[Array, "3"],
 ) -> Nearest:
-    """Return the separation of two balls; ``otherwise`` is the normal where their centres coincide."""
+    """Return the separation of two balls; ``otherwise`` is the normal if their centres coincide."""
     way = on_b - on_a
     normal, apart = _unit(way, otherwise), _length(way)
     return Nearest(apart - radius_a - radius_b, on_a + radius_a * normal, on_b - radius_b * normal, normal)
@@ -163,7 +163,7 @@ def _segment_parameters(
 
 
 def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[Array, Array]:
-    """Return the same of any number of pairs, from the products of the two and of each with the offset."""
+    """Return these parameters for any number of pairs, from the dot products of ``_segment_parameters``."""
     square = aa * bb - ab * ab
     parallel = square <= PARALLEL * aa * bb
     crossing = jnp.clip(_over(ab * bo - ao * bb, jnp.where(parallel, 0.0, square)), 0.0, 1.0)
@@ -174,9 +174,9 @@ def _parameters(aa: Array, bb: Array, ab: Array, ao: Array, bo: Array) -> tuple[
 
 
 def _across(a: Float[Array, "3"], b: Float[Array, "3"], outward: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Return a unit vector perpendicular to two directions, as far outward as may be; any, where there is none.
+    """Return a unit vector perpendicular to two directions, on the outward side; if they are parallel, any one.
 
-    Constant.
+    Its derivative is 0.
     """
     a, b, outward = jax.lax.stop_gradient((a, b, outward))
     longer = jnp.where(_dot(a, a) >= _dot(b, b), a, b)
@@ -187,7 +187,7 @@ def _across(a: Float[Array, "3"], b: Float[Array, "3"], outward: Float[Array, "3
 
 
 def _axes(a: Core, b: Core) -> Float[Array, "k 3"]:
-    """Return directions, or opposites, along which convex polytopes that do not overlap are apart; some may be 0."""
+    """Return the candidates for a separating axis of two convex polytopes, each up to its sign; unused rows are 0."""
     crossed = cross(a.edges[:, None], b.edges[None]).reshape(-1, 3)
     lengths = jax.vmap(_length)(a.edges)[:, None] * jax.vmap(_length)(b.edges)
     tiny = jax.vmap(_length)(crossed) <= PARALLEL * lengths.reshape(-1)
@@ -198,7 +198,7 @@ def _axes(a: Core, b: Core) -> Float[Array, "k 3"]:
 def _best_axis(
     a: Float[Array, "v 3"], b: Float[Array, "w 3"], axes: Float[Array, "k 3"]
 ) -> tuple[Int[Array, ""], Float[Array, ""]]:
-    """Return the axis along which b is furthest out, k more if against it; and how far b is out."""
+    """Return the index of the axis that separates b from a most (plus k for the opposite direction), and the gap."""
     along_a, along_b = (_dot(points[:, None], axes) for points in (a, b))
     ahead = jnp.min(along_b, 0) - jnp.max(along_a, 0)
     behind = jnp.min(along_a, 0) - jnp.max(along_b, 0)
@@ -213,7 +213,7 @@ def _signed(axes: Float[Array, "k 3"], best: Int[Array, ""]) -> Float[Array, "3"
 
 
 def _margin(a: Float[Array, "v 3"], b: Float[Array, "w 3"]) -> Float[Array, ""]:
-    """Return a distance that is small against the shapes and large against rounding."""
+    """Return a distance that is small relative to the shapes and large relative to rounding."""
     size = jnp.max(jnp.abs(a - a[0])) + jnp.max(jnp.abs(b - b[0]))
     return jnp.finfo(a.dtype).eps ** 0.4 * size
 
@@ -248,7 +248,7 @@ def _search(a: Float[Array, "v 3"], b: Float[Array, "w 3"]) -> tuple[Int[Array, 
 
 
 class _Search(NamedTuple):
-    """Four vertices of each shape, repeated where fewer count; the nearest point of their differences to 0."""
+    """Four vertices of each shape (repeated if fewer are used), and the point of their differences nearest to 0."""
 
     ids_a: Int[Array, "4"]
     ids_b: Int[Array, "4"]

@@ -125,7 +125,7 @@ def convex_hull(points: np.ndarray) -> UnitCore:
 
 
 def mesh_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
-    """Return the hull of a mesh geom: MuJoCo's own, so no finer than its ``maxhullvert``, where it has one."""
+    """Return the hull of a mesh geom: MuJoCo's own if it has one, so no finer than its ``maxhullvert``."""
     mesh = model.geom_dataid[geom]
     start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     points = model.mesh_vert[start : start + count]
@@ -144,7 +144,7 @@ def _qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
 
 
 def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
-    """Return the hull of ``MOST_VERTICES`` of these vertices, chosen so that the others are little outside it."""
+    """Return the hull of ``MOST_VERTICES`` of these vertices, chosen so that the others are only slightly outside."""
     chosen = scipy.spatial.ConvexHull(points, qhull_options=f"TA{_FIRST_VERTICES}").vertices
     hull = _qhull(points[chosen])
     while len(chosen) < MOST_VERTICES:
@@ -188,12 +188,12 @@ def _squares_to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray
 
 @cache
 def _spread_normals() -> np.ndarray:
-    """Return 40 directions all around, as the faces of the polyhedron of an ellipsoid have them."""
+    """Return 40 evenly spread directions: the face normals of the polyhedron that stands for an ellipsoid."""
     return _different(scipy.spatial.ConvexHull(_ball()).equations[:, :3])
 
 
 def padded(cores: Sequence[UnitCore]) -> UnitCore:
-    """Return the cores of one size, with a leading axis: short ones repeat their last rows; all have edges, or none."""
+    """Return the cores stacked and padded to one size by repeating rows; either all have edges or none has."""
     complete = all(len(core.edges) for core in cores)
     whole = [core if complete else core._replace(edges=np.zeros((0, 3))) for core in cores]
     array = jnp if any(isinstance(core.radius, jax.Array) for core in cores) else np
@@ -229,7 +229,7 @@ def world_cores(
 
 
 def unit_rows(rows: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
-    """Return the rows of length 1; those of length 0 stay so, with derivatives 0."""
+    """Return the rows scaled to length 1; rows of length 0 stay 0, with derivatives 0."""
     square = jnp.sum(rows * rows, -1, keepdims=True)
     is_zero = square == 0.0
     return jnp.where(is_zero, 0.0, rows / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
@@ -266,7 +266,7 @@ def _bent_edges(points: np.ndarray, ends: np.ndarray, normals: np.ndarray) -> np
 
 
 def _different(directions: np.ndarray) -> np.ndarray:
-    """Return unit vectors without those that repeat an earlier one or its opposite."""
+    """Return unit vectors without repetitions of an earlier vector or its opposite."""
     apart = np.linalg.norm(directions[:, None] - directions, axis=-1)
     opposite = np.linalg.norm(directions[:, None] + directions, axis=-1)
     repeats = np.tril(np.minimum(apart, opposite) <= _MERGED, -1).any(1)

@@ -1,4 +1,4 @@
-"""The convex hulls of the shapes that take part: of added shapes, of the model's meshes, and of files."""
+"""Convex hulls of the shapes of a collision limit: of added shapes, of the model's meshes, and of mesh files."""
 
 from __future__ import annotations
 

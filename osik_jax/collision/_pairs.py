@@ -20,16 +20,16 @@ Patterns = Iterable[tuple[str, str]]
 
 
 class Member(NamedTuple):
-    """One shape, as far as it is known before any number is.
+    """Static properties of one shape.
 
     Attributes:
-        name: its own.
-        aliases: the link and the moving body that it is fixed to, ``"world"`` for the world.
-        kind: None where no distance to it can be computed.
+        name: name of the shape.
+        aliases: names of the link and of the moving body that it is fixed to, ``"world"`` for the world.
+        kind: None if no distance to it can be computed.
         body: the moving body that it is fixed to.
         link: number of the model's body that it is fixed to.
         masks: MuJoCo's ``contype`` and ``conaffinity``; None: meets all.
-        added: whether it is an added shape, and no geom of the robot.
+        added: whether it is an added shape rather than a geom of the robot.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Member(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Return the shape's name for messages, with its link if the name alone does not tell it."""
+        """Return the shape's name for messages, with its link unless the name is that of the link."""
         return self.name if self.added or self.name in self.aliases else f"{self.name} (of {self.aliases[0]})"
 
     @property
@@ -56,7 +56,7 @@ def members(robot: Robot, shapes: Mapping[str, CollisionShape]) -> list[Member]:
 
     Raises:
         KeyError: a shape is fixed to a frame that does not exist.
-        ValueError: a shape is called like a geom.
+        ValueError: a shape has the name of a geom.
     """
     tree, model = robot.tree, robot.mj_model
     bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
@@ -90,13 +90,13 @@ def _link_of_frame(model: mujoco.MjModel, bodies: Sequence[str], frame: str | No
 def candidate_pairs(
     robot: Robot, scene: Sequence[Member], pairs: Patterns | None, exclude: Iterable[str | tuple[str, str]]
 ) -> list[tuple[int, int]]:
-    """Return the pairs of members that can move against each other, are no neighbours, and are asked for.
+    """Return the requested pairs of members that can move relative to each other and are not neighbours.
 
-    Pairs that ``pairs`` asks for by their names, not by a glob, may be neighbours, and the model may exclude them.
+    A pair that ``pairs`` gives by names rather than by a glob may be neighbours, or excluded by the model.
 
     Raises:
         KeyError: a pattern matches nothing.
-        ValueError: a geom that no distance can be computed to takes part, or nothing is left.
+        ValueError: no distance to a geom can be computed, or no pair is left.
     """
     pairs = None if pairs is None else _checked(pairs)
     wanted = _default_pairs(scene) if pairs is None else _named_pairs(scene, pairs)
@@ -156,7 +156,7 @@ def _meet(a: Member, b: Member) -> bool:
 
 
 def exact_pairs(scene: Sequence[Member], patterns: Patterns | None) -> set[tuple[int, int]]:
-    """Return the pairs that are asked for by their names, not by globs."""
+    """Return the pairs that are given by names, not by globs."""
     names = {name for member in scene for name in (member.name, *member.aliases)}
     return _named_pairs(scene, [pair for pair in patterns or () if names.issuperset(pair)])
 
@@ -178,9 +178,9 @@ def _excluded(scene: Sequence[Member], exclude: Iterable[str | tuple[str, str]])
 
 
 def _match(scene: Sequence[Member], pattern: str) -> list[int]:
-    """Return members called ``pattern``, or on a body or link called so, or else that match it as a glob.
+    """Return the members with this name or on the body or link of this name, else those that match it as a glob.
 
-    Of a body or link, those that are there to be met.
+    For a body or link, these are its solid members.
     """
     for fits in (str.__eq__, fnmatch.fnmatchcase):
         found = [
@@ -201,7 +201,7 @@ def _match(scene: Sequence[Member], pattern: str) -> list[int]:
 
 
 def _model_excludes(robot: Robot, scene: Sequence[Member]) -> set[tuple[int, int]]:
-    """Return the model's own ``<exclude>`` elements."""
+    """Return the pairs that the model's ``<exclude>`` elements name."""
     pairs = {frozenset(divmod(int(signature), 1 << 16)) for signature in robot.mj_model.exclude_signature}
     return {
         (i, j)
@@ -227,7 +227,7 @@ class _RigidParts:
         return self._part(member.body, member.link)
 
     def parent(self, part: int) -> int | None:
-        """Return the part that a moving part hangs from by its joints; None if that is the world, or if it is fixed."""
+        """Return the part to which the joints of a moving part connect it; None for the world, or for a fixed part."""
         return self._parents[part] if part > 0 else None
 
     def _part(self, body: int, link: int) -> int:
@@ -239,7 +239,7 @@ class _RigidParts:
 
 
 def _welds(tree: KinematicTree) -> list[int]:
-    """Return for each body the one that it cannot move against (locked joints do not move)."""
+    """Return for each body the body that it is rigidly attached to, through fixed and locked joints."""
     moving = {tree.joint_bodies[j] for j in range(len(tree.joint_names)) if j not in tree.locked}
     welds: list[int] = []
     for body, parent in enumerate(tree.body_parents):

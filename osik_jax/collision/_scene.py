@@ -1,4 +1,4 @@
-"""All pairs of shapes at once: grouped by what they are, each group one vectorised computation."""
+"""Distances of all pairs of shapes: grouped by kind, with one vectorised computation for each group."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ROUNDS = 4
 
 
 class Group(NamedTuple):
-    """Pairs that one computation does; ``first`` and ``second`` number the scene's shapes."""
+    """Pairs of one vectorised computation; ``first`` and ``second`` are indices of the scene's shapes."""
 
     first: tuple[int, ...]
     second: tuple[int, ...]
@@ -34,15 +34,15 @@ class Group(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The static half: which shapes there are and which of them are kept apart.
+    """Static structure: the shapes, and the pairs that are kept apart.
 
     Attributes:
-        names: of each shape that takes part.
-        kinds: of each.
-        bodies: the moving body that each is fixed to.
-        geoms: of those that are the robot's own, which come first, the number of the geom.
-        frames: of the others, the frame that each is fixed to.
-        hulls: of each, its place among the hulls; 0 for those that are none.
+        names: name of each shape.
+        kinds: kind of each shape.
+        bodies: index of the moving body that each shape is fixed to.
+        geoms: index of the geom of each shape of the robot; these shapes come first.
+        frames: index of the frame that each added shape is fixed to.
+        hulls: index of each shape among the convex hulls; 0 if it is not a hull.
         groups: the pairs.
     """
 
@@ -83,7 +83,7 @@ _RANKS = {Kind.PLANE: 0, Kind.SEGMENT: 1, Kind.BOX: 2, Kind.CYLINDER: 2, Kind.EL
 
 
 def grouped(kinds: Sequence[Kind], pairs: Sequence[tuple[int, int]]) -> tuple[Group, ...]:
-    """Return pairs by what computes them: few groups, because each is compiled separately."""
+    """Return the pairs grouped by their computation; there are few groups, because each is compiled separately."""
     found: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for pair in pairs:
         i, j = sorted(pair, key=lambda k: (_RANKS[kinds[k]], k))
@@ -108,7 +108,7 @@ class Placed(eqx.Module):
 
 
 def place(scene: Scene, robot: Robot, kinematics: Kinematics, added: Placed) -> Placed:
-    """Return the scene's shapes in the world; ``added`` are those that are not the robot's, each in its frame."""
+    """Return the scene's shapes in the world; ``added`` has the poses of the added shapes, each in its frame."""
     own, frames = np.asarray(scene.geoms, int), np.asarray(scene.frames, int)
     robots = Placed(robot.geom_position[own], robot.geom_rotation[own], robot.geom_size[own])
     turn = robot.frame_rotation[frames]
@@ -142,7 +142,7 @@ def _of_group(scene: Scene, group: Group, placed: Placed, hulls: UnitCore | None
 
 
 def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore | None) -> Core:
-    """Return the cores of some shapes, of one size, with a leading axis."""
+    """Return the cores of some shapes, padded to one size and stacked."""
     index, kinds = np.asarray(ids, int), [scene.kinds[k] for k in ids]
     units = [unit_core(kind) for kind in dict.fromkeys(kinds) if kind is not Kind.HULL]
     start = {kind: k for k, kind in enumerate(kind for kind in dict.fromkeys(kinds) if kind is not Kind.HULL)}

@@ -1,4 +1,4 @@
-"""Shapes that a model does not have: obstacles in the world, and what links are taken for."""
+"""Added shapes: obstacles in the world, and shapes on links."""
 
 from __future__ import annotations
 

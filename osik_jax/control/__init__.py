@@ -1,4 +1,4 @@
-"""The loop: one control step, and many."""
+"""One control step, and closed loops of many steps."""
 
 from ._clutch import Clutch as Clutch
 from ._rollout import rollout as rollout

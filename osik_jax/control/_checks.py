@@ -33,7 +33,7 @@ _DEGREES = 6.5
 
 
 def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
-    """Raise TypeError or ValueError for anything that is not what it should be."""
+    """Raise TypeError or ValueError for a wrong robot, scheme or dt."""
     check_robot(robot, where)
     _check_precision(robot)
     if scheme is not None and not isinstance(scheme, Scheme):
@@ -42,7 +42,7 @@ def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
 
 
 def _check_precision(robot: Robot) -> None:
-    """Raise where the robot has another precision than JAX is set to, but for float32 in double precision."""
+    """Raise ValueError for a float64 robot in single precision; warn of a float32 robot in double precision."""
     own, now = robot.q0.dtype, jnp.result_type(float)
     if own == now:
         return
@@ -55,11 +55,11 @@ def _check_precision(robot: Robot) -> None:
 
 
 def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
-    """Return the given limits as a tuple, None where none are given; the robot's own limits are not among them.
+    """Return the given limits as a tuple, or None; the robot's own limits are not added.
 
     Raises:
-        TypeError: no sequence of limits.
-        ValueError: a limit that was made for another robot.
+        TypeError: not a sequence of limits.
+        ValueError: a limit was made for another robot.
     """
     if limits is None:
         return None
@@ -80,7 +80,7 @@ def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
 
 
 def check_dt(dt: Any) -> None:
-    """Raise TypeError where dt is no number, ValueError where it is seen not to be one, positive and finite."""
+    """Raise TypeError unless dt is a number, ValueError unless it is a scalar and, if concrete, positive and finite."""
     seen = concrete(dt)
     if seen is not None and seen.dtype.kind not in "iuf":
         raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
@@ -93,7 +93,7 @@ def check_dt(dt: Any) -> None:
 
 
 def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
-    """Raise TypeError or ValueError where these are no tasks by name, or not this robot's."""
+    """Raise TypeError or ValueError unless these are tasks by name, made for this robot."""
     if not isinstance(tasks, Mapping):
         raise OsikTypeError(f"tasks is a {type(tasks).__name__}; it is a dict from names to tasks")
     if not tasks:
@@ -127,10 +127,10 @@ def warn_of_degrees(robot: Robot, q: Array) -> None:
 
 
 def checked_configuration(robot: Robot, q: Any) -> Array:
-    """Return q, checked, as floats at least as precise as the robot's.
+    """Return a checked q as floats, at least as precise as the robot's.
 
     Raises:
-        TypeError: no numbers.
+        TypeError: q is not numeric.
         ValueError: a wrong length, not finite, or a quaternion of zeros.
     """
     try:
@@ -146,9 +146,9 @@ _accepted_gains: tuple[Any, ...] = ()
 
 
 def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
-    """Give one ``OsikWarning`` that names the tasks whose gain times dt is above 2; nothing is said of traced numbers.
+    """Give one ``OsikWarning`` that names the tasks whose gain times dt is above 2; traced numbers are not checked.
 
-    A step uses 1 / dt in their place (``Task.during``); numbers as large as these are mostly other units.
+    A step uses a gain of 1 / dt in their place (``Task.during``). Such large gains are mostly in other units.
     """
     global _accepted_gains
     gains = [getattr(task, "gain", 0.0) for task in tasks.values()]
@@ -173,7 +173,7 @@ _said_ignored: set[tuple[tuple[str, int], ...]] = set()
 
 
 def warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task]) -> None:
-    """Warn where a ``WeightedQP`` is asked for by name and the priorities differ: once for each set of tasks."""
+    """Warn, once for each set of tasks, if a ``WeightedQP`` is given and the priorities differ."""
     if not isinstance(scheme, WeightedQP) or len(priorities(tasks)) < 2:
         return
     named = tuple((name, task.priority) for name, task in tasks.items() if not task.hard)
@@ -192,7 +192,7 @@ def _is_traced(tree: Any) -> bool:
 
 
 def check_steps(steps: Any) -> None:
-    """Raise ValueError where the number of steps is none."""
+    """Raise ValueError unless the number of steps is an integer from 0 up."""
     if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 0:
         raise OsikValueError(f"steps is {steps!r}; it is the number of steps, an integer")
 
@@ -201,7 +201,7 @@ _BY_STEP = "targets by step"
 
 
 def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
-    """Raise where targets are no mapping, or for a task that does not exist."""
+    """Raise TypeError unless targets are a mapping, KeyError for a task that does not exist."""
     if targets is not None and not isinstance(targets, Mapping):
         raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from task names to {what}")
     for name in targets or {}:
@@ -215,7 +215,7 @@ def check_targets(
     steps: int,
     robot: Robot | None = None,
 ) -> None:
-    """Raise where tasks are none, or targets by step do not fit them."""
+    """Raise TypeError, ValueError or KeyError for invalid tasks, or for targets by step that do not fit them."""
     if callable(tasks):
         if targets is not None:
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
@@ -236,7 +236,7 @@ def check_targets(
 
 
 def check_warm_start(warm_start: Any) -> None:
-    """Raise TypeError where it is not made of integers; whether it fits is seen when the step is compiled."""
+    """Raise TypeError unless a warm start is made of integers; its shapes are checked when the step is compiled."""
     for leaf in jax.tree.leaves(warm_start):
         if not hasattr(leaf, "dtype") or not jnp.issubdtype(leaf.dtype, jnp.integer):
             raise OsikTypeError(
@@ -245,9 +245,9 @@ def check_warm_start(warm_start: Any) -> None:
 
 
 def solved_with(scheme: Scheme, problem: VelocityProblem, warm_start: Any) -> SchemeAnswer:
-    """Return the scheme's answer; ValueError where the warm start is that of another problem or scheme.
+    """Return the scheme's answer; raise ValueError if the warm start is that of another problem or scheme.
 
-    What a warm start should be is that of an answer without one, which is traced only where something went wrong.
+    The expected shapes are those of an answer without warm start, which is traced only after an error.
     """
     if warm_start is None:
         return scheme.solve(problem)
@@ -276,7 +276,7 @@ def _shapes(tree: Any) -> tuple[Any, list[tuple[int, ...]]]:
 
 
 def check_rows(rows: Mapping[str, Any], tasks: Mapping[str, Task], robot: Robot) -> None:
-    """Raise where the rows of a task, which somebody may have written himself, do not fit each other or the robot."""
+    """Raise TypeError or ValueError if the rows of a task (perhaps a user's own) do not fit each other or the robot."""
     for name, own in rows.items():
         kind = type(tasks[name]).__name__
         if not isinstance(own, TaskRows):

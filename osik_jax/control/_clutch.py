@@ -30,13 +30,13 @@ class Clutch(Replaceable):
         position = f0.position + scale A (d.position - d0.position)
         rotation = A (d.rotation d0.rotation') A' f0.rotation
 
-    So only the motion since the clutch was pressed counts: the device may be moved freely while the clutch is open, and
-    pressing or releasing it moves nothing. While it is open the target stands still. A pose of the device that is not
-    finite opens the clutch.
+    So only the motion since the clutch was pressed counts. The device may be moved freely while the clutch is open, and
+    pressing or releasing the clutch moves nothing. While it is open the target stands still. A pose of the device that
+    is not finite opens the clutch.
 
-    At each press and release f0 is the last target where the frame is at rest, also where it rests off its target: so
-    a frame at rest stays at rest. Where the frame moves, f0 is the pose of the frame: a release stops it. A frame that
-    was moved by other means needs a new clutch.
+    At each press and release, f0 is the last target if the frame is at rest, so a frame at rest stays at rest. If the
+    frame moves, f0 is the frame's pose, so a release stops it. After a frame was moved by other means, make a new
+    clutch.
 
     A pure pytree for ``jit``, ``scan`` and ``vmap``:
 
@@ -52,7 +52,7 @@ class Clutch(Replaceable):
             (4,). Default: the same axes.
 
     Raises:
-        TypeError, ValueError: a pose or rotation that is none, a scale that is not positive.
+        TypeError, ValueError: an invalid pose or rotation, or a scale that is not positive.
     """
 
     engaged: Bool[Array, ""]
@@ -117,7 +117,7 @@ def _is_at_rest(frame: Pose, last: Pose) -> Bool[Array, ""]:
 
 
 def _numbers(pose: PoseLike, dtype: Any) -> Any:
-    """Return a pose as arrays; inside a program NaN raises nothing."""
+    """Return a pose as arrays, with NaN allowed."""
     if isinstance(pose, jaxlie.SE3):
         return pose
     if isinstance(pose, tuple | list) and len(pose) == 2:

@@ -53,8 +53,8 @@ def rollout(
 ) -> Trajectory:
     """Return the closed loop: solve, integrate, repeat, in one compiled scan.
 
-    Differentiable in both modes. The reverse mode keeps of each step the configuration and what the solver found, and
-    computes the rest of it again on its way back: a long path costs little memory.
+    Differentiable in both modes. The reverse mode keeps the configuration and the solver's answer of each step, and
+    computes everything else again: a long path costs little memory.
 
     Args:
         robot: the robot.
@@ -153,7 +153,7 @@ def _rollout(
 
 
 def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, moved: Bool[Array, ""] | bool) -> Any:
-    """Return tasks and limits ``after`` a step's velocity, or as they are where there was none (``moved`` false)."""
+    """Return tasks and limits ``after`` a step's velocity, or unchanged before the first step (``moved`` false)."""
 
     def one(part: Task | Limit) -> Task | Limit:
         if velocity is None or type(part).after in (Task.after, Limit.after):
@@ -164,13 +164,13 @@ def remembering(tasks_and_limits: Any, velocity: Float[Array, " nv"] | None, mov
 
 
 def move(robot: Robot, q: Array, v: Array, dt: Array | float) -> Array:
-    """Return where a step leads; nowhere if q or dt is NaN."""
+    """Return the configuration after a step; q itself if q or dt is NaN."""
     (usable, usable_dt), is_valid = with_placeholder((q, jnp.asarray(dt)))
     return jnp.where(is_valid, integrate(robot, usable, v, usable_dt).astype(q.dtype), q)
 
 
 def _cold_start(one_step: Callable[[Any], Any], inputs: Any) -> Any:
-    """Return zeros in the shape of what a step leaves to the next, from one that is traced and not run."""
+    """Return zeros in the shapes of the state that a step passes on, found by tracing one step."""
     one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), jax.tree.map(jnp.asarray, inputs))
     return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(one_step, one))
 

@@ -13,8 +13,8 @@ class Solution(eqx.Module):
 
     Attributes:
         velocity: v; under ``WeightedQP`` and ``HierarchicalQP`` inside its box exactly. ``WeightedQP`` returns, by
-            status: SOLVED, the best; INFEASIBLE, the one that misses what is hard least; MAX_ITERATIONS, a careful
-            step downhill, in the box and no worse than standing still; NUMERICAL_ERROR, zero, clipped into the box.
+            status: SOLVED, the optimum; INFEASIBLE, the least violation of hard rows; MAX_ITERATIONS, a step in the
+            box that costs no more than standing still; NUMERICAL_ERROR, zero, clipped into the box.
             (nv,)
         status: a ``Status`` code.
         iterations: changes of the active set, all levels together.
@@ -25,11 +25,12 @@ class Solution(eqx.Module):
         box_violation: how far v leaves its box [rad/s or m/s], 0 but for ``NullSpace``; or, where that is more, how far
             it leaves the rows of limits that are no box, in their units: rounding, but for ``NullSpace`` and where the
             status is INFEASIBLE.
-        slack: of each task, J v minus the nearest point of its interval: what the task did not get. {name: (m,)}
-        error: of each task, its error (equality) or value (inequality) at q. {name: (m,)}
+        slack: J v minus the nearest point of the interval, by task: the unmet part of its demand. {name: (m,)}
+        error: error (equality) or value (inequality) at q, by task. {name: (m,)}
         warm_start: for the next step: the active set, as a pytree of integers; None for ``NullSpace``.
 
-    All numbers are finite: what a NaN in the input spoils is 0, its derivatives too, and the status says so.
+    All numbers are finite. If the input has a NaN, the numbers that depend on it are 0, with derivatives 0, and the
+    status says so.
     """
 
     velocity: Float[Array, " nv"]

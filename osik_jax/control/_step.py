@@ -209,8 +209,8 @@ _compiled_step = compiled(_plain_step)
 def _with_nan(problem: VelocityProblem, raw_box: tuple[Array, Array], is_valid: Array) -> VelocityProblem:
     """Re-insert NaN where inputs were not valid, so that every solver reports NUMERICAL_ERROR.
 
-    It comes in through a select, so that derivatives with respect to what the problem was made of are 0 in that lane.
-    Of equalities what they want and their weights say it, all in one operation: matrices are large.
+    A select inserts it, so that derivatives by the problem's data are 0 in that lane. In equality rows the wanted
+    velocities and weights become NaN, in one operation for all tasks, because matrices are large.
     """
     small = [name for name, r in problem.rows.items() if r.is_equality and r.dofs is None and name not in problem.hard]
     rows = {
@@ -282,5 +282,5 @@ def velocity_problem(
 
 
 def in_type_of(dt: Any, q: Array) -> Any:
-    """Return dt in q's type, so that a Python number, a NumPy and a JAX one share a compiled program."""
+    """Return dt in q's dtype, so that numbers of Python, NumPy and JAX share a compiled program."""
     return dt.astype(q.dtype) if isinstance(dt, jax.Array) else np.asarray(dt, q.dtype)

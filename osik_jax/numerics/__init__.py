@@ -1,1 +1,1 @@
-"""Arrays and what a user gives for them. Knows no robot and no solver."""
+"""Array helpers, and checks and conversions of a user's numbers; independent of robots and solvers."""

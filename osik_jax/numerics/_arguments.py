@@ -15,10 +15,10 @@ from .._errors import OsikTypeError, OsikValueError
 
 
 def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
-    """Return a floating-point type that JAX has now; ``float`` stands for JAX's default.
+    """Return a floating-point dtype that JAX supports now; ``float`` stands for JAX's default.
 
     Raises:
-        TypeError: no floating-point type.
+        TypeError: not a floating-point dtype.
         ValueError: float64 while ``jax_enable_x64`` is off.
     """
     wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
@@ -30,10 +30,10 @@ def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
-    """Return a finite number that is not negative. ``dtype=None`` stands for an array's own, else JAX's default.
+    """Return a finite number that is not negative; ``dtype=None``: an array's float dtype, else JAX's default.
 
     Raises:
-        ValueError: it is not, or not a scalar.
+        ValueError: the value is negative, not finite, or not a scalar.
     """
     if dtype is None:
         own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
@@ -47,8 +47,8 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
     """Return an array of this shape; a scalar is repeated.
 
     Raises:
-        TypeError: no numbers.
-        ValueError: any other shape, or NaN that can be seen.
+        TypeError: the value is not numeric.
+        ValueError: any other shape, or a concrete NaN.
     """
     out = as_array(value, what, dtype)
     if out.shape not in ((), shape):
@@ -59,28 +59,28 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
 
 
 def check_not_nan(value: Array, what: str) -> None:
-    """Raise ValueError where a value can be seen to be NaN, which no number of a problem is."""
+    """Raise ValueError if a concrete value has a NaN."""
     seen = concrete(value)
     if seen is not None and np.isnan(seen).any():
         raise OsikValueError(f"{what} is {seen}; it has to be numbers, not NaN")
 
 
 def check_finite(value: Array, what: str) -> None:
-    """Raise ValueError where a value can be seen not to be finite."""
+    """Raise ValueError unless a value is finite; traced values are not checked."""
     seen = concrete(value)
     if seen is not None and not np.isfinite(seen).all():
         raise OsikValueError(f"{what} is {seen}; it has to be finite")
 
 
 def check_not_negative(value: Array, what: str) -> None:
-    """Raise ValueError where a value can be seen to be negative or not finite."""
+    """Raise ValueError unless a value is finite and not negative; traced values are not checked."""
     seen = concrete(value)
     if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
         raise OsikValueError(f"{what} is {seen}; it has to be finite and not negative")
 
 
 def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:
-    """Return both bounds as arrays (rows,), a missing one infinite; (None, None) where neither is given."""
+    """Return both bounds as arrays (rows,), a missing one infinite; (None, None) if neither is given."""
     if lower is None and upper is None:
         return None, None
     low = as_vector(-jnp.inf if lower is None else lower, (rows,), "lower", dtype)
@@ -90,7 +90,7 @@ def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | No
 
 
 def check_bounds(lower: Array | None, upper: Array | None) -> None:
-    """Raise ValueError where lower can be seen to be above upper."""
+    """Raise ValueError if a concrete lower bound is above the upper one."""
     low, high = concrete(lower), concrete(upper)
     if lower is None or upper is None or low is None or high is None:
         return
@@ -100,22 +100,22 @@ def check_bounds(lower: Array | None, upper: Array | None) -> None:
 
 
 def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None = None) -> str:
-    """Return some entries of an array as text for messages, by name where there are names."""
+    """Return some entries of an array as text for messages, with their names or numbers."""
     found = np.flatnonzero(which).tolist()
     return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)
 
 
 def check_count(what: str, value: Any, *, least: int = 1) -> None:
-    """Raise ValueError for what is no integer, or less than ``least``."""
+    """Raise ValueError unless the value is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
         raise OsikValueError(f"{what} is {value!r}; it is an integer, at least {least}")
 
 
 def as_array(value: Any, what: str, dtype: Any) -> Array:
-    """Return the value as an array of this type.
+    """Return the value as an array of this dtype.
 
     Raises:
-        TypeError: it is made of something else than numbers.
+        TypeError: the value is not numeric.
     """
     try:
         return jnp.asarray(value, dtype)
@@ -125,5 +125,5 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """Return the value as NumPy, or None where it is traced and cannot be looked at."""
+    """Return the value as a NumPy array, or None if it is traced."""
     return None if isinstance(value, Tracer) else np.asarray(value)

@@ -8,13 +8,13 @@ that plain JAX and the kernels decide alike.
 Not here, because they are no tolerances of a solver:
 
 - sizes of blocks, tiles, workspaces and shared memory, which change the time and not the answer;
-- guards against division by 0 (1e-300, 1e-37, ``finfo.tiny``), and limits on iterations in proportion to a problem's
-  size: what they are is what the line that has them says, and for the limits the docstring of the public function;
-- what a user may set: defaults of solvers and schemes, such as ``damping``, stand in their signatures;
+- guards against division by 0 (1e-300, 1e-37, ``finfo.tiny``), which stand in the line that needs them;
+- limits on iterations in proportion to a problem's size, in the docstring of the public function;
+- options of users, such as ``damping``, whose defaults stand in the signatures of solvers and schemes;
 - parts of a task's own formula, with a unit and a meaning there: the cone's rounded tip or the cosine that counts as
   behind (``tasks/_pointing.py``), the least distance of a look-at task, the default weight of a posture;
-- what a robot, a task, a limit or a shape is accepted with when it is made (a unit quaternion, collinear corners), and
-  how far limits stay clear of their bounds (``limits/``);
+- tolerances of checks when a robot, task, limit or shape is made (a unit quaternion, collinear corners), and the
+  distances that limits keep from their bounds (``limits/``);
 - searches that use the solvers: ``inverse/``, ``retargeting/``.
 """
 

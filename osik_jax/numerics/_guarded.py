@@ -1,4 +1,4 @@
-"""Arithmetic whose derivatives hold where bounds coincide, and where the squares of small numbers underflow."""
+"""Arithmetic with correct derivatives where bounds coincide or the squares of small numbers underflow."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ def _quotient_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -
 
 
 def at_most_inverse(gain: Float[Array, ""], dt: Float[Array, ""] | float) -> Float[Array, ""]:
-    """Return the gain, at most 1 / dt; where they are equal, the derivative is that of the gain.
+    """Return the gain, at most 1 / dt; if they are equal, the derivative is that of the gain.
 
-    The derivative of 1 / dt is infinite for a dt of 1e-20 in single precision, and 0 times that is NaN: it is not taken
-    where the gain is the smaller one.
+    In single precision the derivative of 1 / dt is infinite for a dt of 1e-20, and 0 times that is NaN. So it is not
+    taken if the gain is the smaller one.
     """
     dt = jnp.asarray(dt, jnp.result_type(gain))
     is_capped = gain > 1.0 / jax.lax.stop_gradient(dt)
@@ -40,7 +40,7 @@ def at_most_inverse(gain: Float[Array, ""], dt: Float[Array, ""] | float) -> Flo
 
 
 def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Float[Array, "*S"]:
-    """Return way / dt; a rate so fast that it is no bound (``_FASTEST``) has a derivative of 0, not an infinite one."""
+    """Return way / dt; a rate above ``_FASTEST``, which bounds nothing, has the derivative 0, not an infinite one."""
     dt = jnp.asarray(dt, way.dtype)
     is_far = jnp.abs(way) > _FASTEST * dt
     far = jax.lax.stop_gradient(way / dt)
@@ -48,7 +48,7 @@ def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Flo
 
 
 def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the Euclidean norm, whose squares neither overflow nor underflow; its gradient at 0 is 0."""
+    """Return the Euclidean norm without overflow or underflow of squares; its gradient at 0 is 0."""
     size = largest(vector)
     squared = jnp.sum((vector / size) ** 2)
     positive = squared > 0.0
@@ -62,19 +62,19 @@ def largest(vector: Float[Array, "..."]) -> Float[Array, ""]:
 
 
 def greatest(vectors: Float[Array, "*S m"]) -> Float[Array, "*S"]:
-    """Return the largest entry of each vector; its derivative is that of the entry, of the first one in a tie.
+    """Return the largest entry of each vector; its derivative is that of the first largest entry.
 
-    That of ``jnp.max`` divides by the number of entries that equal the maximum. Where XLA computes the entries twice
-    and rounds them differently, there is none.
+    The derivative of ``jnp.max`` divides by the number of entries that equal the maximum. If XLA computes the entries
+    twice with different rounding, that number is 0.
     """
     return jnp.take_along_axis(vectors, jnp.argmax(vectors, -1, keepdims=True), -1)[..., 0]
 
 
 def clipped(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x clipped into [lower, upper]; where all three are one number, the derivative is that of the bounds.
+    """Return x clipped into [lower, upper]; if all three are equal, the derivative is that of the bounds.
 
-    With bounds that are one number the result is that number, whatever x does. ``jnp.clip`` gives x a quarter of the
-    derivative there. Where x touches one bound alone, the derivative is the mean of both sides.
+    Between equal bounds the result does not depend on x, but ``jnp.clip`` gives x a quarter of the derivative there. If
+    x equals one of two different bounds, the derivative is the mean of both sides.
     """
     pinned = (x == lower) & (lower == upper)
     low, high = (jnp.where(pinned, bound, 0.0) for bound in (lower, upper))

@@ -1,7 +1,7 @@
-"""Placeholders: what is NaN is replaced before the first operation, and that it was there is remembered.
+"""Placeholders: NaN is replaced before the first operation, and a flag records that it was there.
 
-A select after the fact keeps a NaN out of an answer, and not out of a derivative: reverse mode multiplies the zero that
-the select sends back by coefficients that are NaN, and the sum over lanes carries that into every number they share.
+A select at the end keeps a NaN out of an answer but not out of a derivative. Reverse mode multiplies the zero from the
+select by coefficients that are NaN, and the sum over lanes carries that into every shared number.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ _NEVER_INFINITE = _WEIGHTS | {"target", "target_velocity", "axis", "ratios"}
 def with_placeholder(tree: Any) -> tuple[Any, Bool[Array, ""]]:
     """Return the tree with 1 in place of numbers that are not valid, and whether all were valid.
 
-    Each array is selected from by itself, so that one which the lanes of a batch share stays shared. NaN is never
-    right; an infinity is, where it can mean no bound: not in a bare array, nor in the weights, gain and target of a
-    task.
+    Each array is checked by itself, so an array that all lanes share stays shared. NaN is never valid. An infinity is
+    valid if it can mean "no bound", so not in a bare array, nor in the weights, gain and target of a task.
     """
     numbers, rest = eqx.partition(tree, eqx.is_inexact_array)
     valid = jax.tree_util.tree_map_with_path(lambda path, a: jnp.where(_is_invalid(path, a), 1.0, a), numbers)
@@ -35,13 +34,13 @@ def with_placeholder(tree: Any) -> tuple[Any, Bool[Array, ""]]:
 
 
 def positive(dt: Any) -> Array:
-    """Return dt, or NaN where it is not positive: that is no step either."""
+    """Return dt, or NaN unless it is positive."""
     dt = jnp.asarray(dt)
     return jnp.where(dt > 0.0, dt, jnp.nan)
 
 
 def _joined(arrays: list[Array]) -> Array:
-    """Return all numbers as one array, which one operation checks."""
+    """Return all numbers as one array, so that one operation checks them."""
     return jnp.concatenate(arrays) if arrays else jnp.zeros(0)
 
 

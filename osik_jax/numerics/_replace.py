@@ -1,4 +1,4 @@
-"""Immutable objects with other numbers: what tasks, limits and schemes share."""
+"""Base class of immutable objects (tasks, limits, schemes) whose numbers can be replaced."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ._arguments import as_vector
 
 
 class Replaceable(eqx.Module):
-    """Base of what is made of numbers, which may be replaced, and of structure, which may not."""
+    """Base of immutable objects: their numbers can be replaced, their structure cannot."""
 
     def replace(self, **changes: Any) -> Self:
-        """Return the same object with other numbers, checked and converted as on construction.
+        """Return a copy of the object with other numbers, checked and converted as on construction.
 
         Works inside ``jit`` and changes no structure, so nothing is compiled again:
         ``task.replace(target=(p, R), gain=5.0)``, ``limit.replace(gain=0.5)``, ``scheme.replace(damping=1e-4)``. A
         batch is a vmapped replace: ``jax.vmap(lambda p: task.replace(target=(p, R)))(positions)``.
 
         Raises:
-            TypeError: a name that is not one of this object's numbers; the message lists those that are.
+            TypeError: a name is not one of this object's numbers; the message lists them.
             ValueError: a wrong shape or value.
         """
         for name in changes:
@@ -42,14 +42,14 @@ class Replaceable(eqx.Module):
 
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Return names that ``replace`` takes: the fields that hold numbers."""
+        """Return the names that ``replace`` accepts: the fields with numbers."""
         fields = dataclasses.fields(self)
         return tuple(f.name for f in fields if not f.metadata.get("static") and getattr(self, f.name) is not None)
 
     def _convert(self, name: str, value: Any) -> Any:
-        """Return a new value for a field, in the precision of the one that it replaces."""
+        """Return the new value of a field, in the precision of the old one."""
         old = getattr(self, name)
         return as_vector(value, jnp.shape(old), name, jnp.result_type(old, float))
 
     def _check(self) -> None:
-        """Raise ValueError where a number is not what it may be, or fields do not fit each other."""
+        """Raise ValueError if a number is out of its range, or if fields do not fit each other."""

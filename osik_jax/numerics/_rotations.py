@@ -1,4 +1,4 @@
-"""Rotations as users have them, rounded to a few digits, made exact."""
+"""Exact rotations from a user's rotations, which may be rounded to a few digits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ITERATIONS = 4
 
 
 def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str], Array]:
-    """Return the function that evaluates numbers which are there while a program is traced: they stay constants."""
+    """Decorate a function so that concrete arguments are evaluated during tracing and stay constants."""
 
     @wraps(function)
     def evaluated(given: Array, what: str) -> Array:
@@ -36,11 +36,11 @@ def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str]
 
 @_evaluated
 def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:
-    """Return quaternions divided by their lengths, which are 1 within 2 %.
+    """Return quaternions divided by their lengths, which must be 1 within 2 %.
 
     Raises:
-        ValueError: a length can be seen to be another, or not finite; ``what`` is what the message calls it. A
-            quaternion of another length that is traced becomes NaN.
+        ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
+            length becomes NaN.
     """
     squared = jnp.sum(given**2, -1, keepdims=True)
     valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
@@ -52,11 +52,11 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
 
 @_evaluated
 def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B 3 3"]:
-    """Return the rotation matrices that are nearest to the given ones, whose columns have length 1 within 2 %.
+    """Return the rotation matrices nearest to the given ones, whose columns must have length 1 within 2 %.
 
     Raises:
-        ValueError: a matrix can be seen not to be that near to a rotation; ``what`` is what the message calls it. A
-            matrix of that kind that is traced becomes NaN.
+        ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
+            becomes NaN if it is traced.
     """
     eye = jnp.eye(3, dtype=given.dtype)
     residual = jnp.max(jnp.abs(_product(given, jnp.swapaxes(given, -1, -2)) - eye), (-1, -2), keepdims=True)
@@ -86,7 +86,7 @@ def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Arra
 
 
 def _refuse(valid: Bool[Array, "*B"], given: Array, what: str, right: str) -> None:
-    """Raise ValueError with the first of the values that can be seen not to be valid, and the places of up to ten."""
+    """Raise ValueError with the first invalid concrete value and the indices of up to ten of them."""
     seen, values = concrete(valid), concrete(given)
     if seen is None or values is None or seen.all():
         return
