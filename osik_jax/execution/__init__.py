@@ -1,1 +1,1 @@
-"""Execution of batches: blocks of lanes, precision, backends, derivative rules, the CPU's workers. Knows no problem."""
+"""Execution of batches: blocks of lanes, precision, backends, derivative rules, workers of the CPU client."""

@@ -1,11 +1,10 @@
-"""Choice of the candidate that runs: the one table of backends.
+"""Choice of backend: the table of kernels, and the dispatch by platform.
 
-A solver takes a candidate for the answer, certifies it in plain JAX, and searches where that fails. Candidates come
-from kernels; the search needs none and is the definition. ``backend``, a static option of solvers and schemes, chooses.
-Kernels of projections on null spaces compute what plain JAX would: all of the classical order, and the factors of the
-levels in reverse order. With bounds a kernel searches, and what it cannot answer is searched again. Kernels of
-kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's backend is that of its whole step
-(``_computed.py``).
+A solver takes a kernel's candidate, certifies it in plain JAX, and searches if that fails. The search is the definition
+and needs no kernel. ``backend``, a static option of solvers and schemes, chooses. Kernels of null-space projection, of
+kinematics and of task rows replace plain JAX without a search (``_computed.py``): all of the classical order, and the
+factors of the levels in the reverse order. With bounds a null-space kernel searches, and plain JAX searches again for
+problems that it cannot solve. A scheme's backend is that of its whole step.
 
     backend   weighted QP                          hierarchy                           null space
     "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
@@ -21,10 +20,10 @@ kinematics and of rows of tasks, too, compute what plain JAX would; a scheme's b
     "core"                                    CPUs: any robot, any precision      CPUs: inside the former
                                                                                   CUDA: float32, about 40 dofs at most
 
-"core" is the text of ``osik_jax/core``, compiled for CPUs when the package is installed and for a GPU at the first
-call. There a problem has to fit into shared memory; what does not fit is plain JAX's.
-"auto" takes what is installed and fits, and the search elsewhere. Which platform a program runs on is decided when it
-is lowered, not when it is traced (``on_platforms``).
+"core" is the C++ of ``osik_jax/core``, compiled for CPUs when the package is installed and for a GPU at the first call.
+On a GPU a problem has to fit into shared memory; plain JAX solves larger ones. "auto" takes the core if it is installed
+and fits, else the search. The platform of a program is decided when it is lowered, not when it is traced
+(``on_platforms``).
 """
 
 from __future__ import annotations
@@ -47,11 +46,11 @@ CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"
 
 
 def check_backend(backend: Any) -> Backend:
-    """Return the backend, if it is one and what it needs is there.
+    """Return a checked backend.
 
     Raises:
-        ValueError: it is none.
-        ModuleNotFoundError: the package of its kernels is not installed; the message says how to install it.
+        ValueError: no such backend.
+        ModuleNotFoundError: its kernels are not installed; the message says how to install them.
     """
     if backend in ("numba", "warp"):
         raise OsikValueError(f"backend={backend!r} is gone: the compiled core has its kernels; take 'auto' or 'core'")
@@ -63,16 +62,16 @@ def check_backend(backend: Any) -> Backend:
 
 
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
-    """Return whether a solver has to make a program with the candidates of a kernel in it.
+    """Return whether a solver includes the candidates of a kernel in its program.
 
     Args:
-        backend: what was asked for.
-        kernel: "core" for that of CPUs, "core-cuda" for that of GPUs.
+        backend: the requested backend.
+        kernel: "core" for CPUs, "core-cuda" for GPUs.
         fits: whether the solver has such a kernel for problems of this kind, precision and shape.
 
     Raises:
-        ValueError: this very kernel was asked for and does not fit.
-        Exception: it was asked for and is not there, as ``check_backend``.
+        ValueError: this kernel was requested and does not fit.
+        ModuleNotFoundError: it was requested and is not installed.
     """
     if kernel == "core-cuda":
         return backend in ("auto", "core") and fits and cuda_is_default()
@@ -87,12 +86,12 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
 
 
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:
-    """Call the function that takes a kernel's candidates on the kernel's platform, and the search elsewhere.
+    """Call a kernel's function on the kernel's platform, and the search on other platforms.
 
     The functions are not differentiated. One program may be lowered for several platforms.
 
     Raises:
-        ValueError: a symbolic batch of ``jax.export``, which no kernel takes; a kernel in a program that is exported.
+        ValueError: a symbolic batch of ``jax.export``, or a kernel in a program that is exported.
     """
     if not kernels:
         return search(*args)

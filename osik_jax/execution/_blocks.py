@@ -1,4 +1,4 @@
-"""A long batch in pieces that stay in the cache."""
+"""Computation of a long batch in blocks that stay in the CPU's cache."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ The solvers have the same, so that a block of a step is one of theirs.
 
 
 def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
-    """Return ``function(*args)``, computed on a CPU some lanes at a time, one block after another.
+    """Return ``function(*args)``, computed on a CPU in blocks of lanes, one after another.
 
     A symbolic number of lanes (``jax.export``) is one block.
 
     Args:
         function: takes and returns pytrees whose arrays have a leading axis, the lanes.
-        args: what it is called with.
-        size: lanes in a block; the last block is filled up with copies of the first lane. Fewer where a LAPACK call of
-            so many would be split among workers that are too few.
+        args: arguments of the function.
+        size: lanes in a block; the last block is padded with copies of the first lane. Blocks are smaller if a LAPACK
+            call of this size would be split among too few workers.
     """
     count = jax.tree.leaves(args)[0].shape[0]
     if is_symbolic(count):
@@ -50,5 +50,5 @@ def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) ->
 
 
 def first_axes_as_one(a: jax.Array) -> jax.Array:
-    """Return the first two axes as one."""
+    """Return the array with its first two axes merged."""
     return a.reshape(a.shape[0] * a.shape[1], *a.shape[2:])

@@ -1,4 +1,4 @@
-"""Candidates of a kernel first, then one search for the problems whose candidate fails its certificate."""
+"""Candidates of a kernel, then one search for the problems whose candidate fails its certificate."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ class Candidates(NamedTuple):
     """Functions with which a solver uses one kernel. All take batches: arrays have a leading axis of problems.
 
     Attributes:
-        certified: from the problems to the kernel's candidates, with a flag where the certificate holds.
-        search_rest: from these and the problems to the answers; it searches where the flag is not set.
+        certified: function of the problems that returns the kernel's candidates, each with a flag: certified or not.
+        search_rest: function of these and the problems that returns the answers; it searches for the other problems.
     """
 
     certified: Callable[..., Any]
     search_rest: Callable[..., Any]
 
     def answers(self, *problems: Any) -> Any:
-        """Return the candidates where they are certified, the search's answers elsewhere."""
+        """Return certified candidates, and the search's answers for the other problems."""
         return self.search_rest(self.certified(*problems), *problems)
 
 
@@ -36,15 +36,15 @@ def certified_or_searched(
 ) -> Any:
     """Solve a batch by the kernel of the platform and the search, or by the search alone.
 
-    Where the only kernel is one for CPUs and JAX's default backend a CPU, the search is traced once for all platforms:
-    on those without the kernel no candidate is certified, and it begins with ``no_candidates``. It may leave out what a
-    kernel has tried, so that a program for such a platform is made quicker with ``backend="jax"``.
+    If the only kernel is for CPUs and JAX's default backend is a CPU, the search is traced once for all platforms. On
+    platforms without the kernel it begins with ``no_candidates``. The search may omit methods that the kernel has
+    tried, so a program for such a platform is faster with ``backend="jax"``.
 
     Args:
-        kernels: what a solver takes of each kernel, by backend; empty for the search alone.
-        search: from the problems to their answers.
+        kernels: functions of each kernel, by backend; empty for the search alone.
+        search: function of the problems that returns their answers.
         problems: pytrees whose arrays have a leading axis.
-        no_candidates: from the problems to what ``certified`` returns where nothing is; default: zeros.
+        no_candidates: function of the problems that returns uncertified candidates; default: zeros.
     """
     if len(kernels) != 1 or not kernels.keys() <= CPU_KERNELS or not cpu_is_default():
         return on_platforms({name: kernel.answers for name, kernel in kernels.items()}, search, *problems)

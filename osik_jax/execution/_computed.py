@@ -1,7 +1,7 @@
-"""Functions that a kernel of the core computes, where it computes what plain JAX would.
+"""Functions with a kernel of the core that returns the same numbers as plain JAX.
 
-Nothing is proposed and nothing certified: the kernel's answer is that of the plain function to rounding, which is what
-runs elsewhere, and the derivative.
+There is no certificate: the kernel's answer equals that of the plain function up to rounding. The plain function runs
+on other platforms and gives the derivative.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from ._rules import custom_jvp
 
 
 def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: bool = True) -> Callable[..., Any]:
-    """Return the plain function, by a kernel of a batch where the core is. What is given by name is static.
+    """Return the plain function, computed by a kernel for batches where the core is; keyword arguments are static.
 
     Args:
-        plain: of one problem: pytrees of arrays by position.
-        kernel: the same for arrays with a leading axis, of the lanes or of length 1 where all lanes share one. Its
+        plain: function of one problem, with pytrees of arrays as positional arguments.
+        kernel: the same function of batches: arrays have a leading axis, of length 1 if all lanes share the array. Its
             first argument calls a method of the core: ``_library.call``, or on a GPU ``_cuda.call_lanes``.
         on_gpu: whether there is a kernel for GPUs.
     """
@@ -64,10 +64,10 @@ def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: 
 
 
 def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what ``in_lanes`` does, without copies of what all lanes share and without blocks.
+    """Return a function of one problem as ``in_lanes`` does, without blocks and without copies of shared arrays.
 
     Args:
-        solve: takes pytrees whose arrays have a leading axis, of the lanes or of length 1, and returns those of lanes.
+        solve: function of pytrees whose arrays have a leading axis of lanes, or of length 1 if shared.
     """
 
     @custom_vmap
@@ -96,7 +96,7 @@ def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what ``in_shared_lanes`` takes, from a function of one lane."""
+    """Return the batched function that ``in_shared_lanes`` takes, from a function of one lane."""
 
     def wide(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
@@ -113,9 +113,9 @@ def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def side_by_side(*arrays: ArrayLike) -> Float[Array, "lanes k"]:
-    """Return all numbers of each lane, one array after another, for lanes as ``in_shared_lanes`` has them.
+    """Return the numbers of several arrays concatenated for each lane, for arguments of ``in_shared_lanes``.
 
-    An argument of a kernel costs time, and one that is made of constants alone is made once.
+    Each argument of a kernel costs time, and an argument of constants alone is made once.
     """
     flat = [jnp.reshape(a, (len(a), -1)) for a in map(jnp.asarray, arrays)]
     lanes = lanes_of(flat)

@@ -1,4 +1,4 @@
-"""Settings of the CPU runtime: explicit, for the process as a whole, and never made by an import."""
+"""Settings of the CPU runtime for the whole process; an import makes none."""
 
 from __future__ import annotations
 
@@ -27,31 +27,30 @@ def configure_cpu(
     asynchronous: bool = False,
     older_fusions: bool = False,
 ) -> None:
-    """Set XLA's CPU runtime up for small problems, in the process as a whole, before the first JAX computation.
+    """Configure XLA's CPU runtime for small problems, for the whole process, before the first JAX computation.
 
-    Call it once, in a program and not in a library. What you have set already stays: ``PJRT_NPROC``, these flags
-    in ``XLA_FLAGS``, ``OPENBLAS_NUM_THREADS``, ``JAX_CPU_ENABLE_ASYNC_DISPATCH``. Calling it again with the same
-    arguments does nothing. Without it every answer is the same; one robot's control step takes longer, and two
-    batches of factorisations at once in one program can wait for each other for ever where there are few cores.
+    Call it once, in a program and not in a library. Your own settings stay: ``PJRT_NPROC``, these flags in
+    ``XLA_FLAGS``, ``OPENBLAS_NUM_THREADS``, ``JAX_CPU_ENABLE_ASYNC_DISPATCH``. Calling it again with the same arguments
+    does nothing. Answers do not depend on it. Without it one robot's control step takes longer, and on few cores two
+    batches of factorisations in one program can wait for each other for ever.
 
     Args:
-        workers: threads in XLA's pool, at least (``PJRT_NPROC``); never fewer than there are cores. More than batched
-            factorisations run at once: jaxlib's wait for workers inside workers.
-        lapack_threads: threads of one LAPACK call: those of SciPy's OpenBLAS, which jaxlib uses. NumPy's is another.
-        side_by_side: whether XLA orders operations so that they can run at the same time. That costs more than it gains
-            where they take microseconds. Left alone with a jaxlib that it was not tried with, for a flag that XLA does
-            not know ends the process.
-        asynchronous: whether a program of one CPU device is handed to another thread instead of being run in the one
-            that calls it (``jax_cpu_enable_async_dispatch``).
-        older_fusions: whether XLA fuses operations as it did before its fusion emitters: programs compile
-            sooner and run as fast, with a jaxlib before 0.11, which has both ways. Try your program with it: together
-            with XLA's optimiser switched off, loops in loops were seen to go on for ever.
+        workers: least number of threads in XLA's pool (``PJRT_NPROC``); never fewer than the cores. It must be larger
+            than the number of batched factorisations at once, which wait for workers inside workers.
+        lapack_threads: threads of one LAPACK call, of SciPy's OpenBLAS, which jaxlib uses. NumPy has its own.
+        side_by_side: whether XLA orders operations so that they can run at the same time, which costs more than it
+            gains if they take microseconds. Not set with untested releases of jaxlib, because a flag that XLA does not
+            know ends the process.
+        asynchronous: whether a program of one CPU device runs in another thread than its caller
+            (``jax_cpu_enable_async_dispatch``).
+        older_fusions: whether XLA fuses operations as before its fusion emitters (jaxlib before 0.11). Programs compile
+            sooner and run as fast. Do not combine it with XLA's optimiser switched off: nested loops may never end.
 
     Raises:
-        ValueError: ``workers`` or ``lapack_threads`` is no integer from 1 up; ``older_fusions`` with a jaxlib that has
-            none.
-        RuntimeError: JAX has its CPU client already, and a setting that would have to be another is read when that is
-            made; the message names it.
+        ValueError: ``workers`` or ``lapack_threads`` is not an integer from 1 up, or ``older_fusions`` with a jaxlib
+            from 0.11 on.
+        RuntimeError: JAX has made its CPU client, which reads a setting that would have to change; the message names
+            it.
     """
     for name, value in (("workers", workers), ("lapack_threads", lapack_threads)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -73,7 +72,7 @@ def configure_cpu(
 
 
 def _environment(workers: int, side_by_side: bool, older_fusions: bool) -> dict[str, str]:
-    """Return what the environment lacks."""
+    """Return the environment variables to set."""
     changes = {}
     if "PJRT_NPROC" not in os.environ and workers > cores():
         changes["PJRT_NPROC"] = str(workers)
@@ -87,12 +86,12 @@ def _environment(workers: int, side_by_side: bool, older_fusions: bool) -> dict[
 
 
 def _dispatch(asynchronous: bool) -> bool:
-    """Return whether the way in which programs are run has to be changed."""
+    """Return whether the option for asynchronous dispatch has to change."""
     return _ASYNCHRONOUS.upper() not in os.environ and jax.config.values[_ASYNCHRONOUS] != asynchronous
 
 
 def _client_exists() -> bool:
-    """Return whether JAX has made its devices: after that it refuses to be told their number."""
+    """Return whether JAX has made its CPU client, after which it refuses to change the number of devices."""
     name = "jax_num_cpu_devices"
     now = jax.config.values[name]
     try:
@@ -104,7 +103,7 @@ def _client_exists() -> bool:
 
 
 def _limit_lapack(threads: int) -> None:
-    """Limit SciPy's OpenBLAS to so many threads a call."""
+    """Limit SciPy's OpenBLAS to this number of threads for each call."""
     if "OPENBLAS_NUM_THREADS" in os.environ:
         return
     threadpoolctl = import_module("threadpoolctl")

@@ -1,8 +1,8 @@
-"""Double precision inside a program whose data are single.
+"""Double precision inside a program with data in single precision.
 
-Whether a bound holds a level up, and on which side of the tolerance a pivot is, are yes or no; rounding that turns one
-over costs a lower level its optimum. Data in single precision cost next to nothing, as long as what is computed from
-them is in double.
+Whether a bound is active and whether a pivot exceeds its tolerance are yes-or-no decisions. A decision reversed by
+rounding can cost a lower level its optimum. Data in single precision cost almost no accuracy as long as computations
+are in double precision.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 
 def in_double(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function, computed in double precision; floats come back in the precision of the first one."""
+    """Return the function computed in double precision; its floats are returned in the precision of the first one."""
 
     def wide(*args: Any) -> Any:
         given = next(a.dtype for a in jax.tree.leaves(args) if _is_float(a))
@@ -35,7 +35,7 @@ def _is_float(a: Array) -> bool:
 
 
 def first_smallest(a: Float[Array, " m"]) -> Int[Array, ""]:
-    """Return the index of the smallest number, the first of equals.
+    """Return the index of the smallest number, the first one in a tie.
 
     ``jnp.argmin`` does not compile for doubles in a program whose default is single.
     """

@@ -1,8 +1,8 @@
-"""Batches of problems, seen as one array of lanes by code that stops early, branches or works in blocks.
+"""Batches of problems as explicit arrays of lanes, for code that stops early, branches or works in blocks.
 
-Under plain ``vmap`` a ``while_loop`` selects its whole carry at every iteration and a ``cond`` runs both branches. Code
-that sees the lanes decides itself: a branch that no lane needs is not run, and on a CPU a batch goes through in blocks
-that stay in the cache, each of which stops when its own slowest lane is done.
+Under plain ``vmap`` a ``while_loop`` selects its whole carry at every iteration, and a ``cond`` runs both branches.
+Code that sees the lanes can skip a branch that no lane needs. On a CPU it processes a batch in blocks that stay in the
+cache, and each block stops when its slowest lane is done.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FEW_ON_CPU, FEW = 4, 256
 
 
 def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of one problem, from a function of many.
+    """Return a function of one problem from a batched function.
 
     Args:
         solve: takes and returns pytrees whose arrays have a leading axis, the lanes.
@@ -58,11 +58,11 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def lanes_of(args: Any, axes: Any = None) -> int:
-    """Return how many lanes there are of arrays that have all of them, or one that all lanes share.
+    """Return the number of lanes of some arrays; the axis of an array that all lanes share has length 1.
 
     Args:
         args: a pytree of arrays.
-        axes: which axis of each is that of the lanes; default: the first. Flags count as 0 and 1.
+        axes: the axis of lanes of each array; default: the first. Flags count as 0 and 1.
     """
     leaves = jax.tree.leaves(args)
     counts = {a.shape[int(axis)] for a, axis in zip(leaves, jax.tree.leaves(axes) or [0] * len(leaves), strict=True)}
@@ -73,19 +73,19 @@ def lanes_of(args: Any, axes: Any = None) -> int:
 
 
 def no_lanes(solve: Callable[..., Any], args: tuple[Any, ...]) -> Any:
-    """Return what ``solve`` returns for a batch of 0 problems: it is asked for the shapes of one, and not run."""
+    """Return the result of ``solve`` for a batch of 0 problems, from the shapes for one problem; it is not run."""
     one = jax.tree.map(lambda a: jax.ShapeDtypeStruct((1, *a.shape[1:]), a.dtype), args)
     return jax.tree.map(lambda a: jnp.zeros((0, *a.shape[1:]), a.dtype), jax.eval_shape(solve, *one))
 
 
 def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:
-    """Return the state of all lanes after those that are not done were worked on again, a block at a time.
+    """Return the state of all lanes after ``again`` was applied to those that are not done, block by block.
 
     Args:
         state: a pytree whose arrays have a leading axis, the lanes.
         done: lanes that stay as they are.
-        again: from the numbers of a block's lanes and the state of all to the new state of that block.
-        block: lanes that are worked on together; a block that is not full has copies of the last lane.
+        again: function of the indices of a block's lanes and the state of all lanes; returns the block's new state.
+        block: number of lanes in a block; a block that is not full is padded with the last lane.
     """
     lanes = len(done)
     if lanes == 1:  # XLA would see that every round of the loop has the same numbers, and go through it beforehand
@@ -102,7 +102,7 @@ def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, A
 
 
 def first_set(flags: Bool[Array, " B"], size: int) -> Int[Array, " size"]:
-    """Return the numbers of the first flags that are set, and the count of flags where there are no more of them.
+    """Return the indices of the first flags that are set, padded with the number of flags.
 
     ``jnp.nonzero`` does not compile in double precision in a program whose default is single, from JAX 0.12 on.
     """
@@ -114,14 +114,16 @@ def first_set(flags: Bool[Array, " B"], size: int) -> Int[Array, " size"]:
 def with_a_few(
     data: Any, state: Any, done: Bool[Array, " B"], again: Callable[[Any, Any], Any], block: int | None = None
 ) -> Any:
-    """Return what ``with_the_rest`` does, by a function of a block's data and state; a short batch is one block.
+    """Return the state as ``with_the_rest`` does, for a function of a block's data and state.
+
+    A batch of at most ``block`` lanes is one block.
 
     Args:
         data: a pytree whose arrays have a leading axis, the lanes; it does not change.
         state: likewise.
         done: lanes that stay as they are.
-        again: from a block's data and state to its new state.
-        block: lanes that are worked on together; default: a few, as is good where most lanes are done.
+        again: function of a block's data and state; returns its new state.
+        block: number of lanes in a block; default: a few, for batches in which most lanes are done.
     """
     lanes = done.shape[0]
     if is_symbolic(lanes):
@@ -139,5 +141,5 @@ def with_a_few(
 
 
 def choose(where: jax.Array, new: Any, old: Any) -> Any:
-    """Return ``new`` in the lanes where the flag (one a lane) is set, ``old`` in the others."""
+    """Return ``new`` in lanes whose flag is set, ``old`` in the others."""
     return jax.tree.map(lambda a, b: jnp.where(where.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

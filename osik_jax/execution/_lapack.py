@@ -1,7 +1,7 @@
-"""LAPACK calls in a program: which of them a jaxlib splits, and how many lanes keep them whole.
+"""LAPACK calls in a program: which of them jaxlib splits, and the batch size up to which it does not.
 
-Where calls that are split can wait for ever is said in ``_workers.py``. A call is split where its batch times the
-operations for one matrix reaches a number; a batch of 1 never is.
+Split calls can wait for ever (``_workers.py``). A call is split if its batch size times the operations for one matrix
+reaches ``SPLIT``; a batch of 1 is never split.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ SPLIT = 200_000
 
 
 class Call(NamedTuple):
-    """A batched call: how many matrices, and operations for one of them."""
+    """Batched LAPACK call: its number of matrices, and the operations for one matrix."""
 
     batch: int
     operations: int
 
     def is_split(self) -> bool:
-        """Return whether it is split into tasks."""
+        """Return whether the call is split into tasks."""
         return self.batch > 1 and self.batch * self.operations >= SPLIT
 
 
 def lapack_calls(function: Callable[..., Any], *args: Any) -> list[Call]:
-    """Return the LAPACK calls in the program of ``function(*args)``, of arrays or their shapes; nothing is run."""
+    """Return the LAPACK calls in the program of ``function(*args)`` by tracing it with arrays or their shapes."""
     return list(_calls(jax.make_jaxpr(function)(*args).jaxpr))
 
 
 def lanes_in_one(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> int:
-    """Return the most lanes, up to ``size``, of which no call is split, at least 1.
+    """Return the largest number of lanes, from 1 to ``size``, for which no LAPACK call is split.
 
     Args:
         function: takes pytrees whose arrays have a leading axis, the lanes.
-        args: what it is called with, or the shapes of that.
-        size: lanes, at least 1.
+        args: its arguments, or their shapes.
+        size: number of lanes, at least 1.
     """
     block = jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), args)
     # a call has so many matrices a lane, or those of a few lanes

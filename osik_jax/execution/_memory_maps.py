@@ -18,11 +18,11 @@ _warned: list[int] = []
 
 
 def watch_memory_maps(name: str, compiled: Any) -> None:
-    """Warn once where the process nears the kernel's maximum of memory maps, at which it is ended.
+    """Warn once if the process approaches Linux's maximum of memory maps, at which it would be ended.
 
     Args:
-        name: of the function.
-        compiled: what ``jax.jit`` made of it. Maps are counted only where it has more programs than at the last call.
+        name: name of the function.
+        compiled: the jitted function. Maps are counted only if it has more programs than at the last call.
     """
     programs = compiled._cache_size()
     if programs == _seen.get(name, 0):
@@ -35,7 +35,7 @@ def watch_memory_maps(name: str, compiled: Any) -> None:
 
 
 def counted_maps() -> int | None:
-    """Return how many memory maps this process has; None where the system does not say."""
+    """Return the number of memory maps of this process; None if the system does not tell."""
     try:
         return _MAPS.read_bytes().count(b"\n")
     except OSError:

@@ -1,13 +1,12 @@
-"""Functions with rules of their own: for the derivative, which survives loops, and for long batches.
+"""Functions with their own rules for derivatives, which survive loops, and for long batches.
 
-Linearising a ``scan`` moves what does not change out of its body, and before jax 0.12 ``jax.custom_jvp`` does not come
-through that: the body keeps the plain operations and forgets the rule. First derivatives are right, but the second ones
-of a loop are then those of the plain operations, silently; for a solver whose search is cut off from differentiation,
-that is 0. A primitive of its own keeps its rule. Python 3.11 has no jax from 0.11 on, so the primitive is needed for as
-long as that Python is supported.
+Linearising a ``scan`` moves constant parts out of its body. Before jax 0.12 ``jax.custom_jvp`` loses its rule there:
+the body keeps the plain operations. First derivatives are right, but second derivatives of a loop are silently those of
+the plain operations. For a solver whose search is not differentiated, they are 0. A primitive keeps its rule. Python
+3.11 has no jax from 0.11 on, so the primitive is needed as long as that Python is supported.
 
-A primitive may also go through a batch in its own way. On a CPU, arrays of a thousand lanes do not stay in the cache
-from one operation to the next; ``blocked`` runs all operations on some lanes, then on the next.
+A primitive can also process a batch in its own way. On a CPU, arrays of a thousand lanes do not stay in the cache
+between operations; ``blocked`` runs all operations on one block of lanes after another.
 
 This is the only file that uses ``jax.interpreters``, and a new release of jax breaks it first:
 ``tests/execution/test_rules.py`` takes each rule of the primitive through each transformation.
@@ -35,20 +34,20 @@ FOUND = "found by a search"
 
 
 def found(tree: Any) -> Any:
-    """Return the arrays as they are, under the name ``FOUND``."""
+    """Return the arrays unchanged, named ``FOUND`` for ``jax.checkpoint``."""
     return jax.tree.map(lambda a: checkpoint_name(a, FOUND), tree)
 
 
 def custom_jvp(function: Callable[..., Any]) -> Ruled:
-    """Decorate as ``jax.custom_jvp`` does, functions of pytrees by position with inexact arrays as results.
+    """Decorate a function as ``jax.custom_jvp`` does: pytrees as positional arguments, float arrays as results.
 
-    What is given by keyword is static; the rule is given it too.
+    Keyword arguments are static, and the rule receives them too.
     """
     return Ruled(function)
 
 
 def blocked(size: int) -> Callable[[Callable[..., Any]], Ruled]:
-    """Return the function as it is, which on a CPU takes this many lanes of a ``vmap`` at a time.
+    """Return a decorator that makes a vmapped function run on a CPU in blocks of ``size`` lanes.
 
     Its derivatives run on all lanes at once: in blocks they would be somewhat faster, and compile much longer.
     """
@@ -62,14 +61,14 @@ def blocked(size: int) -> Callable[[Callable[..., Any]], Ruled]:
 
 
 class Ruled:
-    """A function with a rule of its own for its derivative, to any order."""
+    """Function with its own derivative rule, to any order."""
 
     def __init__(self, function: Callable[..., Any], block: int | None = None) -> None:
         self.function, self.block = function, block
         update_wrapper(self, function)
 
     def defjvp(self, rule: Callable[..., tuple[Any, Any]]) -> Callable[..., tuple[Any, Any]]:
-        """Set the rule: from primals and tangents, both tuples, to results and their tangents."""
+        """Set the rule: a function of primals and tangents (tuples) that returns results and their tangents."""
         self.rule = rule
         return rule
 
@@ -135,7 +134,7 @@ def _batch(
 
 
 def _in_blocks(wide: Callable[..., Any], axes: tuple[int | None, ...], size: int) -> Callable[..., Any]:
-    """Return a function of many lanes, some lanes at a time; arrays that all lanes share stay shared."""
+    """Return the batched function computed in blocks of lanes; arrays that all lanes share stay shared."""
 
     def function(*leaves: ArrayLike) -> Any:
         own = {i: jnp.moveaxis(leaves[i], axis, 0) for i, axis in enumerate(axes) if axis is not None}
@@ -158,9 +157,9 @@ batching.primitive_batchers[_ruled] = _batch
 
 
 def not_exported(tree: Any) -> Any:
-    """Return the arrays as they are; a program for ``jax.export`` with them in it is refused when it is lowered.
+    """Return the arrays unchanged; a program that contains them cannot be exported by ``jax.export``.
 
-    For arguments of kernels: their custom calls are known to this process alone.
+    For arguments of kernels, whose custom calls exist in this process alone.
     """
     return jax.tree.map(lambda a: _not_exported.bind(jnp.asarray(a)), tree)
 

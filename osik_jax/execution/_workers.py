@@ -1,10 +1,10 @@
-"""Workers of XLA's CPU pool, and where too few of them can wait for ever.
+"""Workers of XLA's CPU pool, and the condition under which too few of them wait for ever.
 
-In jaxlib 0.10 and 0.11.0 a batched LAPACK call (Cholesky, QR, triangular solve, LU, SVD, eigenvalues) whose batch times
-the operations for one matrix is at least 200,000 is split into tasks for the pool, and waits for them in the thread
-that runs it, which is itself a worker where operations that do not depend on each other run at once. When as many such
-calls wait as there are workers, no worker is left for their tasks, and the program never ends. Single problems, small
-batches and a pool of one worker are not split and cannot wait. Before and after these releases no call is split.
+jaxlib 0.10 and 0.11.0 split a batched LAPACK call (Cholesky, QR, triangular solve, LU, SVD, eigenvalues) into tasks for
+the pool if its batch size times the operations for one matrix is at least 200,000. The call waits for its tasks in the
+thread that runs it, which may itself be a worker. If as many such calls wait as there are workers, no worker is left
+for the tasks, and the program never ends. Single problems, small batches and a pool of one worker are not split. Other
+releases split no call.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ _SPLITS = (0, 10), (0, 11, 1)
 
 
 def cores() -> int:
-    """Return the number of cores that this process may use: XLA takes as many workers unless it is told otherwise."""
+    """Return the number of cores that this process may use, which is XLA's default number of workers."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache
 def jaxlib_version() -> tuple[int, ...]:
-    """Return jaxlib's version."""
+    """Return jaxlib's version as a tuple of integers."""
     return tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
 
 
 def too_few_workers() -> bool:
-    """Return whether calls of LAPACK that are split can wait for ever: a pool of few, whose size nobody has chosen."""
+    """Return whether split LAPACK calls can wait for ever: the pool is small and its size was not chosen."""
     return "PJRT_NPROC" not in os.environ and 1 < cores() < ENOUGH and splits(jaxlib_version()) and cpu_is_default()
 
 
@@ -46,7 +46,7 @@ def splits(jaxlib: tuple[int, ...]) -> bool:
 
 
 def warn_of_few_workers() -> None:
-    """Warn, once, where a batch is about to be solved by too few workers."""
+    """Warn once that a batch is solved by too few workers."""
     global _warned
     if _warned:
         return

@@ -18,20 +18,20 @@ Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
 
 
 def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]) -> Poses:
-    """Return the poses of all bodies in the world from their poses in their parents. Rotations have to be rotations.
+    """Return the poses of all bodies in the world from their poses relative to their parents.
 
-    Row 0 is the world's: 0 and the identity.
+    Row 0 is the world: 0 and the identity. Rotations must be exact.
 
-    All bodies at once, each with the ancestor as far above it as it has come: a tree of depth d takes log2(d) rounds.
-    The derivative adds up velocities along each body's ancestors, one product with a constant matrix: as cheap in
-    either mode, however deep the tree.
+    Each round composes every body with an ancestor twice as far above it, so a tree of depth d takes log2(d) rounds.
+    The derivative sums velocities over each body's ancestors, by one product with a constant matrix. It costs the same
+    in both modes and for any depth.
     """
     return _composer(tree)(position, rotation)
 
 
 @lru_cache(maxsize=64)
 def _composer(tree: KinematicTree) -> Callable[..., Poses]:
-    """Return the function for one tree, with its rule."""
+    """Return the composition for one tree, with its derivative rule."""
 
     @custom_jvp
     def poses(position: Array, rotation: Array) -> Poses:
@@ -56,7 +56,7 @@ def _composer(tree: KinematicTree) -> Callable[..., Poses]:
 
 
 def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
-    """Return the composed poses by a small loop, which XLA's CPU backend makes one operation instead of a dozen."""
+    """Return the composed poses by a small loop, which is one operation in XLA's CPU backend."""
     if not len(rounds):
         return position, rotation
     start = position, rotation
@@ -64,7 +64,7 @@ def _in_a_loop(position: Array, rotation: Array, rounds: Array) -> Poses:
 
 
 def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
-    """Return what ``_in_a_loop`` does, its rounds written out: on a GPU, each round of a loop is launched anew."""
+    """Return the composed poses with the rounds unrolled, because a GPU launches each round of a loop."""
     poses = position, rotation
     for i in range(len(rounds)):
         poses = _doubled(jax.lax.optimization_barrier(poses), rounds[i])  # or XLA recomputes all rounds before
@@ -72,7 +72,7 @@ def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
 
 
 def _doubled(poses: Poses, above: Array) -> Poses:
-    """Return poses that reach twice as many bodies up the tree."""
+    """Return the poses of one round: each relative to an ancestor twice as far above."""
     position, rotation = poses
     turn = rotation[above]
     return position[above] + rotate(turn, position), compose(turn, rotation)

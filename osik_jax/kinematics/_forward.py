@@ -37,7 +37,7 @@ class Kinematics(eqx.Module):
         dof_linear: direction in which each dof translates its body, 0 for rotations. (full nv, 3)
         dof_angular: axis about which each dof turns its body, 0 for translations. (full nv, 3)
         dof_anchor: a point on that axis [m]. (full nv, 3)
-        backend: "jax", or what made it and makes what tasks want of it: see ``WeightedQP.backend`` (static).
+        backend: backend of these arrays, and of Jacobians made from them; see ``WeightedQP.backend`` (static).
     """
 
     body_position: Float[Array, "nbody 3"]
@@ -70,12 +70,12 @@ class Kinematics(eqx.Module):
 
 
 def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return the pose of a body, link, site or geom, as targets of tasks take it.
+    """Return the pose of a body, link, site or geom, in the form of a task's target.
 
     Args:
         robot: the robot.
-        kinematics: of ``forward_kinematics``, at the configuration.
-        frame: its name, one of ``robot.frame_names``.
+        kinematics: ``forward_kinematics`` at the configuration.
+        frame: one of ``robot.frame_names``.
 
     Returns:
         The position of its origin in the world [m], (3,), and the rotation from its axes to the world's, (3, 3).
@@ -111,7 +111,7 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
 
 
 def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
-    """Return ``forward_kinematics``, by the compiled core where it can; Jacobians of the result take the same route.
+    """Return ``forward_kinematics`` by the compiled core if possible; Jacobians of the result use the same backend.
 
     Raises:
         ModuleNotFoundError: the backend's package is not installed.
@@ -159,10 +159,10 @@ def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) ->
 
 
 def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
-    """Return the centre of mass [m], in the world, of the robot or of the body ``subtree`` with its descendants.
+    """Return the centre of mass in the world [m], of the robot or of the body ``subtree`` with its descendants.
 
-    What is fixed to the world (an arm's base) does not count, as in Pinocchio and unlike MuJoCo, nor do loose bodies of
-    a scene. A frame that is not a body stands for the moving body that carries it.
+    Bodies fixed to the world (an arm's base) do not count, as in Pinocchio and unlike MuJoCo; nor do loose bodies of a
+    scene. A frame that is not a body stands for the moving body that carries it.
 
     Raises:
         KeyError: no such body.
@@ -196,7 +196,7 @@ def moving_center(
 
 
 def _with_masses(robot: Robot, subtree: str | None) -> Robot:
-    """Return the robot with ``body_masses`` as its masses."""
+    """Return the robot with the masses of ``body_masses``."""
     mass = body_masses(robot, subtree)
     return robot if mass is robot.body_mass else eqx.tree_at(lambda robot: robot.body_mass, robot, mass)
 
@@ -213,7 +213,7 @@ def _center_and_jacobian(robot: Robot, kinematics: Kinematics) -> tuple[Float[Ar
 
 
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:
-    """Return columns of v from columns of all the model's dofs: locked dofs drop out, followers join their leaders."""
+    """Return columns for v from columns for all dofs: locked dofs are left out, followers are added to leaders."""
     (own, _), *followers = tree.dof_columns
     reduced = jacobian if len(own) == jacobian.shape[-1] else jacobian[..., own]
     for index, coefficient in followers:

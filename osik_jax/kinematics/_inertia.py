@@ -1,4 +1,4 @@
-"""Mass matrix and centroidal momentum, from the inertias of what each dof carries."""
+"""Mass matrix and centroidal momentum, from composite inertias."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ._rigid import compose, cross, rotate
 
 
 class Composite(NamedTuple):
-    """Each body with all that hangs from it, as one rigid body; in world axes."""
+    """Inertia of each body with all its descendants as one rigid body, in world axes."""
 
     mass: Float[Array, " nbody"]  # [kg]
     center: Float[Array, "nbody 3"]  # of mass [m]
@@ -32,10 +32,10 @@ class Momenta(NamedTuple):
 def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
     """Return the inertia matrix M of the robot over v: its kinetic energy is ``v' M v / 2`` [J].
 
-    With the inertia of drives (``robot.dof_armature``), as in MuJoCo. Followers carry theirs to their leaders, locked
-    joints move with what carries them. Symmetric; positive definite where every motion moves some mass.
+    It includes the inertia of drives (``robot.dof_armature``), as in MuJoCo. That of followers is added to their
+    leaders; locked joints are rigid. It is symmetric, and positive definite if every motion moves some mass.
 
-    Composite bodies (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2), all dofs at once.
+    Method: composite bodies (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2), all dofs at once.
     """
     momenta = _momenta(robot, kinematics)
     axis = kinematics.dof_angular
@@ -47,7 +47,7 @@ def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
 
 
 def centroidal_momentum_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "6 nv"]:
-    """Return A with A v = [linear; angular] momentum [kg m/s; kg m^2/s].
+    """Return the matrix A with A v = [linear; angular] momentum [kg m/s; kg m^2/s].
 
     World axes; the angular momentum is about the centre of mass.
 

@@ -1,8 +1,7 @@
-"""Joint maths from MJX, one level deep, so that XLA never recomputes a chain of parents.
+"""Joint transforms from MJX, relative to the parent bodies, so that XLA does not recompute chains of parents.
 
-``mjx.kinematics`` on a serial chain makes XLA's CPU fusion recompute every parent of every link, so a long chain costs
-far more than its links do. Here MJX sees a forest in which each body hangs from the world alone, and returns what its
-joints do in the parent's frame; ``_composition`` composes the tree, in rounds that double the distance.
+On a serial chain, XLA's CPU fusion of ``mjx.kinematics`` recomputes all ancestors of each link. So MJX gets a forest in
+which each body's parent is the world, and returns poses relative to the parents; ``_composition`` composes the tree.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ with contextlib.redirect_stdout(None):  # it prints which of its optional back e
 def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
     """Return MJX data in which ``xpos, xquat, xanchor, xaxis`` are in the frame of each body's parent.
 
-    The quaternions are as long as the model's and the joints' axes are: 1, unless somebody changed those numbers. The
-    world is where it is, whatever its row says.
+    Quaternions have the length of the model's quaternions and axes: 1, unless these numbers were changed. The world's
+    row is the identity.
     """
     model, data = _forest(
         robot.tree.joint_types, robot.tree.joint_bodies, len(robot.tree.body_names), jnp.result_type(float).name
@@ -47,7 +46,7 @@ def joint_transforms(robot: Robot, qpos: Float[Array, " nqfull"]) -> mjx.Data:
 def _forest(
     joint_types: tuple[int, ...], joint_bodies: tuple[int, ...], bodies: int, precision: str
 ) -> tuple[mjx.Model, mjx.Data]:
-    """Return an MJX model with these joints and no tree, and its data; the numbers in it are replaced before use."""
+    """Return an MJX model with these joints on bodies of the world, and its data; its numbers are placeholders."""
     del precision  # part of the cache key: the arrays take the precision in force when they are made
     spec = mujoco.MjSpec()
     for body in range(1, bodies):
@@ -62,6 +61,6 @@ def _forest(
 
 
 def dof_kinds(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray]:
-    """Return the joint type of each full dof, and the dof's number within its joint."""
+    """Return the joint type of each dof (locked ones included), and the dof's index within its joint."""
     kinds = np.asarray(tree.joint_types, int)[tree.dof_joint]
     return kinds, np.arange(len(kinds)) - tree.full_dof_address[:-1][tree.dof_joint]

@@ -75,7 +75,7 @@ def center_arguments(robot: Robot, kinematics: Any) -> tuple[tuple[Array, ...], 
 
 
 def _arrays(kinematics: Any) -> tuple[Array, ...]:
-    """Return the fields as the kernels take them: all with the same number of lanes."""
+    """Return the fields of the kinematics for a kernel, all with the same number of lanes."""
     fields = jax.tree.leaves(kinematics)
     lanes = max(len(a) for a in fields)
     return tuple(jnp.broadcast_to(a, (lanes, *a.shape[1:])) for a in fields)

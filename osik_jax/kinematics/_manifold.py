@@ -1,4 +1,4 @@
-"""Moving along the configuration manifold, and the way back."""
+"""Integration on the configuration manifold, and its inverse."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..robot._tree import BALL, FREE
 def integrate(
     robot: Robot, q: Num[ArrayLike, " nq"], v: Num[ArrayLike, " nv"], dt: Float[Array, ""] | float = 1.0
 ) -> Float[Array, " nq"]:
-    """Return the configuration that is reached from q at a constant velocity v after dt.
+    """Return the configuration after moving from q at a constant velocity v for dt.
 
     A free joint's position moves along its linear velocity, in world axes; its quaternion, and that of a ball joint,
     becomes ``quaternion * exp(omega dt)``: angular velocities are in body axes (MuJoCo's ``mj_integratePos``).
@@ -51,7 +51,7 @@ def integrate(
 
 
 def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"]) -> Float[Array, " nv"]:
-    """Return the velocity that goes from qa to qb in unit time, so that integrating it from qa arrives at qb. (nv,).
+    """Return the velocity (nv,) that moves qa to qb in unit time; ``integrate`` is the inverse.
 
     Rotations go the short way round: no angle is greater than pi.
 

@@ -19,8 +19,8 @@ from ._rigid import cross
 def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
     """Return the derivative of ``forward_kinematics`` along v: each field with a last axis of length nv.
 
-    What autodiff through the kinematics gives, from the motion axes that are known already: a body turns and moves with
-    every dof above it, an axis and its anchor with every dof of the joints before them.
+    It equals the derivative by autodiff, computed from the known motion axes. A body moves with every dof above it. An
+    axis and its anchor move with every dof of the joints before them.
     """
     tree = robot.tree
     kinds, number = dof_kinds(tree)
@@ -37,10 +37,10 @@ def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
 
 
 def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:
-    """Return which dofs (columns) turn the axis of each dof, and which move its anchor.
+    """Return which dofs (columns) rotate the axis of each dof, and which move its anchor.
 
-    Hinges and slides sit where the joints before them have brought their body; the axes of ball and free joints are
-    those of the body itself. A free joint's anchor is its body's origin.
+    The axes of hinges and slides move with the joints before them; the axes of ball and free joints are those of the
+    body itself. A free joint's anchor is its body's origin.
     """
     kinds, _ = dof_kinds(tree)
     joint = tree.dof_joint
@@ -53,7 +53,7 @@ def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Boo
 def _velocity(
     kinematics: Kinematics, points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]
 ) -> Float[Array, "k 3 nvfull"]:
-    """Return the velocity of points under unit speed of each dof that moves them."""
+    """Return the velocity of points at unit speed of each dof that moves them."""
     axis = kinematics.dof_angular.T
     velocity = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
     return jnp.where(moved[:, None, :], velocity, 0.0)
@@ -62,6 +62,6 @@ def _velocity(
 def _turning(
     kinematics: Kinematics, vectors: Float[Array, "k 3 n"], turned: Bool[np.ndarray, "k nvfull"]
 ) -> Float[Array, "k 3 n nvfull"]:
-    """Return the rate of column vectors under unit speed of each dof that turns them."""
+    """Return the rate of column vectors at unit speed of each dof that rotates them."""
     axis = kinematics.dof_angular.T[None, :, None, :]
     return jnp.where(turned[:, None, None, :], cross(axis, vectors[..., None], along=1), 0.0)

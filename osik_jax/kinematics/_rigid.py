@@ -1,4 +1,4 @@
-"""Rotations made, applied and composed.
+"""Rotation matrices: from quaternions, applied to vectors, and composed.
 
 Written out term by term: XLA fuses that into what is around it, never runs it in reduced precision, and makes no
 library call of it, which sums of three numbers do not repay.

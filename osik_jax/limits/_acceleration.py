@@ -1,4 +1,4 @@
-"""Greatest joint accelerations, and speeds from which a joint can still stop inside its range."""
+"""Limits on joint accelerations, and on speeds from which a joint can still stop inside its range."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _MOST_STEPS = 1e6  # of braking
 
 
 class AccelerationLimit(Limit):
-    """``|v - v_last| <= acceleration dt``, and no speed from which a joint cannot stop inside its range.
+    """Limit ``|v - v_last| <= acceleration dt``, and speeds from which a joint can stop inside its range.
 
-    With ``d`` the way left to a bound, the greatest speed towards it is the one from which braking by
-    ``acceleration dt`` a step stops on the bound, in whole steps:
+    With the distance ``d`` to a bound, the greatest speed towards it is the one from which braking by
+    ``acceleration dt`` in each step stops on the bound, in whole steps:
 
         v = d / (n dt) + (n - 1) / 2 acceleration dt,    n the least number with  n (n + 1) / 2 acceleration dt^2 >= d
 
-    (n dt times v, less the n (n - 1) / 2 acceleration dt^2 that braking takes off, is d). It is the discrete form of
+    (n dt v minus the n (n - 1) / 2 acceleration dt^2 lost by braking is d). It is the discrete form of
     ``v^2 <= 2 acceleration d`` (A. Del Prete, "Joint position and velocity bounds in discrete-time
     acceleration/torque control of robot arms", RA-L 2018; F. Flacco, A. De Luca, O. Khatib, ICRA 2012), and exact where
-    positions move by ``v dt``: from a state that fulfils it every velocity in the box leads to one that does, so the
-    three limits never contradict each other in closed loop, whatever is chosen inside the box.
+    positions move by ``v dt``. From a state that fulfils it, every velocity in the box leads to another such state. So
+    ranges, speeds and accelerations never contradict each other in closed loop.
 
     From other states (outside the range, too fast, stopped too late) the acceleration holds, then the velocity limit,
     then the speed from which the joint can stop at the other end. A joint outside its range returns at
@@ -93,7 +93,7 @@ class AccelerationLimit(Limit):
         self._check(dof_names(robot))
 
     def parts(self) -> Sequence[Limit]:
-        """Return the accelerations and the braking as separate limits; a velocity limit comes in between."""
+        """Return acceleration and braking as separate limits, because velocity limits are applied between them."""
         stopping = _Stopping(self.acceleration, self.lower, self.upper, self.return_speed)
         return _Reachable(self.acceleration, self.velocity), stopping
 
@@ -155,7 +155,7 @@ class _Stopping(Limit):
 
 
 def _rounded(product: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Return the product rounded to one bit less, so that no compiler fuses it with the sum that it goes into."""
+    """Return the product rounded to one bit less, so that a compiler cannot fuse it with a following sum."""
     precision = jnp.finfo(product.dtype)
     return jax.lax.reduce_precision(product, precision.nexp, precision.nmant - 1)
 
@@ -170,10 +170,10 @@ def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Arr
 def stopping_speed(
     way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Float[Array, ""] | float
 ) -> Float[Array, " nv"]:
-    """Return the greatest velocity from which braking stops within the way left, of which some is used in every step.
+    """Return the greatest velocity from which braking in whole steps stops within a distance.
 
-    See ``AccelerationLimit``. Piecewise linear in ``way`` [rad or m], continuous, with n steps of braking in a piece;
-    ``way / dt`` for a way that is negative, or an acceleration that is infinite.
+    See ``AccelerationLimit``. The velocity is continuous and piecewise linear in ``way``, the distance [rad or m], with
+    n braking steps in a piece. It is ``way / dt`` for a negative distance or an infinite acceleration.
     """
     free, instant = jnp.isinf(way), jnp.isinf(acceleration)
     way_left = jnp.where(free, 0.0, way)

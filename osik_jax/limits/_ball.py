@@ -55,10 +55,10 @@ def ball_rates(
     margin: float,
     shortest: float,
 ) -> BallRates | None:
-    """Return the bounds for a step of dt of the ball joints; None where there are none.
+    """Return the bounds on a step of dt of the ball joints; None without ball joints.
 
-    Farther from the end of the range than ``shortest``, a step shorter than the way to the end cannot leave the range,
-    whatever its direction. Nearer to it, ``shortest`` bounds its length, and a row what it turns along the axis.
+    Farther from the end of the range than ``shortest``, a rotation shorter than the distance to the end cannot leave
+    the range. Nearer to it, ``shortest`` bounds the rotation, and a row bounds its part about the axis.
 
     Args:
         robot: the robot.

@@ -1,4 +1,4 @@
-"""Walls that a frame's origin does not pass."""
+"""Limit that keeps a frame's origin between planes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ._rows import LimitRows
 
 
 class PositionBarrier(Limit):
-    """Keeps a frame's origin p between planes by a control barrier: ``lower <= normals p <= upper``.
+    """Limit that keeps a frame's origin p between planes by a control barrier: ``lower <= normals p <= upper``.
 
     The speed towards a plane falls with the way left to it:
 

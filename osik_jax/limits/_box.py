@@ -1,4 +1,4 @@
-"""The velocity box of all limits, and the rows of limits that are no box."""
+"""Base class of limits, their common velocity box, and the rows of limits that are not a box."""
 
 from __future__ import annotations
 
@@ -27,20 +27,19 @@ _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
 class Limit(MadeForRobot, Replaceable):
     """Base of all limits: subclass it and write ``box``, ``rows`` or both to make your own.
 
-    ``limit.replace(name=value, ...)`` is the same limit with other numbers, those that ``limit.replaceable`` lists.
+    ``limit.replace(name=value, ...)`` returns the limit with other numbers; ``limit.replaceable`` lists their names.
 
-    A box always exists; rows may contradict it or each other, and the answer is then INFEASIBLE.
+    The box is never empty. Rows may contradict it or each other; the status is then INFEASIBLE.
 
     Attributes:
-        kind: ``"acceleration"`` limits are applied before ``"velocity"``, ``"braking"`` and ``"position"`` limits, in
-            this order, whatever order they are given in. Of two that have nothing in common the one applied first
-            holds.
+        kind: limits are applied in the order ``"acceleration"``, ``"velocity"``, ``"braking"``, ``"position"``. If two
+            contradict each other, the one applied first holds.
     """
 
     kind: ClassVar[Kind] = "velocity"
 
     def parts(self) -> Sequence[Limit]:
-        """Return the limits that take this one's place in the box, if it is of several kinds."""
+        """Return the parts that are applied in place of this limit, if it is of several kinds."""
         return (self,)
 
     def box(
@@ -54,14 +53,14 @@ class Limit(MadeForRobot, Replaceable):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:
-        """Return bounds on linear functions of v, at configuration q whose kinematics are given. Default: none."""
+        """Return bounds on linear functions of v at configuration q. Default: none."""
         del robot, kinematics, q, dt
         return None
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """Return the limit for the next step, given this step's ``velocity``; itself if it has no memory.
 
-        What remembers has it as a leaf. ``rollout`` calls this at every step; around ``solve`` it is for you to do.
+        ``rollout`` calls this at every step; around ``solve`` you call it.
         """
         del velocity
         return self
@@ -70,7 +69,7 @@ class Limit(MadeForRobot, Replaceable):
 def limit_box(
     robot: Robot, q: Float[Array, " nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Return the box on v that all limits ask for over a step of dt [s]; lower <= upper always.
+    """Return the box of all limits on v for a step of dt [s]; lower <= upper always.
 
     Acceleration and velocity limits first; then each position limit is clipped into the box so far:
     ``lower = clip((q_lower - q) / dt, v_lower, v_upper)``, ``upper = clip((q_upper - q) / dt, v_lower, v_upper)``.
@@ -87,7 +86,7 @@ def limit_box(
         lower and upper bounds on v. (nv,) each
 
     Raises:
-        ValueError: dt is seen not to be positive.
+        ValueError: a concrete dt is not positive.
     """
     seen = concrete(dt)
     if seen is not None and not (seen > 0.0).all():
@@ -105,7 +104,7 @@ def limit_box(
 
 
 def _a_little_below(upper: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Return bounds lower by some roundoff: where XLA computes one twice, the two may differ by it, and would cross."""
+    """Return bounds lowered by some roundoff: XLA may round the same bound differently in two places."""
     fraction = _ROUNDOFF * jnp.finfo(upper.dtype).eps
     return jnp.where(upper > 0.0, upper * (1.0 - fraction), upper * (1.0 + fraction))
 
@@ -117,7 +116,7 @@ def limit_rows(
     limits: Sequence[Limit],
     dt: Float[Array, ""] | float,
 ) -> LimitRows | None:
-    """Return the rows of all limits that have any, in the order of the limits; None where there are none.
+    """Return the rows of all limits, in the order of the limits; None if there are none.
 
     Args:
         robot: the robot.

@@ -29,50 +29,50 @@ from ._rows import LimitRows
 
 
 class CollisionAvoidanceLimit(Limit):
-    """Keeps the robot's geoms a distance from each other and from the world.
+    """Limit that keeps the robot's geoms a distance from each other and from the world.
 
     Each pair has the signed distance d between its shapes, the unit normal n from one to the other and the Jacobians of
-    the nearest points a and b. The ``max_pairs`` that could meet soonest, all joints being equally fast, give a row:
+    the nearest points a and b. The ``max_pairs`` pairs with the shortest time to contact, with all joints equally fast,
+    give a row each:
 
         n' (J_b - J_a) v >= -min(gain, 1 / dt) (d - minimum_distance)           where d < detection_distance
 
-    A pair nearer than ``minimum_distance`` is asked to part at no more than ``recovery_speed``. The rows are those of
-    a step's start: over a step, turning shapes come nearer by about ``(omega dt)**2 r / 2`` more than the rows tell,
-    omega being their angular velocity relative to each other and r the distance of the nearest point from its axis.
-    That is what ``minimum_distance`` is for. The other pairs are free for the step.
+    A pair nearer than ``minimum_distance`` parts at no more than ``recovery_speed``. Rows are those of the start of a
+    step. Over the step, turning shapes come nearer by about ``(omega dt)**2 r / 2`` more than the rows allow, with
+    their relative angular velocity omega and the distance r of the nearest point from its axis. Choose
+    ``minimum_distance`` accordingly. The other pairs are free for the step.
 
     Geoms: planes, spheres, capsules, boxes, cylinders (as prisms of 16 sides around them), ellipsoids (as polyhedra of
     42 corners around them, up to 7 % larger) and meshes (as their convex hulls). Height fields and SDFs have no
-    distance here. Pairs are those that MuJoCo would let collide: not of one body, nor of bodies with one joint between
-    them, and by the masks ``contype`` and ``conaffinity`` and the model's ``<exclude>``; locked joints are none.
+    distance. Default pairs are those that MuJoCo would let collide, by the masks ``contype`` and ``conaffinity`` and
+    the model's ``<exclude>``. Pairs of one body, or of bodies with one joint between them, are left out; locked joints
+    do not count as joints.
 
-    The distance is exact and once differentiable, but for faces and edges that come to lie flat on each other, where
-    the nearest points jump. Where a mesh or an ellipsoid overlaps another shape its depth is overestimated where edges
-    cross.
+    The distance is exact and once differentiable, except where faces or edges come to lie flat on each other: there the
+    nearest points jump. If a mesh or an ellipsoid overlaps another shape, the depth is overestimated where edges cross.
 
     Args:
-        robot: the robot; its geoms are what is kept apart.
-        pairs: which to keep apart: pairs of names or globs of geoms, shapes, links or bodies (``"world"``), such as
-            ``[("*hand*", "torso")]``. Masks then do not count, and pairs asked for by their names, not by a glob, are
-            kept however near they are. None: all that may collide.
-        exclude: names or globs of what is left out, or pairs of them.
-        shapes: obstacles, and shapes of links that have no geoms, by name. They meet all that has masks.
-        minimum_distance: [m]; may be negative.
-        detection_distance: beyond it a pair is free [m].
-        gain: [1/s], of the approach to ``minimum_distance``; more than 1 / dt counts as 1 / dt.
-        recovery_speed: at which pairs that are too near have to part, if they are near enough to need it [m/s]. 0: they
-            have to come no nearer.
-        q0_distance: pairs that are nearer than this at ``q0`` are left out [m]: the soles on the floor, links whose
-            geoms overlap by construction; ``left_out`` has them. ``-inf``: none is. None: ``minimum_distance``, and
-            none that ``pairs`` asks for by name; such a pair is asked to part at ``recovery_speed`` at most.
-        max_pairs: how many rows there are (static).
+        robot: the robot.
+        pairs: pairs to keep apart: names or globs of geoms, shapes, links or bodies (``"world"``), such as
+            ``[("*hand*", "torso")]``. Masks then do not count, and pairs given by names, not by a glob, are kept
+            however near they are. None: all default pairs.
+        exclude: names or globs of shapes, links or bodies to leave out, or pairs of them.
+        shapes: obstacles, and shapes of links without geoms, by name. They are kept off all geoms with masks.
+        minimum_distance: least distance [m]; may be negative.
+        detection_distance: distance beyond which a pair is free [m].
+        gain: rate of the approach to ``minimum_distance`` [1/s]; more than 1 / dt counts as 1 / dt.
+        recovery_speed: greatest speed at which pairs that are too near must part [m/s]. 0: they must not come nearer.
+        q0_distance: pairs nearer than this at ``q0`` are left out [m], such as soles on the floor, or links whose geoms
+            overlap by construction; ``left_out`` has them. ``-inf``: no pair is left out. None: ``minimum_distance``,
+            but pairs that ``pairs`` gives by name are kept.
+        max_pairs: number of rows (static).
 
     Raises:
         KeyError: a name matches nothing.
         ValueError: no pair is left, or a number or shape does not fit.
 
     Warns:
-        OsikWarning: pairs that a glob of ``pairs`` asks for are left out, as they are too near at ``q0``.
+        OsikWarning: pairs are left out because they are too near at ``q0``.
 
     Attributes:
         left_out: names of the shapes of the pairs that are not kept apart because they are too near at ``q0`` (static).
@@ -126,7 +126,7 @@ class CollisionAvoidanceLimit(Limit):
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Return the names of the shapes that are kept apart, pair by pair, in the order of ``distances``."""
+        """Return the names of the shapes of each pair that is kept apart, in the order of ``distances``."""
         return self.scene.pair_names
 
     def distances(self, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
@@ -200,7 +200,7 @@ class CollisionAvoidanceLimit(Limit):
 
 
 def _time_to_meet(gap: Float[Array, " pairs"], jacobian: Float[Array, "pairs nv"]) -> Float[Array, " pairs"]:
-    """Time until pairs are too near [s], with each dof at 1 rad/s or m/s in the worst direction; constant."""
+    """Return the time until pairs are too near [s], with each dof at 1 rad/s or m/s in the worst direction."""
     # the choice of pairs is discrete and has no derivative
     gap, jacobian = jax.lax.stop_gradient((gap, jacobian))
     return gap / (jnp.sum(jnp.abs(jacobian), -1) + _SLOWEST)
@@ -232,7 +232,7 @@ def _apart_at_home(
     least: Float[Array, ""] | float,
     named: set[tuple[int, int]],
 ) -> tuple[list[tuple[int, int]], dict[tuple[int, int], float]]:
-    """Return the pairs no nearer than ``least`` at q0 or asked for by name, and the distances [m] of all others."""
+    """Return the pairs that are given by name or not nearer than ``least`` at q0, and the distances [m] of the rest."""
     if (isinstance(least, float) and least == -np.inf) or named.issuperset(possible):
         return list(possible), {}
     scene, added, cores = _assembled(robot, found, shapes, hulls, possible)
@@ -262,7 +262,7 @@ def _warn_of_left_out(shown: str, least: Float[Array, ""]) -> None:
 
 
 def _shown(found: Sequence[Member], near: Mapping[tuple[int, int], float]) -> str:
-    """Return pairs with their distances."""
+    """Return pairs with their distances, as text for messages."""
     return ", ".join(f"{found[i].label}-{found[j].label} ({d:.3g} m)" for (i, j), d in near.items())
 
 

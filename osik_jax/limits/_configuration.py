@@ -27,7 +27,7 @@ _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
 
 
 class ConfigurationLimit(Limit):
-    """Keeps joints in their range: ``gain (lower - q) / dt <= v <= gain (upper - q) / dt``.
+    """Limit that keeps joints in their range: ``gain (lower - q) / dt <= v <= gain (upper - q) / dt``.
 
     A step of dt with a velocity in this box ends inside the range to the last bit, rounding included. With a gain below
     1 a joint approaches the end of its range step by step.
@@ -146,7 +146,7 @@ def _own_return_speed(robot: Robot) -> Float[Array, " nv"]:
 
 
 def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None:
-    """Raise ValueError where a return speed can be seen not to be positive."""
+    """Raise ValueError if a concrete return speed is not positive."""
     seen = concrete(speed)
     if seen is not None and not (seen > 0.0).all():
         raise OsikValueError(f"return speeds have to be positive: {entries(seen, ~(seen > 0.0), names)}")
@@ -169,7 +169,7 @@ def _check_gain(gain: Array) -> None:
 
 
 def _check(robot: Robot, lower: np.ndarray, upper: np.ndarray) -> None:
-    """Raise ValueError with the joints' names."""
+    """Raise ValueError for invalid ranges, with the joints' names."""
     names = dof_names(robot)
     unordered = np.flatnonzero(~(lower <= upper))
     if len(unordered):

@@ -1,4 +1,4 @@
-"""Greatest speeds of a floating base."""
+"""Limits on the speeds of a floating base."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class FloatingBaseVelocityLimit(Limit):
     def box(
         self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-        """Return the speeds along the axes that v itself has."""
+        """Return the bounds along the axes of v."""
         lower, upper = super().box(robot, q, dt)
         first = robot.tree.dof_address[self.joint]
         speeds, start = (self.linear, first) if self.axes == "world" else (self.angular, first + 3)
@@ -75,9 +75,9 @@ class FloatingBaseVelocityLimit(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:
-        """Return rows for the other axes, with R the base's rotation. (3,) or none.
+        """Return three rows along the axes that v does not have; None without such speeds.
 
-        ``R' p'`` in the base's axes, ``R w`` in the world's.
+        With R the base's rotation, they are ``R' p'`` in the base's axes or ``R w`` in the world's.
         """
         del q, dt
         speeds = self.linear if self.axes == "base" else self.angular

@@ -1,4 +1,4 @@
-"""Any linear function of the velocity within bounds."""
+"""Limit on linear functions of the velocity."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LinearLimit(Limit):
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:
-        """Return the rows as they are."""
+        """Return the given rows."""
         del robot, kinematics, q, dt
         return LimitRows(self.matrix, self.lower, self.upper)
 

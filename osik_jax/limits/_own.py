@@ -14,10 +14,10 @@ _OWN: tuple[type[ConfigurationLimit] | type[VelocityLimit], ...] = (Configuratio
 
 
 class NoLimits(Limit):
-    """Mark that switches the robot's own limits off; see ``no_limits``."""
+    """Marker that switches off the robot's own limits; see ``no_limits``."""
 
     def parts(self) -> Sequence[Limit]:
-        """Return no limit: the mark bounds nothing."""
+        """Return no parts: the marker bounds nothing."""
         return ()
 
     def __repr__(self) -> str:

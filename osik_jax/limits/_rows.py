@@ -1,4 +1,4 @@
-"""Rows of limits that are no box: bounds on linear functions of the velocity."""
+"""Rows of limits that are not a box: bounds on linear functions of the velocity."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Greatest joint speeds."""
+"""Limits on joint speeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The three schemes: how tasks that cannot all be met share the robot. Same tasks, same limits, one call."""
+"""Schemes: three ways to decide between tasks that cannot all be met."""
 
 from ._hierarchical import HierarchicalQP as HierarchicalQP
 from ._null_space import NullSpace as NullSpace

@@ -1,4 +1,4 @@
-"""The scheme of a call that names none."""
+"""Default scheme of a call without ``scheme=``."""
 
 from __future__ import annotations
 

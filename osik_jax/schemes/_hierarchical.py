@@ -1,4 +1,4 @@
-"""Strict priorities: no task gives way to one below it (eq. 9)."""
+"""Strict priorities by hierarchical quadratic programs (eq. 9)."""
 
 from __future__ import annotations
 

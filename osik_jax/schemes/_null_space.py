@@ -21,36 +21,34 @@ METHODS: tuple[str, ...] = get_args(NullSpaceMethod)
 
 
 class NullSpace(Scheme):
-    """Each priority in the null space of those above it; what is left descends a joint-limit potential.
+    """Scheme that solves each priority in the null space of those above; the rest descends a joint-limit potential.
 
     The potential f = 1/(2 n) sum r_i / ((u_i - q_i)(q_i - l_i)), r_i = u_i - l_i, repels the n limited joints from
-    their limits; the motion is -potential_gain df/dq. Limits are not hard: the answer may leave its box, and
-    ``Solution.box_violation`` says by how much. Inequality rows count only while the levels above leave them violated.
+    their limits; the motion is -potential_gain df/dq. Limits are not hard: the answer may leave its box by
+    ``Solution.box_violation``. Inequality rows count only while the levels above leave them violated.
 
-    ``method="saturated"`` makes the limits hard (saturation in the null space): joints at their limits leave the work
-    to the others, a priority that cannot be met inside the limits is scaled down, keeping its direction, and the
-    potential is followed as nearly as the limits allow.
+    ``method="saturated"`` makes the limits hard (saturation in the null space). The other joints take over from joints
+    at their limits. A priority that cannot be met inside the limits is scaled down and keeps its direction.
 
-    ``method="reverse"`` builds the motion from the potential and the lowest priority up: the first is exact, up to its
-    damping, however the others conflict with it, and nothing jumps where a priority comes to depend on those above.
-    Limits are not hard there, and inequality rows count while what comes before them, the lower priorities, leaves them
-    violated.
+    ``method="reverse"`` builds the motion from the potential and the lowest priority up. The first priority is exact up
+    to its damping, and nothing jumps if a priority becomes dependent on those above. Limits are not hard. Inequality
+    rows count only while the lower priorities leave them violated.
 
-    Hard tasks and limits with rows are the first level, undamped. What it asks for and cannot have makes the answer
-    INFEASIBLE. Its inequality rows take part only where standing still violates them, and the levels below may break
-    the others: of limits, ``box_violation`` tells that too.
+    Hard tasks and limits with rows are the first level, without damping. If it cannot be met, the status is INFEASIBLE.
+    Its inequality rows count only if standing still violates them; the levels below may violate the others, and
+    ``box_violation`` covers that for limits.
 
     Attributes:
         method: "classical", from the first priority down; "reverse"; or "saturated" (static).
-        damping: of each priority's motion: s / (s^2 + damping) stands for 1 / s; 0 allowed.
-        curvature_damping: kappa, the fraction of what each priority's linear model leaves out that is added to its
-            damping, twice that below others; 0 for none. What is added vanishes where the tasks are met
+        damping: damping of each priority's motion: s / (s^2 + damping) replaces 1 / s; 0 allowed.
+        curvature_damping: kappa, the factor of the damping for the second-order terms that the linear model omits,
+            doubled for priorities below others; 0 for none. It vanishes where the tasks are met
             (``TaskRows.curvature``).
         potential_gain: alpha [rad^2/s]; 0 turns the potential off. It needs a ``ConfigurationLimit`` among the limits.
-        margin: joints are taken to be at least this fraction of their range away from either limit.
-        rank_tolerance: rows that stand out of the span of others by less than this fraction of the size (Frobenius
-            norm) of their level's weighted rows count as dependent on them.
-        backend: whose kernels compute, as in ``solve_nullspace`` (static).
+        margin: least distance of a joint to its limits in the potential, as a fraction of its range.
+        rank_tolerance: rows outside the span of other rows by less than this fraction of the Frobenius norm of their
+            level's weighted rows count as dependent.
+        backend: choice of kernels, as in ``solve_nullspace`` (static).
     """
 
     method: NullSpaceMethod = eqx.field(default="classical", static=True, kw_only=True)
@@ -67,7 +65,7 @@ class NullSpace(Scheme):
 
     @property
     def saturates(self) -> bool:
-        """Return whether the limits are hard."""
+        """Return whether joint limits are hard (``method="saturated"``)."""
         return self.method == "saturated"
 
     def solve(self, problem: VelocityProblem, warm_start: None = None) -> SchemeAnswer:
@@ -99,13 +97,13 @@ class NullSpace(Scheme):
         return SchemeAnswer(answer.x, status, count, count, jax.lax.stop_gradient(jnp.max(jnp.abs(gradient))))
 
     def _start(self, problem: VelocityProblem) -> Float[Array, " nv"]:
-        """Return where the first level begins: an inequality row that holds there takes no part in it."""
+        """Return the starting velocity of the first level; inequality rows that hold there are inactive in it."""
         nowhere = jnp.zeros_like(problem.position)
         return clipped(nowhere, problem.lower, problem.upper) if self.saturates else nowhere
 
 
 def _first_residual(first: Level, answer: NullSpaceSolution, problem: VelocityProblem) -> Float[Array, ""]:
-    """Return what the first priority misses of its scaled motion, as a gradient over the joints that can move."""
+    """Return the largest gradient entry, over joints that can move, of the first priority's unmet scaled motion."""
     start = clipped(jnp.zeros_like(answer.x), problem.lower, problem.upper)
     left = first.matrix @ (answer.x - start) + answer.scales[0] * first.distance(start)
     return jax.lax.stop_gradient(

@@ -26,21 +26,21 @@ from ..tasks._curvature import fraction_to_damp, near_part, row_sums, share_of_f
 
 
 class VelocityProblem(eqx.Module):
-    """One step: what the tasks ask of the velocity, and its limits.
+    """Problem of one step: rows of the tasks on the velocity v, and its limits.
 
     Attributes:
-        rows: of each task, by name.
-        priorities: of each task, by name; 1 first (static).
-        lower: of v, -inf where free. (nv,)
-        upper: of v, inf where free. (nv,)
-        position: of each dof [rad or m], 0 for ball and free joints. (nv,)
-        position_lower: of each dof, -inf where free or no ``ConfigurationLimit`` was given. (nv,)
-        position_upper: likewise, inf where free. (nv,)
+        rows: rows of each task, by name.
+        priorities: name and priority of each task; 1 is the most important (static).
+        lower: lower bounds of the box on v, -inf where free. (nv,)
+        upper: upper bounds of the box on v, inf where free. (nv,)
+        position: position of each dof [rad or m], 0 for ball and free joints. (nv,)
+        position_lower: lower end of each dof's range, -inf without a ``ConfigurationLimit``. (nv,)
+        position_upper: upper end of each dof's range, inf without one. (nv,)
         hard: names of the tasks that are constraints (static).
-        limit_rows: of the limits that are no box, all together; None where there are none.
+        limit_rows: rows of all limits that are not a box; None if there are none.
         dt: time of the step [s].
-        turning: dofs that turn something, which bends paths. (nv,)
-        scalar: dofs that are a joint of their own: not those of a ball or a free joint. (nv,)
+        turning: whether each dof rotates a body, which bends paths. (nv,)
+        scalar: whether each dof is a hinge or slide. (nv,)
     """
 
     rows: dict[str, TaskRows]
@@ -57,23 +57,23 @@ class VelocityProblem(eqx.Module):
     scalar: Bool[Array, " nv"] = eqx.field(default=True, converter=jnp.asarray)
 
     def soft(self) -> dict[str, TaskRows]:
-        """Return the rows of the tasks that are no constraints."""
+        """Return the rows of the tasks that are not constraints."""
         return {name: rows for name, rows in self.rows.items() if name not in self.hard}
 
     def by_priority(self) -> list[list[str]]:
-        """Return the names of the tasks of each priority, most important first; without those that are constraints."""
+        """Return the names of the tasks of each priority, most important first, without constraints."""
         ranked = [(name, rank) for name, rank in self.priorities if name not in self.hard]
         return [[name for name, own in ranked if own == rank] for rank in sorted({rank for _, rank in ranked})]
 
     def curvature(self, names: Iterable[str]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return a bound on what the linear model of these tasks leaves out, and the part of it to damp.
+        """Return a bound on the second-order terms that the linear model of these tasks omits, and the damping for it.
 
-        A step leaves ``1/2 dt^2 (grad^2 e)[v, v]`` of each error out; see ``TaskRows.curvature``. Tasks bend along
-        different chains, so their parts add up like the sides of a right angle.
+        The model omits ``1/2 dt^2 (grad^2 e)[v, v]`` of each error; see ``TaskRows.curvature``. The bounds of tasks
+        are combined as a Euclidean norm, because tasks bend along different chains.
 
-        Where all of them are near their targets, less than the whole bound counts (``near_part``). The part to damp is
-        what the tasks' own rows do not resist (``fraction_to_damp``). Of inequality tasks, whose rows may be inactive,
-        it is the whole bound.
+        Near the targets of all tasks only a part of the bound counts (``near_part``). The damping is the part that the
+        tasks' own rows do not resist (``fraction_to_damp``). For inequality tasks, whose rows may be inactive, it is
+        the whole bound.
 
         Returns:
             The bound and the damping, in the units of weight times J^2.
@@ -107,7 +107,7 @@ class VelocityProblem(eqx.Module):
         return safe_norm(jnp.concatenate([of_rest, bounds])), safe_norm(jnp.concatenate([of_rest, to_damp]))
 
     def _bounds(self, rows: Sequence[TaskRows]) -> Float[Array, " k"]:
-        """Return dt times the curvature of each; no number where all tasks are hard."""
+        """Return dt times the curvature of each task; empty without tasks."""
         return self.dt * jnp.stack([own.curvature for own in rows]) if rows else jnp.zeros(0, self.dt.dtype)
 
     def dampings(
@@ -120,13 +120,13 @@ class VelocityProblem(eqx.Module):
     ) -> list[Damping]:
         """Return the damping of each level of ``levels``.
 
-        The constraints get none, though they bend too: with damping, they would be missed.
+        Constraints have none although they bend too: with damping, they would be missed.
 
         Args:
-            constraints: as ``constraints`` has them.
-            constant: damping that each priority has anyway.
+            constraints: answer of ``constraints()``.
+            constant: constant damping of each priority.
             curvature: kappa, the factor of each priority's curvature damping.
-            below_others: whether the rows of the levels above a priority balance what it cannot meet.
+            below_others: whether rows of the levels above balance the unmet demand of a priority.
         """
         found, above = [], list(self.hard)
         if constraints is not None:
@@ -146,12 +146,12 @@ class VelocityProblem(eqx.Module):
         return found
 
     def curvature_above(self, names: Iterable[str], above: Sequence[str]) -> Float[Array, ""]:
-        """Return the bound on the curvature that these tasks meet in the rows above them.
+        """Return the bound on the curvature of the rows above these tasks, along the force that the tasks exert.
 
-        What a task cannot meet, the rows above balance, and these bend: a closed loop at its toggle point moves only at
-        second order. The force of the task and that of the rows above have about the same norm in the joints. Tasks
-        that bend themselves are damped for that (``curvature``), so for them closed loops count alone. Feet do not
-        count: legs bend little while they stand, and a hand would lag behind a target that it can reach.
+        The rows above balance the unmet demand of a task, and bend: a closed loop at its toggle point moves at second
+        order only. In the joints, the force of the task and that of the rows above have about the same norm. For tasks
+        with a curvature of their own (``curvature``) only closed loops count. Feet do not: legs bend little while they
+        stand, and a hand would lag behind a target within reach.
         """
         loops = [name for name in above if self.rows[name].closes_loop]
         rows = [self.rows[name] for name in names]
@@ -165,7 +165,7 @@ class VelocityProblem(eqx.Module):
         return safe_norm(jnp.stack(parts)) if parts else jnp.zeros((), self.lower.dtype)
 
     def _bending(self, names: Sequence[str]) -> Float[Array, ""]:
-        """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their size."""
+        """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their norm."""
         rows = [self.rows[name] for name in names]
         weight, squared = (
             jnp.concatenate(of_each) for of_each in ([r.weight for r in rows], [r.squared_lengths() for r in rows])
@@ -176,10 +176,10 @@ class VelocityProblem(eqx.Module):
         return quotient(greatest(self.bends(names)), jnp.where(size > 0.0, size, 1.0))
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
-        """Return what a motion of each dof costs these tasks at second order, for a unit residual (``row_sums``).
+        """Return the second-order cost of a motion of each dof for these tasks, for a unit residual (``row_sums``).
 
-        It is 0 for the dofs of ball and free joints: a box for the components of a turn would depend on where the
-        world's axes point. Where a robot stands, its legs keep its base from turning.
+        It is 0 for the dofs of ball and free joints: a box on the components of a rotation would depend on the world's
+        axes. If a robot stands, its legs keep its base from turning.
         """
         arms = [jnp.broadcast_to(self.rows[name].levers, self.lower.shape) for name in names]
         farthest = reduce(jnp.maximum, arms)  # a maximum over an axis has no derivative where XLA rounds it twice
@@ -194,7 +194,7 @@ class VelocityProblem(eqx.Module):
         return Level(matrix, lower, upper, weight, [r.is_equality for r in rows for _ in r.error])
 
     def constraints(self) -> Level | None:
-        """Return what has to hold beside the box as one level, hard tasks and then rows of limits; None for none."""
+        """Return hard tasks and then rows of limits as one level; None if there are none."""
         if self.limit_rows is None:
             return self.level(self.hard) if self.hard else None
         limit = self.limit_rows
@@ -202,12 +202,12 @@ class VelocityProblem(eqx.Module):
         return _joined(self.level(self.hard), rows) if self.hard else rows
 
     def levels(self, constraints: Level | None) -> list[Level]:
-        """Return the constraints, if there are any, and the priorities."""
+        """Return the constraints as the first level, if there are any, then the priorities."""
         ranked = [self.level(names) for names in self.by_priority()]
         return ranked if constraints is None else [constraints, *ranked]
 
     def slack(self, velocity: Float[Array, " nv"]) -> dict[str, Float[Array, " m"]]:
-        """Return J v minus the nearest point of the interval, of each task."""
+        """Return J v minus the nearest point of the interval, by task."""
         dense = {name: rows for name, rows in self.rows.items() if rows.dofs is None}
         values = {name: velocity[np.array(rows.dofs, int)] for name, rows in self.rows.items() if name not in dense}
         if dense:
@@ -228,9 +228,9 @@ def _joined(first: Level, second: Level) -> Level:
 def status_with(
     constraints: Level, status: Int[Array, ""], velocity: Float[Array, " nv"], *, start: Array | None = None
 ) -> Int[Array, ""]:
-    """Return INFEASIBLE in the place of SOLVED where the velocity misses a constraint.
+    """Return the status, with INFEASIBLE in place of SOLVED if the velocity misses a constraint.
 
-    With a ``start`` only those count that are equalities or violated there (what a projection looks at). (nv,)
+    With a ``start`` (nv,), inequalities that hold there do not count, as in a projection.
     """
     level = constraints.scaled()
     finite = [jnp.where(jnp.isfinite(b), jnp.abs(b), jnp.inf) for b in (level.lower, level.upper)]
@@ -255,9 +255,9 @@ class SchemeAnswer(eqx.Module):
 
 
 class Scheme(Replaceable):
-    """Base of the schemes: how tasks that cannot all be met are weighed against each other.
+    """Base of the schemes, which decide between tasks that cannot all be met.
 
-    ``scheme.replace(name=value, ...)`` is the same scheme with other numbers, those that ``scheme.replaceable`` lists.
+    ``scheme.replace(name=value, ...)`` returns the scheme with other numbers; ``scheme.replaceable`` lists their names.
     """
 
     @abc.abstractmethod
@@ -266,8 +266,8 @@ class Scheme(Replaceable):
 
         Args:
             problem: the step.
-            warm_start: what the answer to a step nearby had in ``warm_start``; integers, all zeros for a cold start. It
-                changes the time that the answer takes, and not the answer.
+            warm_start: ``warm_start`` of the answer to a similar step; integers, all zeros for a cold start. It
+                changes the computing time, not the answer.
         """
 
     def _convert(self, name: str, value: Any) -> Any:
@@ -275,7 +275,7 @@ class Scheme(Replaceable):
 
 
 def as_max_iterations(value: Any) -> int | None:
-    """Return a maximum of iterations: an integer from 0 up, Python's or NumPy's, or None.
+    """Return a checked maximum of iterations: an integer from 0 up, or None.
 
     Raises:
         ValueError: anything else.
@@ -288,5 +288,5 @@ def as_max_iterations(value: Any) -> int | None:
 
 
 def as_leaf(name: str) -> Callable[[ArrayLike | Array], Float[Array, ""]]:
-    """Return a converter of a scheme's number to a traced leaf, which names it where it is negative or not finite."""
+    """Return a converter of a scheme's number to an array leaf; its errors for negative or infinite values name it."""
     return lambda value: as_scalar(value, name)

@@ -23,22 +23,24 @@ from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, as_max_iter
 
 
 class WeightedQP(Scheme):
-    """min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2  subject to the box.
+    """Scheme of one quadratic program: tasks share the robot by their weights.
+
+        min 1/2 sum_i weight_i |J_i v - wanted_i|^2 + 1/2 damping |v|^2     subject to the box
 
     Weights multiply squared residuals (pink and mink: ``weight = cost**2``). Rows of inequality tasks cost the square
-    of their distance to the interval (soft rows). Hard tasks and limits with rows are constraints (hard rows). Where
-    these are infeasible, together or with the box, they are missed by as little as can be and the answer is INFEASIBLE.
-    Priorities are ignored. Smooth where tasks conflict; no task is met exactly while another asks for something else.
+    of their distance to the interval (soft rows). Hard tasks and limits with rows are constraints (hard rows). If these
+    are infeasible, the status is INFEASIBLE, and they are violated as little as possible. Priorities are ignored. The
+    answer is smooth where tasks conflict, and then no task is met exactly.
 
     Attributes:
-        damping: of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, the diagonal
-            term of a dof, its damping and its posture together, is at least 4 epsilon times the largest weight times
-            row norm squared.
-        curvature_damping: kappa, the fraction of what the linear model leaves out that is added to the damping; 0 for
-            none. What is added vanishes where the tasks are met (``TaskRows.curvature``); where the damping and the
-            posture are strong enough by themselves, it vanishes with the square of the tasks' error.
+        damping: damping of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, the
+            diagonal term of a dof, its damping and its posture together, is at least 4 epsilon times the largest weight
+            times row norm squared.
+        curvature_damping: kappa, the factor of the damping for the second-order terms that the linear model omits; 0
+            for none. It vanishes where the tasks are met (``TaskRows.curvature``). For a dof that its damping and
+            posture hold strongly, it vanishes with the square of the tasks' error.
         max_iterations: limit on changes of the active set (static).
-        backend: whose candidates for the answer are taken, as in ``solve_least_squares_qp`` (static).
+        backend: choice of kernels, as in ``solve_least_squares_qp`` (static).
     """
 
     damping: Float[Array, ""] = eqx.field(default=1e-8, converter=as_leaf("damping"))
@@ -83,7 +85,7 @@ class WeightedQP(Scheme):
 
 
 def _least_damping(problem: VelocityProblem, backend: Backend) -> Float[Array, ""]:
-    """Return the weakest damping that a kernel of single precision tells from the Hessian's roundoff; 0 without one."""
+    """Return the least damping above the Hessian's roundoff in a single-precision kernel; 0 if there is none."""
     rows = list(problem.soft().values())
     dtype = problem.lower.dtype
     if dtype != jnp.float32 or not rows or not takes(backend, "core-cuda", fits=_cuda.installed()):
@@ -104,9 +106,9 @@ def _diagonal_terms(
 ) -> dict[str, Array]:
     """Return the cost ``1/2 sum_i d_i (v_i - center_i)^2`` of the damping and of rows on one dof each.
 
-    With b the bound on the tasks' curvature, a dof whose terms are d gets the fraction ``b / (b + 30 d)`` of the
-    curvature damping: nearly all of it where a target is far out of reach, and next to none where its damping or its
-    posture damps it enough already (docs/paper.md, "Curvature damping").
+    With the bound b on the tasks' curvature, a dof whose terms are d gets the fraction ``b / (b + 30 d)`` of the
+    curvature damping: nearly all of it if a target is far out of reach, and almost none if its damping or its posture
+    is strong enough (docs/dev/derivations.md, "Curvature damping").
 
     Args:
         single_dof: rows of tasks that ask for the velocity of one dof each.

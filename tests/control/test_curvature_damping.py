@@ -215,7 +215,7 @@ def test_derivatives_where_little_room_is_left(scheme, arm):
 @pytest.mark.parametrize("error", [0.0, 0.02, 0.8])
 @pytest.mark.parametrize("posture", [0.0, 3e-4, 0.1])
 def test_a_posture_makes_up_for_it_in_a_weighted_program(arm, posture, error):
-    """Without limits the answer is that of a linear system, here with the damping that docs/paper.md states."""
+    """Without limits the answer is that of a linear system, here with the damping of docs/dev/derivations.md."""
     kappa, damping = 1.25, 1e-8
     q = bent(arm)
     kinematics = kinematics_at(arm, q)

@@ -70,7 +70,7 @@ def test_mjcf_and_urdf_by_name():
 
 
 def test_the_command_that_checks_one(monkeypatch: pytest.MonkeyPatch):
-    """Poses against MuJoCo C, as docs/robots.md tells users to do with a robot of Menagerie."""
+    """Poses against MuJoCo C, as for a robot of Menagerie."""
     robots_table = importlib.import_module("benchmarks.robots_table")
     monkeypatch.setattr(robots_table, "CALLS", 2)
     row = robots_table.row("toy_mj_description")
