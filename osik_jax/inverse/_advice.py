@@ -1,4 +1,4 @@
-"""Advice on the rows to free, where an arm has fewer joints than its frames have rows."""
+"""Advice on rows to leave out, for arms with fewer joints than their frames have rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SINGULAR = 1e-6
 
 
 def advice(robot: Robot, rows: Mapping[str, tuple[bool, ...]]) -> tuple[str, ...]:
-    """Return a sentence for each frame that asks for more rows than joints carry it, and names rows to leave out.
+    """Return a sentence for each frame with more rows than joints, with the rows to leave out.
 
     Args:
         robot: the robot.
@@ -54,7 +54,7 @@ def _line(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> str
 
 
 def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> tuple[tuple[bool, ...], str]:
-    """Return the rows that the joints move best, and their axes: with the whole position where it can be kept."""
+    """Return the rows that the joints move best, and their axes; all position rows are kept if possible."""
     matrices = {axes: np.asarray(own) for axes, own in zip(("world", "frame"), _jacobians(robot, frame), strict=True)}
     sets = list(combinations(np.flatnonzero(asked).tolist(), joints))
 

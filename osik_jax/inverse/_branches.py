@@ -20,7 +20,7 @@ _ISOLATED_SEPARATION = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
-    """The entries of q that a search moves.
+    """Entries of q that a search moves.
 
     Attributes:
         entries: their numbers.

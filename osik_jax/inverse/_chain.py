@@ -1,4 +1,4 @@
-"""The kinematics of a few frames, for many configurations at once: lanes are the last axis of every array.
+"""Kinematics of a few frames for many configurations at once; the last axis of every array is that of lanes.
 
 A search evaluates hundreds of configurations a target. With the lanes last, every operation is one pass over contiguous
 numbers, on a CPU and on a GPU. Of the robot, only the joints that carry one of the frames take part.
@@ -48,7 +48,7 @@ class Layout(NamedTuple):
 
 
 class Chain(eqx.Module):
-    """A robot's geometry, as far as the frames depend on it.
+    """Geometry of the part of a robot on which the frames depend.
 
     The pose of a joint's far side in its near side is ``constant + f(angle) first + g(angle) second``, with sine and
     versine of a hinge's angle, or the travel of a slide and 0.
@@ -135,7 +135,7 @@ def make_chain(robot: Robot, frames: Sequence[str], layout: Layout) -> Chain:
 def _before_joints(
     robot: Robot, bodies: np.ndarray, first_of_body: np.ndarray
 ) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
-    """Return, for each joint, the pose of its body before the body's first joint, in the frame before.
+    """Return, for each joint, its body's fixed pose relative to the preceding joint's far side.
 
     Bodies that are fixed to others are one body with them, so that there is a joint on each body of a path.
     """
@@ -246,7 +246,7 @@ def _joined(pose: Float[Array, "3 4 lanes"], own: Float[Array, "3 4 lanes"]) -> 
 
 
 def _times(a: Float[Array, "*k m 3 lanes"], b: Float[Array, "*k 3 n lanes"]) -> Float[Array, "*k m n lanes"]:
-    """Return the matrix product of each lane, written out: three products of arrays."""
+    """Return the matrix product of each lane, as three products of arrays."""
     first, second, third = (a[..., :, i, None, :] * b[..., i, None, :, :] for i in range(3))
     return first + second + third
 
@@ -258,7 +258,7 @@ def jacobian(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames 
 
 
 def _joint_columns(chain: Chain, kinematics: ChainKinematics) -> Float[Array, "frames k 6 lanes"]:
-    """Return the same as ``_body_columns`` over the chain's joints."""
+    """Return the Jacobian columns of ``_body_columns``, over the chain's joints."""
     layout = chain.layout
     hinge = np.array(layout.hinges)[:, None, None]
     columns = []

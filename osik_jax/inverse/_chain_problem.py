@@ -1,4 +1,4 @@
-"""Frames, limits and tolerances as a search, and what a search found as an answer."""
+"""Searches for poses of frames: set-up from frames, limits and tolerances, and evaluation of the answers."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Settings(NamedTuple):
 
 
 class ChainRoute(NamedTuple):
-    """Poses of frames that hinges and slides carry; hashable.
+    """Problem of poses of frames whose chains have hinges and slides only; hashable.
 
     Attributes:
         frames: names.
@@ -64,7 +64,7 @@ class ChainRoute(NamedTuple):
 
     @property
     def starts_anew(self) -> bool:
-        """Return whether the way to the least error begins with new searches, and is part of traced programs."""
+        """Return whether the search for the least error starts anew, and is part of traced programs."""
         return True
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
@@ -80,7 +80,7 @@ class ChainRoute(NamedTuple):
         return np.array(chain_layout(robot.tree, self.frames).dofs, int)
 
     def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
-        """Return the rows of each frame that count."""
+        """Return which rows of each frame are used."""
         del settings
         return dict(zip(self.frames, self.rows, strict=True))
 
@@ -161,7 +161,7 @@ def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array,
 
 
 def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
-    """Return the length of the links to each frame [m], slides extended, and where the first joint is. (frames, 3)."""
+    """Return the links' length to each frame [m], slides extended, and the first joint's position. (frames, 3)."""
     kinematics, layout = chain_kinematics(chain, x[:, None]), chain.layout
     travel = jnp.maximum(jnp.abs(upper - x), jnp.abs(lower - x))
     lengths, roots = [], []

@@ -1,4 +1,4 @@
-"""Searches for poses of frames that hinges and slides carry, with nothing but a box around the joints."""
+"""Searches for poses of frames whose chains have hinges and slides, with joint limits alone."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class ChainSearch(eqx.Module):
     enough: Float[Array, ""]
 
     def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
-        """Return the starts of the searches with these numbers."""
+        """Return the starts of the searches with these indices."""
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         if self.near:
@@ -133,7 +133,7 @@ class ChainSearch(eqx.Module):
         return jnp.where(done, x, jnp.clip(x + move, lower, upper)), errors
 
     def newton_step(self, x: Float[Array, " n"], goal: Goal) -> Float[Array, " n"]:
-        """Return the shortest step to the goal by the linear model at x; what stands at a limit goes with the limit."""
+        """Return the shortest step to the goal by the linear model at x; joints at a limit move with it."""
         aim = Goal(goal.position[..., None], goal.rotation[..., None])
         error, matrix, _ = self.linearised(x[:, None], aim)
         low, high = x <= self.lower, x >= self.upper
@@ -154,7 +154,7 @@ class ChainSearch(eqx.Module):
         return jnp.sqrt(jnp.sum((x - self.first) ** 2))
 
     def finishing(self, exact: bool) -> ChainSearch:
-        """Return the same search without the term that draws it to the first configuration, for the last steps.
+        """Return the search for the last steps, without the term that pulls towards the first configuration.
 
         ``exact``: it goes on beyond what the tolerances ask for.
         """
@@ -162,7 +162,7 @@ class ChainSearch(eqx.Module):
         return dataclasses.replace(self, near=False, enough=enough)
 
     def isolated(self, x: Float[Array, "lanes n"], goal: Goal) -> Bool[Array, " lanes"]:
-        """Return whether a solution is the only one around: every motion of the joints takes a frame off its target."""
+        """Return whether a solution is isolated: every motion of the joints moves a frame off its target."""
         matrix = self.linearised(x.T, lanes_last(goal))[1]
         if len(matrix) < x.shape[1]:
             # with fewer rows than joints there is always a motion that keeps the frames
@@ -184,7 +184,7 @@ class ChainSearch(eqx.Module):
         return found.x.T, jnp.sqrt(2.0 * found.cost), found.steps
 
     def _measuring(self) -> ChainSearch:
-        """Return the same errors, with a radian for as many metres as the tolerances say."""
+        """Return the search with errors in which a radian counts as the tolerances' ratio in metres."""
         return dataclasses.replace(self, length=self.tolerance[0] / self.tolerance[1])
 
     def model(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Array]:
@@ -198,14 +198,14 @@ class ChainSearch(eqx.Module):
         return error, matrix, curvature(self.chain, kinematics, linear, angular, self.length)
 
     def linearised(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
-        """Return the error of each row that counts [m], its derivative (rows, n, lanes), and the frames' errors."""
+        """Return the error of each used row [m], its derivative (rows, n, lanes), and the frames' errors."""
         error, matrix, (_, linear, angular) = self._rows(x, goal)
         return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
 
     def _rows(
         self, x: Float[Array, "n lanes"], goal: Goal
     ) -> tuple[Array, Array, tuple[ChainKinematics, Array, Array]]:
-        """Return the error of each row that counts, its derivative, and the kinematics and errors behind them."""
+        """Return the error of each used row, its derivative, and the kinematics and errors of the frames."""
         kinematics = chain_kinematics(self.chain, x)
         linear = kinematics.position - goal.position
         angular = rotation_error(kinematics.rotation, goal.rotation)

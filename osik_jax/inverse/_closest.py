@@ -1,4 +1,4 @@
-"""The configuration with the least error, for targets that no search has met."""
+"""Configurations with the least error, for targets that no search has met."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _EQUAL = 0.01
 
 
 class Closest(NamedTuple):
-    """The best local optimum of each target.
+    """Best local optimum of each target.
 
     Attributes:
         x: coordinates. (targets, n)
@@ -31,7 +31,7 @@ class Closest(NamedTuple):
 def closest(
     search: Any, goals: Any, x: Float[Array, "targets seeds n"], open_: Bool[Array, " targets"], *, near: bool
 ) -> Closest:
-    """Go on from the most promising of each target's searches to local optima, and take the best.
+    """Continue from the most promising searches of each target to local optima, and return the best.
 
     The best overall would often be of one basin, that of the searches that converge fastest. So the searches form
     groups, and the best of each group goes on.

@@ -1,4 +1,4 @@
-"""A search of a fixed length: a pure function of arrays, with shapes and work that depend on no number."""
+"""Searches of a fixed length, as a pure function of arrays for traced programs."""
 
 from __future__ import annotations
 
@@ -63,5 +63,5 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
 
 
 def at_solution(search: Any, goal: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x, found by a search that is not differentiated, with the derivative of a solution."""
+    """Return x, the result of an undifferentiated search, with the derivative of a solution."""
     return attached(jax.lax.stop_gradient(x), search, goal)

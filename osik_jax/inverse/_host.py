@@ -22,14 +22,14 @@ _LANES_EACH = 8
 
 
 def lanes_for(targets: int) -> int:
-    """Return the number of searches that go on together for so many targets."""
+    """Return the number of simultaneous searches for this number of targets."""
     backend = jax.default_backend()
     wanted = targets if backend == "cpu" else _LANES_EACH * targets
     return min(max(_power_of_two(wanted), _FEWEST_LANES), _MOST_LANES.get(backend, _OTHER_LANES))
 
 
 def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
-    """Return ``function(goals, open)`` computed in chunks of the targets; a chunk is filled up with targets not open.
+    """Return ``function(goals, open)`` computed in chunks of targets, padded with targets that are not open.
 
     On a CPU, chunks run in threads side by side: XLA runs a program in the thread that calls it. What comes out does
     not depend on how many there are.
@@ -61,7 +61,7 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
 
 
 def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
-    """Return ``function(*args)`` of the chosen targets alone, filled up to a power of two; others get any numbers.
+    """Return ``function(*args)`` for the chosen targets, padded to a power of two; results of others are undefined.
 
     Args:
         chosen: targets, at least one. (targets,)

@@ -1,4 +1,4 @@
-"""The derivative of what a search has found, which does not differentiate the search."""
+"""Implicit derivative of the result of a search."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..execution._rules import custom_jvp
 
 @custom_jvp
 def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"]:
-    """Return x as it is, with the derivative by the problem that it solves.
+    """Return x unchanged, with its derivative by the problem that it solves.
 
     Where ``error(x, problem) = 0``, the implicit function theorem gives ``J dx = -d error``: of all such dx the
     shortest, over the coordinates that stand at no limit; those that do move with their limit. That is the derivative

@@ -55,7 +55,7 @@ def inverse_kinematics(
     restarts: int = _RESTARTS,
     closest: bool = True,
 ) -> InverseKinematicsSolution:
-    """Return configurations that bring frames to poses, or meet tasks; or the best that was found, and what stops it.
+    """Return configurations that bring frames to poses, or meet tasks; else the best ones, with the reason.
 
     Searches start at quasi-random configurations within the limits. Those that make no progress are given up for
     others, and each target is searched for until it is found or has had ``seeds * (1 + restarts)`` of them. Poses of
@@ -147,7 +147,7 @@ def inverse_kinematics(
 
 
 def default_seeds(coordinates: int, every: bool) -> int:
-    """Return the number of searches for a target that moves so many coordinates: more where all solutions count."""
+    """Return the default number of searches for a number of coordinates; larger if all solutions are wanted."""
     return int(np.clip(2 ** min(coordinates + 2, 30), _SEEDS, _MOST_SEEDS)) if every else _SEEDS
 
 
@@ -183,7 +183,7 @@ def _inward(bound: Array, sign: float) -> Array:
 
 
 def _together(values: Sequence[Any]) -> Any:
-    """Return one array, NumPy's where nothing is traced, because operations of JAX cost more than a search."""
+    """Return the stacked values, by NumPy unless traced, because JAX's dispatch costs more than a search."""
     return (jnp if _is_traced(values) else np).stack(values)
 
 

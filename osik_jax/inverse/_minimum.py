@@ -51,7 +51,7 @@ class Minimum(NamedTuple):
 
 
 class _State(NamedTuple):
-    """A lane's best configuration with the model there, and a configuration to try."""
+    """Best configuration of a lane with its quadratic model, and a trial configuration."""
 
     x: Float[Array, "n lanes"]
     cost: Float[Array, " lanes"]
@@ -71,7 +71,7 @@ def minimum(
     open_: Bool[Array, " lanes"],
     gain: Float[Array, ""],
 ) -> Minimum:
-    """Go from each start to a local minimum within the box.
+    """Descend from each start to a local minimum within the box.
 
     Args:
         model: the errors and their derivatives.
@@ -100,7 +100,7 @@ def minimum(
 
 
 def _step(model: Model, lower: Array, upper: Array, gain: Array, state: _State) -> _State:
-    """Take each lane's trial where it lowers the cost, and make the next one, with more damping where it does not."""
+    """Accept each lane's trial if it lowers the cost, else raise its damping; make the next trial."""
     new = model(state.trial)
     cost = 0.5 * jnp.sum(new[0] ** 2, 0)
     better = state.open_ & (cost < state.cost)
@@ -132,7 +132,7 @@ def _move(
     curvature: Float[Array, "n n lanes"],
     damping: Float[Array, " lanes"],
 ) -> Float[Array, "n lanes"]:
-    """Return a damped Newton step, or one of Gauss and Newton where the damped Hessian is not positive definite."""
+    """Return a damped Newton step, or a Gauss-Newton step if the damped Hessian is not positive definite."""
     squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
     scale = jnp.maximum(jnp.max(jnp.sum(matrix**2, 0), 0), jnp.finfo(gradient.dtype).tiny)
     ridged = squares + damping * scale * jnp.eye(len(gradient), dtype=gradient.dtype)[..., None]

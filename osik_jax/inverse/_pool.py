@@ -1,4 +1,4 @@
-"""Many searches on a fixed number of lanes: a lane that ends takes up the next search, until none is left."""
+"""Many searches on a fixed number of lanes: a lane whose search ends takes the next one."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class Errors(NamedTuple):
 
 @runtime_checkable
 class Search(Protocol):
-    """A search method: a pytree, whose methods take arrays with the lanes in front."""
+    """Base class of a search: a pytree whose methods take arrays with a leading axis of lanes."""
 
     def begin(self, seed: Int[Array, " lanes"], goal: Any) -> Float[Array, "lanes n"]:
-        """Return the starts of the searches with these numbers."""
+        """Return the starts of the searches with these indices."""
         ...
 
     def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: int) -> tuple[Array, Array, Errors]:
@@ -46,7 +46,7 @@ class Search(Protocol):
 
 
 class Found(NamedTuple):
-    """The best of each target's searches.
+    """Best result of each target's searches.
 
     Attributes:
         x: coordinates.
@@ -86,7 +86,7 @@ def run_pool(
     longest: Int[Array, ""],
     enough: Float[Array, ""],
 ) -> Found:
-    """Search for all targets until each is found or has had all its seeds.
+    """Search for all targets until each is found or has used all its seeds.
 
     Deterministic: which search a lane takes up depends on nothing but the arguments.
 
@@ -117,12 +117,12 @@ def run_pool(
 
 
 def _of(goals: Any, target: Int[Array, " lanes"]) -> Any:
-    """Return each lane's goal; idle lanes have the last one's."""
+    """Return the goal of each lane; idle lanes have the last goal."""
     return jax.tree.map(lambda a: jnp.take(a, target, axis=0, mode="clip"), goals)
 
 
 def _first_state(size: Any, targets: int, lanes: int) -> _State:
-    """Return all lanes idle. Arrays over targets have one more row, to which idle lanes write."""
+    """Return the initial state with idle lanes. Arrays over targets have one more row for idle lanes."""
     worst = jnp.full(targets + 1, jnp.inf, size.dtype)
     none = jnp.zeros(targets + 1, jnp.int32)
     idle = jnp.zeros(lanes, jnp.int32)
@@ -135,12 +135,12 @@ def _first_state(size: Any, targets: int, lanes: int) -> _State:
 
 
 def _wanting(state: _State, open_: Array, seeds: Array, enough: Array) -> Bool[Array, " targets"]:
-    """Return targets that another search could help."""
+    """Return which targets need another search."""
     return open_ & (state.started[:-1] < seeds) & (state.found.errors.score[:-1] > enough)
 
 
 def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Array, state: _State) -> _State:
-    """Give idle lanes new searches for the targets that want one, in turn."""
+    """Give idle lanes new searches for the targets that need one, in turn."""
     targets = len(open_)
     wanting = _wanting(state, open_, seeds, enough)
     rank = jnp.cumsum(wanting, dtype=jnp.int32)
@@ -191,7 +191,7 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
 
 
 def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, longest: Array, enough: Array) -> _Lanes:
-    """End searches whose target is found, that are too long, or that no longer make progress."""
+    """End searches whose target is found, that are too long, or that make no progress."""
     age = lanes.age + CHECK
     # the negated comparison also ends a search whose cost is NaN
     stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)

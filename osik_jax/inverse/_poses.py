@@ -28,7 +28,7 @@ _ACCEPTED = (
 
 
 def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tuple[bool, ...], ...], int | None]:
-    """Return goals (targets, frames, ...), the rows of each frame that count, and the number of targets.
+    """Return goals (targets, frames, ...), which rows of each frame are used, and the number of targets.
 
     The number is None for one target that is no batch.
 

@@ -1,4 +1,4 @@
-"""Execution of the searches of many targets: as many as each target needs, or a fixed number of each."""
+"""Searches for many targets: as many as each target needs, or a fixed number for each."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def explored(
     every: bool,
     go_on: bool,
 ) -> tuple[InverseKinematicsSolution, Outcomes, Bool[Array, "targets seeds"] | None]:
-    """Return all searches of each target, to their ends, and with ``every`` whether solutions are isolated.
+    """Return the results of all searches of each target; with ``every`` also whether solutions are isolated.
 
     It is a pure function of a limited amount of work.
     """

@@ -1,4 +1,4 @@
-"""Starts of searches: a sequence of points whose every prefix fills a box evenly."""
+"""Starts of searches: a sequence of points, each prefix of which fills a box evenly."""
 
 from __future__ import annotations
 

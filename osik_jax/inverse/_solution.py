@@ -16,7 +16,7 @@ _NEAR = 5e-3
 
 
 class InverseKinematicsSolution(eqx.Module):
-    """Configurations that put frames where they have to be, or come as near as was found; one, or with a leading axis.
+    """Answer of inverse kinematics: the configuration found, or the best one; many targets have a leading axis.
 
     Attributes:
         q: the best configuration, its joints within their limits exactly. (..., nq)
@@ -101,6 +101,6 @@ class InverseKinematicsSolution(eqx.Module):
 
 
 def _miss(residual: np.ndarray) -> str:
-    """Return a residual in words."""
+    """Return a residual as text."""
     numbers = " ".join(f"{value:+.3g}" for value in residual)
     return f"off by {numbers}" + (" (x y z [m], rotation about x y z [rad])" if len(residual) == 6 else "")

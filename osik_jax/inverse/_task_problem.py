@@ -1,4 +1,4 @@
-"""Tasks, limits and tolerances as a search, and what a search found as an answer."""
+"""Searches for tasks: set-up from tasks, limits and tolerances, and evaluation of the answers."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class TaskParts(NamedTuple):
 
 
 class _ProjectedRange(ConfigurationLimit):
-    """Ranges for a search, which turns ball joints back into their range after each step: no margin, no short steps."""
+    """Joint ranges for a search, which projects ball joints into their range after each step."""
 
     ball_margin: ClassVar[float] = 0.0
     ball_step: ClassVar[float] = float("inf")
 
 
 class TaskRoute(NamedTuple):
-    """Tasks and limits of any kind; hashable."""
+    """Problem of tasks and limits of any kind; hashable."""
 
     @property
     def starts_anew(self) -> bool:
@@ -99,7 +99,7 @@ class TaskRoute(NamedTuple):
         return np.arange(robot.nq)
 
     def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
-        """Return the rows of each frame that a task asks for."""
+        """Return which rows of each frame the tasks use."""
         tasks = settings.parts.tasks.values()
         return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
 
@@ -132,7 +132,7 @@ class TaskRoute(NamedTuple):
 
 
 def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
-    """Return tasks as they are searched with: gains 1, targets at rest.
+    """Return the tasks for a search: with gains of 1 and targets at rest.
 
     Raises:
         TypeError: something that is no task.
@@ -160,7 +160,7 @@ def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ..
 
 
 def _unhurried(robot: Robot, limit: Limit) -> Limit:
-    """Return the limit as a search uses it."""
+    """Return the limit in the form that a search uses."""
     if isinstance(limit, ConfigurationLimit):
         return _ProjectedRange(robot, lower=limit.lower, upper=limit.upper)  # pyright: ignore[reportCallIssue]
     return limit if "gain" not in limit.replaceable else limit.replace(gain=1.0)

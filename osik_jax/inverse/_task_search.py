@@ -1,4 +1,4 @@
-"""Searches by the schemes' own steps: any tasks, limits with rows, priorities, floating bases."""
+"""Searches by steps of a scheme: for any tasks, limits with rows, priorities and floating bases."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Aims(NamedTuple):
 
 
 class TaskSearch(eqx.Module):
-    """Steps of a scheme with every error asked to vanish at once, and no limit on speeds but a longest step.
+    """Search by steps of a scheme that ask for the whole error at once, limited by a longest step.
 
     The tasks' own curvature, as damping, keeps long steps in check. Tasks that are no goals fade out as the goals are
     met, so that a posture decides between solutions and never keeps the goals from being met.
@@ -121,7 +121,7 @@ class TaskSearch(eqx.Module):
     preferred: Float[Array, ""]
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
-        """Return the starts of the searches: the first configuration, then points ever further from it."""
+        """Return the starts of the searches: the first configuration, then points at growing distances from it."""
         del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
@@ -163,7 +163,7 @@ class TaskSearch(eqx.Module):
         return self._moved(q, self.scheme.solve(self._problem(q, goals)).velocity) - q
 
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
-        """Return the goals' rows at q, and how far it is from meeting them."""
+        """Return the rows of the goals at q, and their errors."""
         goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
         kinematics = forward_kinematics(self.robot, q)
         rows = rows_of(self.robot, kinematics, q, {name: task.during(1.0) for name, task in goals.items()})
@@ -209,7 +209,7 @@ class TaskSearch(eqx.Module):
         return jnp.sqrt(jnp.sum(difference(self.robot, self.first, q) ** 2))
 
     def finishing(self, exact: bool) -> TaskSearch:
-        """Return the same search, for the last steps."""
+        """Return the search for the last steps: unchanged."""
         return dataclasses.replace(self, enough=jnp.zeros_like(self.enough)) if exact else self
 
     def isolated(self, x: Float[Array, "lanes nq"], goal: Aims) -> Bool[Array, " lanes"]:
@@ -261,7 +261,7 @@ class TaskSearch(eqx.Module):
 
 
 def damped(scheme: Scheme, factor: float) -> Scheme:
-    """Return the scheme with so many times its curvature damping."""
+    """Return the scheme with its curvature damping multiplied by a factor."""
     if "curvature_damping" not in scheme.replaceable:
         return scheme
     return scheme.replace(curvature_damping=factor * scheme.curvature_damping)  # pyright: ignore
@@ -273,7 +273,7 @@ def is_goal(task: Task) -> bool:
 
 
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
-    """Return how far a task is off in metres and in radians; other units count as metres."""
+    """Return the error of a task in metres and in radians; other units count as metres."""
     position = position_rows(task, len(rows.error))
     residual = jnp.where(rows.weight > 0.0, rows.pull, 0.0)
     parts = (jnp.sum(jnp.where(mask, residual, 0.0) ** 2) for mask in (position, ~position))

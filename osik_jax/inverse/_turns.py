@@ -37,13 +37,13 @@ def unwound(
 def one_turn(
     lower: Float[Array, " n"], upper: Float[Array, " n"], about: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return the ends of one turn within limits that are further apart, around a configuration as far as they allow."""
+    """Return bounds one turn apart within wider limits, centred on a configuration as far as possible."""
     low = jnp.clip(about - 0.5 * TURN, lower, upper - TURN)
     return low, low + TURN
 
 
 def apart(x: Float[np.ndarray, "*k n"], other: Float[np.ndarray, " n"], turns: np.ndarray) -> Float[np.ndarray, "*k"]:
-    """Return the largest difference of a coordinate, whole turns left out [rad or m]."""
+    """Return the largest difference of a coordinate, modulo whole turns [rad or m]."""
     difference = x - other
     turned = difference - TURN * np.round(difference / TURN)
     return np.abs(np.where(turns, turned, difference)).max(-1)

@@ -1,4 +1,4 @@
-"""A controller, robot and all, as one file."""
+"""Controllers as JSON files: robot, tasks, scheme, limits and dt."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
 
 
 def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
-    """Return the controller of a file's content, for the robot that the content makes."""
+    """Return the controller of a file's content, with its robot."""
     return Controller(
         robot=robot,
         tasks={name: decode(task, robot.tree) for name, task in content["tasks"]},
@@ -143,7 +143,7 @@ def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
 
 
 def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, Any]:
-    """Return how to make the robot again: its model; or a name or a file with its hash, and all of its numbers."""
+    """Return the robot as data: its model, or a name or file with its hash, and all its numbers."""
     options = {"floating_base": robot.floating_base, "locked_joints": list(robot.locked_joints)}
     if source is None:
         return {"mjcf": robot.to_mjcf(), "dtype": str(robot.q0.dtype)} | options
@@ -159,7 +159,7 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, An
 
 
 def _check_written(saved: Controller, content: Mapping[str, Any]) -> Controller:
-    """Return the controller read from its content; raise where it asks for another step.
+    """Return the controller read from the content; raise ValueError if its step differs.
 
     Locked joints and fused bodies are written as one body, so masses, shapes and numbers of bodies may differ. What
     counts is what a step sees: it is compared at home and beside it.
@@ -230,7 +230,7 @@ def _hash(file: Path) -> str:
 
 
 def _structure(robot: Robot) -> tuple[Any, ...]:
-    """Return what the numbers of tasks and limits refer to."""
+    """Return the robot's structure to which the numbers of tasks and limits refer."""
     tree = robot.tree
     return tree.dof_owners, tree.frame_names, tree.geom_bodies, [np.shape(getattr(robot, n)) for n in _numbers(robot)]
 

@@ -1,4 +1,4 @@
-"""Tasks, limits and schemes as data that JSON holds, field by field and to the last bit."""
+"""Tasks, limits and schemes as JSON data, field by field and to the last bit."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _field(name: str, value: Any, where: str, tree: KinematicTree) -> Any:
 
 
 def decode(data: Any, tree: KinematicTree) -> Any:
-    """Return the value of what ``encode`` returned, for the robot with this tree.
+    """Return the value of data from ``encode``, for the robot with this tree.
 
     Raises:
         ValueError: no such data, a class or field that this version does not have, or a name that the robot has not.
@@ -119,7 +119,7 @@ def _made(cls: Any, fields: dict[str, Any]) -> Any:
 
 
 def _name(cls: type, where: str) -> str:
-    """Return where a class is found; a class of osik_jax alone."""
+    """Return the import path of a class of osik_jax; raise for other classes."""
     if not cls.__module__.startswith(_PACKAGE):
         raise OsikValueError(
             f"{where} is a {cls.__name__}, which is no class of osik_jax: a file cannot hold it. Make it again after "

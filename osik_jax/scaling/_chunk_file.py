@@ -1,4 +1,4 @@
-"""The file of a chunk: arrays in a plain ``.npz``, which says itself of which job and which chunk they are."""
+"""File of a chunk: arrays in a plain ``.npz``, with the identifiers of its job and chunk."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class OtherJob(OsikValueError):
 
 
 class Part(NamedTuple):
-    """The lanes of a chunk that one of several processes has; a process alone has all of them."""
+    """Lanes of a chunk that one of several processes has; a single process has all of them."""
 
     chunk: int
     process: int = 0
@@ -55,7 +55,7 @@ class Part(NamedTuple):
 
     @classmethod
     def of(cls, path: Path) -> Part | None:
-        """Return the part that a file has by its name, None if it is no file of a chunk."""
+        """Return the part that a file name stands for, or None."""
         match = _FILE.fullmatch(path.name)
         part = cls(*(int(number) for number in match.groups() if number is not None)) if match else None
         return part if part and part.file_name == path.name else None
@@ -68,7 +68,7 @@ def chunk_files(folder: Path) -> dict[Part, Path]:
 
 
 def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
-    """Return the chunks of which all parts are there: one set of parts each, if several numbers of processes wrote."""
+    """Return the complete chunks, each with one set of parts if runs with different numbers of processes wrote it."""
     sets: dict[tuple[int, int], list[Part]] = {}
     for part in sorted(parts):
         sets.setdefault((part.chunk, part.processes), []).append(part)
@@ -105,7 +105,7 @@ def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arr
 
 
 def _check_type(name: str, dtype: np.dtype) -> None:
-    """Raise for Python objects, which only pickle keeps, and types that come back as bytes, such as bfloat16."""
+    """Raise TypeError for types that ``.npz`` does not keep without pickle, such as objects and bfloat16."""
     known = not dtype.hasobject and np.dtype(dtype.str) == dtype
     if not known and dtype.names is None:
         raise OsikValueError(f"{name or 'the result'} is of type {dtype}, which no .npz keeps; NumPy's own numbers do")
@@ -127,13 +127,13 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def remove_partial_files(folder: Path) -> None:
-    """Remove what killed processes left half written; no other process may be writing."""
+    """Remove partial files of killed processes; no other process may be writing."""
     for path in folder.glob(".*.npz.*.partial"):
         path.unlink(missing_ok=True)
 
 
 def unwritable(folder: Path, what: str, error: OSError) -> OSError:
-    """Return an error of the same kind that names the folder and says what becomes of the job."""
+    """Return an error of the same type that names the folder and states how to continue the job."""
     message = f"{what}: {error.strerror or error}; chunks that are finished stay, call again when this is cured"
     return OSError(error.errno or errno.EIO, message, str(folder))
 

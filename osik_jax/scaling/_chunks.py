@@ -1,4 +1,4 @@
-"""Batches larger than memory: chunk by chunk, to disk, killed and continued."""
+"""Batches larger than memory: computed chunk by chunk to disk, resumable."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def run_in_chunks(
     progress: Progress = True,
     unit: str = "lanes",
 ) -> Any:
-    """Return ``function(batch, *shared)``, computed some lanes at a time; on disk, a killed job continues where it was.
+    """Return ``function(batch, *shared)`` computed chunk by chunk; with a folder, an interrupted job continues.
 
     While the devices work on a chunk, the one before is written. Every chunk has the same number of lanes (the last
     one is filled up with copies of its last lane), so one program does for all.
@@ -119,7 +119,7 @@ class _Job:
         self.chunks = -(-count // chunk)
 
     def size(self, k: int) -> int:
-        """Return the lanes of a chunk, less those that fill up the last one."""
+        """Return the number of lanes of a chunk, without padding."""
         return min(self.chunk, self.count - k * self.chunk)
 
     def lanes(self, k: int) -> Any:
@@ -134,7 +134,7 @@ class _Job:
         return made
 
     def inputs(self, k: int) -> Any:
-        """Return the lanes of a chunk, filled up."""
+        """Return the inputs of a chunk, padded."""
         missing = self.chunk - self.size(k)
         return jax.tree.map(
             lambda a: np.concatenate([a, np.repeat(a[-1:], missing, 0)]) if missing else a, self.lanes(k)
@@ -193,7 +193,7 @@ def _positive(value: Any, name: str) -> int:
 
 
 def _agreed(chunks: int, finished: set[int]) -> list[int]:
-    """Return chunks that one process or another lacks: all run the same ones, for the program is of all of them."""
+    """Return the chunks that any process lacks; all processes run them, because they share one program."""
     lacking = np.array([k not in finished for k in range(chunks)])
     if jax.process_count() > 1:
         from jax.experimental.multihost_utils import process_allgather
@@ -220,7 +220,7 @@ def _one_ahead(job: _Job, todo: Sequence[int]) -> Iterator[tuple[int, Any]]:
 
 
 def _rows(result: Any, size: int, chunk: int) -> tuple[list[Block], dict[str, np.ndarray]]:
-    """Return the lanes of a result that this process has: which ones, and the arrays by name."""
+    """Return the lanes of a result that this process has: their indices, and the arrays by name."""
     names, leaves = leaf_names(result), jax.tree.leaves(result)
     wrong = [name for name, leaf in zip(names, leaves, strict=True) if np.shape(leaf)[:1] != (chunk,)]
     if wrong or not leaves:
@@ -257,7 +257,7 @@ class _Layout:
         self.known: tuple[int, dict[str, str]] | None = None
 
     def check(self, arrays: Mapping[str, np.ndarray], chunk: int) -> None:
-        """Raise ValueError where a chunk is not like the first one given."""
+        """Raise ValueError if a chunk differs from the first one."""
         found = {name or "it": f"{array.dtype} {array.shape[1:]}" for name, array in arrays.items()}
         if self.known is None:
             self.known = chunk, found

@@ -25,7 +25,7 @@ def fingerprint(tree: Any) -> dict[str, str]:
 
 
 def identifier(manifest: Mapping[str, Any]) -> str:
-    """Return a hash of all that a manifest says; what is under "job", where it is kept, does not count."""
+    """Return a hash of a manifest without its entry "job"."""
     said = {key: value for key, value in manifest.items() if key != "job"}
     return _digest(json.dumps(said, sort_keys=True).encode())
 

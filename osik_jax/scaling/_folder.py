@@ -1,4 +1,4 @@
-"""A job finds its folder: another job's, a new one, or what an earlier run of it has finished."""
+"""Check of a job's folder: new, of another job, or with finished chunks of this job."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ._saved import read_manifest, write_manifest
 
 
 def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: int) -> dict[int, list[Part]]:
-    """Make a folder that of a job, and read every finished chunk once, to check that it is whole and of this job.
+    """Assign a folder to a job, and check that every finished chunk is complete and of this job.
 
     Damaged files are removed, with a warning, so that they are made anew.
 
@@ -46,7 +46,7 @@ def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: in
 
 
 def _old_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest that is there; a damaged one counts as none, for each chunk says of which job it is."""
+    """Return the existing manifest; None if it is damaged, because each chunk has its job's identifier."""
     try:
         return read_manifest(folder)
     except DamagedFile as damaged:

@@ -1,4 +1,4 @@
-"""One job at a time in a folder."""
+"""Lock that admits one job at a time to a folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ except ImportError:  # Windows
 
 @contextlib.contextmanager
 def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
-    """Make the folder, and keep other jobs out of it inside the block.
+    """Make the folder, and lock it against other jobs inside the block.
 
     The operating system holds the lock for the process and drops it when the process ends, however it ends. So a lock
     file that a killed job left behind stops nobody.
@@ -73,7 +73,7 @@ def _taken(path: Path) -> int | None:
 
 
 def _sign(descriptor: int) -> None:
-    """Write who has the lock, for others to read."""
+    """Write the owner of the lock to its file."""
     os.ftruncate(descriptor, 0)
     os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
     os.fsync(descriptor)

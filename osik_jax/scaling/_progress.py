@@ -1,4 +1,4 @@
-"""Tells how many lanes are done: by a bar, or to a function of the user."""
+"""Progress of a job, by a bar or a user's function."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Progress = bool | Callable[[int, int], Any]
 
 
 def check_progress(progress: Any) -> None:
-    """Raise TypeError for what is neither True, False nor a function."""
+    """Raise TypeError unless the value is True, False or a function."""
     if not isinstance(progress, bool) and not callable(progress):
         raise OsikTypeError(f"progress is {progress!r}; it is True, False, or a function of the lanes done and of all")
 

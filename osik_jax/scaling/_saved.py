@@ -1,4 +1,4 @@
-"""Results in a folder: a file for each chunk, and a manifest that says what of."""
+"""Results in a folder: a file for each chunk, and a manifest of the job."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MANIFEST = "manifest.json"
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write what the chunks are of."""
+    """Write the manifest."""
     with whole_file(folder / MANIFEST) as partial, partial.open("w") as file:
         json.dump(manifest, file, indent=1)
         file.flush()
@@ -57,7 +57,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
 
 @dataclasses.dataclass(frozen=True)
 class Saved:
-    """Results on disk, of a job that is done or still runs. ``saved[a:b]`` reads lanes a to b, ``saved[:]`` all.
+    """Results on disk of a finished or running job. ``saved[a:b]`` reads lanes a to b, ``saved[:]`` all.
 
     Only the chunks that hold the lanes wanted are read.
 
@@ -78,7 +78,7 @@ class Saved:
         return found
 
     def __len__(self) -> int:
-        """Return the number of lanes, also of those that are missing."""
+        """Return the number of lanes, including missing ones."""
         return self.manifest["count"]
 
     @property
@@ -88,7 +88,7 @@ class Saved:
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Return chunks that are not there."""
+        """Return the indices of missing chunks."""
         there = complete(chunk_files(self.folder))
         return tuple(k for k in range(self.chunks) if k not in there)
 
@@ -164,7 +164,7 @@ class Saved:
 
 
 def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: list[Block], own: int) -> None:
-    """Put the rows of an array where they belong."""
+    """Copy the rows of an array to their places in the result."""
     if name not in whole:
         whole[name] = np.zeros((own, *array.shape[1:]), array.dtype)
     row = 0
@@ -182,7 +182,7 @@ def load(folder: str | os.PathLike[str], *, like: Any = None) -> Saved:
             Default: they come as a dict by name.
 
     Raises:
-        FileNotFoundError: the folder is none of ``run_in_chunks``.
+        FileNotFoundError: the folder was not written by ``run_in_chunks``.
         ValueError: this version cannot read it, or ``like`` has other arrays.
     """
     saved = Saved(Path(folder), like)

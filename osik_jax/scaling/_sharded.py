@@ -20,7 +20,7 @@ _SHARED = -1
 
 
 def device_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Return a mesh of devices in a row, with one axis called "lanes", as ``sharded`` takes it.
+    """Return a one-dimensional mesh of devices for ``sharded``, whose axis is called "lanes".
 
     Args:
         devices: some of ``jax.devices()``; default: all, those of other hosts too where ``jax.distributed`` joined
@@ -97,7 +97,7 @@ class ShardedFunction:
         return jax.tree.map(lambda a: a[:count], out) if missing else out
 
     def place(self, *args: Any) -> tuple[Any, ...]:
-        """Return the arguments on the devices where the function wants them, so that calls in a loop copy nothing.
+        """Return the arguments on the function's devices, so that calls in a loop copy nothing.
 
         Raises:
             ValueError: as a call does, and where the devices do not divide the number of lanes.
@@ -109,7 +109,7 @@ class ShardedFunction:
         return jax.tree.unflatten(program.structure, program.placed(leaves))
 
     def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
-        """Return the arrays of the arguments, and the program for what holds them."""
+        """Return the arrays of the arguments, and the program for their structure."""
         leaves, structure = jax.tree.flatten(args)
         known = self._known.get(structure)
         if known is None:
@@ -118,7 +118,7 @@ class ShardedFunction:
 
 
 class _Program:
-    """A function of arrays, for arguments of one structure.
+    """Compiled function of arrays, for arguments of one structure.
 
     Attributes:
         structure: of the arguments.
@@ -163,17 +163,17 @@ class _Program:
         return lengths.pop()
 
     def reachable(self, leaves: list[Any]) -> list[Any]:
-        """Return the arrays, those that ``run`` would not take put where they are wanted."""
+        """Return the arrays; those whose sharding ``run`` does not accept are moved."""
         if jax.process_count() > 1:
             return self.placed(leaves)
         return self._with_moved(leaves, [isinstance(a, jax.Array) and not isinstance(a, Tracer) for a in leaves])
 
     def placed(self, leaves: list[Any]) -> list[Any]:
-        """Return the arrays where they are wanted; Python numbers stay, because they adapt to any precision."""
+        """Return the arrays with the wanted shardings; Python numbers stay, because they adapt to any precision."""
         return self._with_moved(leaves, [not isinstance(a, (bool, int, float, complex)) for a in leaves])
 
     def _with_moved(self, leaves: list[Any], wanted: list[bool]) -> list[Any]:
-        """Return the arrays, those that are wanted and are elsewhere put where they belong."""
+        """Return the arrays; selected ones without the wanted sharding are moved."""
         pairs = zip(leaves, self.places, strict=True)
         away = [i for i, (a, place) in enumerate(pairs) if wanted[i] and not _is_there(a, place)]
         there = moved([leaves[i] for i in away], [self.places[i] for i in away])
@@ -184,7 +184,7 @@ class _Program:
 
 
 def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the function, which makes the arrays without entries that it is given or holds anew.
+    """Return the function with arrays without entries made anew inside it, arguments and constants alike.
 
     With jaxlib 0.11.2 such an array that comes into a ``shard_map`` from outside ends the process (a segmentation fault
     of the Shardy partitioner, on every kind of device); a robot without geoms has some.
@@ -212,14 +212,14 @@ def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
 
 
 def _is_there(leaf: Any, place: NamedSharding) -> bool:
-    """Return whether an array is where it is wanted."""
+    """Return whether an array has the wanted sharding."""
     if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or not leaf.committed:
         return False
     return leaf.sharding == place or leaf.sharding.is_equivalent_to(place, leaf.ndim)  # a spec has several spellings
 
 
 def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
-    """Return arrays on the devices where they are wanted, of other hosts too, each of which has them whole."""
+    """Return arrays with the wanted shardings, over all hosts; each host has the whole arrays."""
     if not leaves:
         return []
     if jax.process_count() == 1:
@@ -237,7 +237,7 @@ def _filled(a: Any, axis: int, missing: int) -> Any:
 
 
 def _on_all_hosts(a: Any, place: NamedSharding) -> Any:
-    """Return one array over hosts from what each of them has whole; it takes its own part and asks nobody."""
+    """Return a global array from the whole array on each host; each host takes its part without communication."""
     if isinstance(a, Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
         return jax.device_put(a, place)
     whole = np.asarray(a, jax.dtypes.canonicalize_dtype(a.dtype))
