@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def batch_axes(tree: T, *names: str, axis: int = 0) -> T:
-    """Return which arrays of a pytree are batched, as ``jax.vmap`` takes it for ``in_axes`` or ``out_axes``.
+    """Return ``in_axes`` (or ``out_axes``) of ``jax.vmap`` for a pytree: 0 for the named arrays, None for the rest.
 
     ``jax.vmap(step, in_axes=(0, osik.batch_axes(tasks, "hand.target")))`` maps over configurations and over the hand's
     target, while all else in ``tasks`` is shared.
@@ -82,7 +82,7 @@ def stack(items: Sequence[T]) -> T:
 
 
 def _with_one_model(items: Sequence[T]) -> list[T]:
-    """Return the items with robots that share one model holder: their own where it is equal, else an empty one."""
+    """Return the items with robots that share one model holder: theirs if it is equal, else an empty one."""
     flat = [jax.tree.flatten(item, is_leaf=_is_robot) for item in items]
     columns = [_alike(parts) for parts in zip(*(leaves for leaves, _ in flat), strict=True)]
     return [
@@ -95,7 +95,7 @@ def _is_robot(part: Any) -> bool:
 
 
 def _alike(parts: Sequence[Any]) -> Sequence[Any]:
-    """Return corresponding parts of the items; robots whose models differ with an empty holder."""
+    """Return corresponding parts of the items; robots with different models get an empty holder."""
     if not _is_robot(parts[0]) or all(part.holder == parts[0].holder for part in parts):
         return parts
     return [dataclasses.replace(part, holder=ModelHolder(None)) for part in parts]
@@ -106,7 +106,7 @@ _STRUCTURE = "that is structure, not a number; make one batch for each"
 
 
 def _difference(a: Any, b: Any, where: str) -> str | None:
-    """Return what in the structure of two pytrees differs first, and why that cannot be a batch; None: nothing does."""
+    """Return the first difference in the structure of two pytrees, as text for a message; None if there is none."""
     at = where.removeprefix(".") or "it"
     if type(a) is not type(b) and not (_is_number(a) and _is_number(b)):
         return f"{at} is a {type(a).__name__} in one and a {type(b).__name__} in the other; {_STRUCTURE}"

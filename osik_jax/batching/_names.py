@@ -30,12 +30,12 @@ def _label(key: Any) -> Any:
 
 
 def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
-    """Return the places among the names of the leaf called ``wanted``, or of all leaves under it.
+    """Return the indices of the leaf called ``wanted``, or of all leaves under it.
 
     A ``*`` stands for any part of a name up to the next dot: ``*.weight``, ``*_foot.gain``, ``limits[*].velocity``.
 
     Raises:
-        KeyError: there is none; the message lists the names.
+        KeyError: no such leaf; the message lists the names.
     """
     own = "[^.]*".join(re.escape(part) for part in str(wanted).split("*"))
     pattern = re.compile(rf"{own}(?:[.\[].*)?")
@@ -79,7 +79,7 @@ def _paired(names: Sequence[str], name: str, value: Any) -> list[tuple[int, Any]
 
 
 def _fitting(value: Any, leaf: Any, name: str, batched: bool) -> Array:
-    """Return a value in the precision of the leaf that it replaces; a scalar is repeated."""
+    """Return a new value in the precision of the old leaf; a scalar is repeated."""
     new, shape = jnp.asarray(value, jnp.result_type(leaf)), jnp.shape(leaf)
     lanes = new.shape[:1] if batched else ()
     if batched and new.ndim == 0:

@@ -1,4 +1,4 @@
-"""A pytree taken apart: its numbers, which are traced, and all else, which a program is compiled for."""
+"""Split of a pytree into its numbers, which are traced, and its static structure."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Static = tuple[tuple[Any, ...], Any]
 
 
 def is_number(leaf: Any) -> bool:
-    """Return whether a leaf is traced: arrays, tracers among them, and Python floats; all else is structure."""
+    """Return whether a leaf is a number (array, tracer or Python float) and not structure."""
     return eqx.is_array(leaf) or isinstance(leaf, float | np.ndarray | np.generic)
 
 
 def taken_apart(tree: Any) -> tuple[Any, Static]:
-    """Return the numbers, a pytree with None in place of all else; and all else, to be a static argument of ``jit``."""
+    """Return the numbers (a pytree with None for other leaves), and the structure as a static argument of ``jit``."""
     numbers, structure = eqx.partition(tree, is_number)
     leaves, treedef = jax.tree.flatten(structure)
     return numbers, (tuple(leaves), treedef)

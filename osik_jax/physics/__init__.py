@@ -1,4 +1,4 @@
-"""A robot with its dynamics: MuJoCo, a floor, position servos, and the loop around them. Import it by name."""
+"""Closed loop in MuJoCo with dynamics, a floor and position servos; import it by name."""
 
 from ._loop import Integrated as Integrated
 from ._loop import Lookahead as Lookahead

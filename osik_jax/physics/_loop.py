@@ -1,4 +1,4 @@
-"""The closed loop: sense, solve, command the servos, let MuJoCo run until the next step."""
+"""Closed loop in MuJoCo: sense, solve, command the servos, simulate until the next step."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ class Command(eqx.Module):
 
 
 class Integrated(Command):
-    """The last command moved on by the velocity: what is sensed acts through the tasks alone.
+    """Servo target: the last command integrated by the velocity; the sensed configuration enters by the tasks alone.
 
-    A servo gives way under load by effort over stiffness. The command moves on until the tasks are met all the same:
-    this is integral action, and steady errors go away. Their gains have to stay below what the servos and the contact
-    let oscillate: a robot that stands wants some 3 to 10 / s where the kinematic loop stands 20 / s and more.
+    Under load a servo deflects by effort over stiffness. The command moves on until the tasks are met: this is integral
+    action, and steady errors vanish. The tasks' gains must stay below those at which servos and contact oscillate: 3 to
+    10 / s for a standing robot, where the kinematic loop allows 20 / s and more.
     """
 
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
@@ -57,11 +57,11 @@ class Integrated(Command):
 
 
 class Lookahead(Command):
-    """Servo target: the configuration to which the velocity leads from the sensed one within a given time.
+    """Servo target: the sensed configuration integrated by the velocity over a given time.
 
-    This is proportional control without memory. A steady error remains, as of a servo whose stiffness is multiplied by
-    gain times time. With a gain of 20 / s and 0.05 s, a servo holds its load as it would with the plan as its target.
-    With one step as the time the robot goes limp.
+    This is proportional control without memory. A steady error remains, as with a servo whose stiffness is multiplied
+    by gain times time. With a gain of 20 / s and 0.05 s, a servo holds its load as if the plan were its target. With
+    one step as the time the robot sinks.
 
     Attributes:
         time: [s].
@@ -104,7 +104,7 @@ def simulate(
     command: Command | None = None,
     before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
-    """Run the loop from the simulation's present state, until the robot falls at the latest.
+    """Run the loop from the simulation's present state, and stop if the robot falls.
 
     Each step senses the configuration, base and joints, solves for the velocity there, makes a servo target of it and
     lets MuJoCo run for ``dt``. One compiled program a step; MuJoCo runs on the host. As in ``rollout``, every
@@ -183,7 +183,7 @@ def _control_step(
     *,
     static: tuple[tuple[Any, ...], Any],
 ) -> tuple[Array, Solution]:
-    """Return the part of a step that is pure: the command and the solution."""
+    """Return command and solution of a step: its pure part."""
     tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
     todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
     velocity, warm_start = memory

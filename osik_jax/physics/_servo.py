@@ -1,4 +1,4 @@
-"""Position servos: what a user asks for, what a robot's model has, and their actuators in MuJoCo."""
+"""Position servos: a user's, those of the robot's model, and their actuators in MuJoCo."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ..robot._tree import BALL, FREE
 
 @dataclasses.dataclass(frozen=True)
 class Servo:
-    """A position servo: effort = stiffness (target - position) - damping velocity, cut at +- ``effort``.
+    """Position servo: effort = stiffness (target - position) - damping velocity, limited to +- ``effort``.
 
     Attributes:
         stiffness: [N m/rad or N/m].
         damping: [N m s/rad or N s/m].
-        effort: the greatest torque or force [N m or N]; ``None``: what the robot's model says, which may be nothing.
+        effort: the greatest torque or force [N m or N]; ``None``: the value in the robot's model, if any.
     """
 
     stiffness: float

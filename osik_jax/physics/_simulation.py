@@ -1,4 +1,4 @@
-"""A robot in MuJoCo that takes servo targets and tells its configuration."""
+"""Simulation of a robot in MuJoCo with servo targets."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6
 
 
 class Simulation:
-    """A world with its state, stepped by MuJoCo's C code; on the host, and changed in place.
+    """World with its state, stepped by MuJoCo's C code on the host and changed in place.
 
     ``data`` is MuJoCo's own, for all that has no method here; ``mujoco.viewer`` takes ``model`` and ``data``.
 
@@ -47,7 +47,7 @@ class Simulation:
         return float(self.data.time)
 
     def reset(self, q: Float[np.ndarray, " nq"] | Array) -> None:
-        """Put the robot at rest at a configuration, its servos there too.
+        """Put the robot and its servos at a configuration, at rest.
 
         Raises:
             ValueError: q has the wrong length or is not finite.
@@ -88,7 +88,7 @@ class Simulation:
         """Simulate for some time with the given servo targets.
 
         Args:
-            command: configuration to servo to; what it says of the base is not read. (nq,)
+            command: configuration of the servo targets; its base entries are ignored. (nq,)
             duration: [s], a whole number of the world's timesteps.
 
         Raises:
@@ -138,7 +138,7 @@ class Simulation:
         return self.world.own_masses @ self.data.xipos / self.world.own_masses.sum()
 
     def contact_points(self) -> Float[np.ndarray, "k 3"]:
-        """Return the contact points of all feet [m], foot after foot. (k, 3)."""
+        """Return the contact points of all feet in the world [m], in the order of the feet. (k, 3)."""
         radius = self.model.geom_size[self._points, :1]
         return self.data.geom_xpos[self._points] - radius * np.array([0.0, 0.0, 1.0])
 

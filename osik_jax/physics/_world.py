@@ -1,4 +1,4 @@
-"""A MuJoCo model of a robot on a floor: contact at its feet, a position servo on every joint."""
+"""MuJoCo model of a robot on a floor, with contact at its feet and a position servo on every joint."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def build_world(
     floor: float | None = None,
     timestep: float = 0.001,
 ) -> World:
-    """Put a robot on a floor.
+    """Return a world with the robot on a floor.
 
     Masses, inertias, joint damping, armature and friction are those of ``robot.mj_model``, as MuJoCo compiled them; no
     geometry of it collides. A follower of a mimic joint is geared to its leader, a locked joint held where it is.
@@ -337,7 +337,7 @@ def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, multipli
 
 
 def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model, with the numbers of the robot's own that no version of MuJoCo spells alike."""
+    """Return the compiled model, with numbers of the robot's model that ``MjSpec`` does not set in all versions."""
     model = spec.compile()
     for name in _COPIED:
         getattr(model, name)[:] = getattr(source, name)

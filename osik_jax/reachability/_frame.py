@@ -22,7 +22,7 @@ from ..tasks._manipulability import volume
 
 
 class Frame(NamedTuple):
-    """A frame that hinges and slides carry.
+    """Frame whose kinematic chain has hinge and slide joints only.
 
     Attributes:
         robot: the robot.
@@ -48,7 +48,7 @@ class Frame(NamedTuple):
         return np.asarray(_manipulability(self.robot, self.settings, q, route=self._route))
 
     def links(self) -> Float[np.ndarray, "k 3"]:
-        """Return points on the joints that carry the frame, at home, and the frame's own [m]."""
+        """Return the positions at home of the joints of the frame's chain, and of the frame [m]."""
         return np.asarray(_links(self.robot, self.settings, route=self._route))
 
     @property
@@ -91,7 +91,7 @@ def _beyond(robot: Robot, settings: Settings, positions: Array, *, route: ChainR
 
 @partial(jax.jit, static_argnames="route")
 def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainRoute) -> Array:
-    """Return sqrt(det(J J')) for each configuration, or sqrt(det(J' J)) where J has fewer columns than rows."""
+    """Return sqrt(det(J J')) for each configuration, or sqrt(det(J' J)) if J has fewer columns than rows."""
     chain = _search(robot, settings, route).chain
     matrix = jnp.moveaxis(jacobian(chain, chain_kinematics(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
     rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)

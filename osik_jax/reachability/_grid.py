@@ -1,4 +1,4 @@
-"""Positions to ask for: a grid over all that a frame gets to."""
+"""Grid of positions over a frame's workspace."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FLAT = 1e-6
 
 
 def around(frame: Frame, positions: int) -> Grid:
-    """Return a grid with the same spacing along x, y and z, over the box of all that a frame gets to.
+    """Return a grid with equal spacing along x, y and z over the bounding box of a frame's workspace.
 
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
     frame never moves, as a planar arm's, is a single coordinate.
@@ -65,7 +65,7 @@ def _along(middle: float, side: float, spacing: float) -> Float[np.ndarray, " n"
 
 
 def checked_grid(grid: object) -> Grid:
-    """Return a grid that a user gives.
+    """Return a checked grid of a user.
 
     Raises:
         TypeError: no three sequences of numbers.

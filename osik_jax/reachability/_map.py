@@ -1,4 +1,4 @@
-"""The map of a frame's reach: positions, orientations, manipulability and configurations."""
+"""Map of a frame's reach: positions, orientations, manipulability and configurations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map as slices: the picture that ``ReachabilityMap.figure`` returns."""
+"""Figure of a map as slices."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 class Field(NamedTuple):
-    """Data of a map as it is drawn; arrays as in ``ReachabilityMap``."""
+    """Data of a figure; arrays as in ``ReachabilityMap``."""
 
     axes: tuple[np.ndarray, np.ndarray, np.ndarray]  # x, y and z of the positions [m]
     share: Float[np.ndarray, "nx ny nz"]

@@ -1,4 +1,4 @@
-"""A map in numbers, for the command line."""
+"""Summary of a map for the command line."""
 
 from __future__ import annotations
 

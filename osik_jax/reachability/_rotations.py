@@ -1,4 +1,4 @@
-"""Orientations that are spread evenly over all of them."""
+"""Evenly spread orientations."""
 
 from __future__ import annotations
 

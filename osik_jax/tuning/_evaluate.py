@@ -1,4 +1,4 @@
-"""A loop on many scenarios: losses and gradients, one scenario not disturbing another."""
+"""Losses and gradients of a loop on many independent scenarios."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Evaluation(eqx.Module):
 
     @property
     def loss(self) -> Float[Array, ""]:
-        """Return the mean over those that were kept; NaN if there are none."""
+        """Return the mean over the kept scenarios; NaN if there are none."""
         return jnp.sum(jnp.where(self.kept, self.losses, 0.0)) / jnp.sum(self.kept)
 
     @property
@@ -95,9 +95,9 @@ def scenario_loss(loss: LossFunction, loop: Loop, scenario: Scenarios) -> tuple[
 def over_scenarios(
     function: Callable[[Any, Any], Any], shared: Any, scenarios: Scenarios, chunk: int, mesh: Mesh | None
 ) -> Any:
-    """Return ``function(shared, scenario)`` of each scenario, some at a time; each device of a mesh takes its share.
+    """Return ``function(shared, scenario)`` for each scenario, in chunks, split over the devices of a mesh.
 
-    What the devices do not divide is filled up with copies of the last scenario, which are cut off again.
+    The scenarios are padded to a multiple of the devices with copies of the last one, which are cut off again.
     """
     if mesh is None:
         return in_chunks(partial(function, shared), scenarios, chunk)
@@ -118,18 +118,18 @@ def over_scenarios(
 
 
 def shares(scenarios: Scenarios, mesh: Mesh | None) -> Scenarios:
-    """Return the scenarios on the devices of a mesh: each has its own, or all where they do not divide."""
+    """Return the scenarios split over the devices of a mesh, or replicated if they do not divide evenly."""
     uneven = mesh is not None and len(scenarios) % mesh.size
     return _placed(scenarios, mesh, PartitionSpec() if mesh is None or uneven else PartitionSpec(mesh.axis_names))
 
 
 def replicas(numbers: Any, mesh: Mesh | None) -> Any:
-    """Return numbers on all devices of a mesh. Python's numbers stay, because they have no precision of their own."""
+    """Return numbers replicated on all devices of a mesh; Python numbers stay, because they have no precision."""
     return _placed(numbers, mesh, PartitionSpec())
 
 
 def replicated(results: Any, mesh: Mesh | None) -> Any:
-    """Return the results of a program on all devices of a mesh, constants too, which it would leave on one."""
+    """Return the results of a program on all devices of a mesh, constants included."""
     return results if mesh is None else jax.lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
 
 
@@ -143,7 +143,7 @@ def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
 
 
 def in_chunks(function: Callable[[Any], Any], batch: Any, chunk: int) -> Any:
-    """Return ``vmap(function)(batch)``, some lanes at a time; the last chunk is filled up with its first lane."""
+    """Return ``vmap(function)(batch)`` computed in chunks; the last chunk is padded with its first lane."""
     count = jax.tree.leaves(batch)[0].shape[0]
     if chunk >= count:
         return jax.vmap(function)(batch)
@@ -162,7 +162,7 @@ def evaluate(
     Args:
         loss: a function of a trajectory and a loop, a ready one or your own.
         loop: what is run.
-        scenarios: what it is run on.
+        scenarios: the scenarios to run.
         chunk: scenarios that run at a time; see ``tune``.
         mesh: devices that the scenarios are split over; see ``tune``.
 
@@ -176,7 +176,7 @@ def evaluate(
 
     Raises:
         KeyError, ValueError: scenarios that do not fit the loop.
-        TypeError: a loss that takes other arguments, or a mesh that is none.
+        TypeError: a loss with other arguments, or a mesh of another type.
     """
     check_loss(loss)
     check_mesh(mesh)
@@ -195,7 +195,7 @@ def _evaluate(numbers: Any, scenarios: Scenarios, *, static: Static, chunk: int,
 
 
 def check_loss(loss: Any) -> None:
-    """Raise TypeError where a loss cannot be called with a trajectory and a loop."""
+    """Raise TypeError unless a loss can be called with a trajectory and a loop."""
     if not callable(loss):
         raise OsikTypeError(
             f"the loss is {loss!r}; it is a function of a trajectory and a loop, such as Tracking('hand')"
@@ -207,7 +207,7 @@ def check_loss(loss: Any) -> None:
 
 
 def check_mesh(mesh: Any) -> None:
-    """Raise TypeError where a mesh is none."""
+    """Raise TypeError unless the mesh is a ``jax.sharding.Mesh`` or None."""
     if mesh is not None and not isinstance(mesh, Mesh):
         raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
 

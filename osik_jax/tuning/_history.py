@@ -55,7 +55,7 @@ class History:
         return int(np.lexsort((loss, self.dropped))[0])
 
     def stale(self, improvement: float) -> int:
-        """Return the number of iterations since the best loss fell by this share, or fewer scenarios were dropped."""
+        """Return the number of iterations since the best loss fell by a fraction, or fewer scenarios were dropped."""
         last, best, fewest = 0, np.inf, np.inf
         for k, (loss, dropped) in enumerate(zip(self.loss, self.dropped, strict=True)):
             if dropped < fewest or (dropped == fewest and loss < best * (1.0 - improvement)):
@@ -65,7 +65,7 @@ class History:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State from which tuning goes on: next parameters, optimiser state and history.
+    """State to resume a tuning: next parameters, optimiser state and history.
 
     Attributes:
         vector: parameters of the next iteration, in the space that the optimiser moves in. (p,)
@@ -79,7 +79,7 @@ class State:
 
 
 def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
-    """Write a state as .npz, in the place of an older one only when it is complete."""
+    """Write a state as .npz; it replaces an older file only when it is complete."""
     arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
     arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
     arrays |= {f"space/{name}": value for name, value in _described(space).items()}
@@ -95,7 +95,7 @@ def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: A
 
     Args:
         path: of the file.
-        space: of the parameters; has to be the one that was saved.
+        space: space of the parameters, equal to that of the saved state.
         optimizer: the optimiser's first state, for its structure.
 
     Raises:

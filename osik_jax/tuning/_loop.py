@@ -1,4 +1,4 @@
-"""The loop that is tuned: a robot, its tasks, a scheme and limits, run for some time."""
+"""Closed loop to tune: a robot, its tasks, a scheme and limits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PARTS = ("robot", "scheme", "limits", "dt")
 
 
 class Loop(eqx.Module):
-    """A closed loop as ``osik_jax.rollout`` runs it: all that has numbers to tune, by name.
+    """Arguments of ``osik_jax.rollout``, whose numbers can be tuned by name.
 
     Numbers of tasks are called ``hand.weight``, ``hand.gain`` or ``hand.gain.maximum``; the others ``scheme.damping``,
     ``limits[1].velocity``, ``robot.body_mass``, ``dt``. A name stands for all numbers under it, and ``*`` for any part

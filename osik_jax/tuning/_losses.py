@@ -25,7 +25,7 @@ LossFunction = Callable[[Trajectory, Loop], Float[Array, ""]]
 
 
 class Loss(eqx.Module):
-    """Base of the ready losses: a ``LossFunction`` that adds up, ``Tracking("hand") + 0.1 * Smoothness()``."""
+    """Base of losses that can be added and scaled: ``Tracking("hand") + 0.1 * Smoothness()``."""
 
     @abc.abstractmethod
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
@@ -90,7 +90,7 @@ class Tracking(Loss):
 
 
 def _tasks_in_time(loop: Loop, time: Float[Array, " steps"]) -> Mapping[str, Task]:
-    """Return the tasks, those that a function of time gives with one more axis."""
+    """Return the tasks; those from a function of time have a leading axis of steps."""
     return jax.vmap(loop.tasks)(time) if callable(loop.tasks) else loop.tasks
 
 

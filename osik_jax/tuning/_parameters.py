@@ -1,4 +1,4 @@
-"""The numbers that are tuned, and the unbounded space in which an optimiser moves."""
+"""Parameters to tune, and the unbounded space of the optimiser."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _NEVER_NEGATIVE = {
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """Numbers of a loop to tune, and where they may go.
+    """Numbers of a loop to tune, with their bounds.
 
     Attributes:
         name: as in ``Loop``. Every finite entry of every array that it stands for is tuned by itself.
@@ -53,7 +53,7 @@ class _Slot(eqx.Module):
 
 
 class ParameterSpace(eqx.Module):
-    """A loop's parameters as one vector without bounds, all of a like size.
+    """A loop's parameters as one unbounded vector with entries of similar size.
 
     With y the number, or its logarithm where ``log``, between bounds A and B:
     ``y = A + (B - A) sigmoid(4 s z / (B - A))``; with one bound alone ``y = A + softplus(s z)`` or
@@ -101,7 +101,7 @@ class ParameterSpace(eqx.Module):
         self.initial = self.vector(start)
 
     def numbers(self, vector: Float[Array, " p"]) -> Float[Array, " p"]:
-        """Return the loop's numbers from the vector without bounds."""
+        """Return the loop's numbers from the unbounded vector."""
         low, high, between, above, below = self._bounds()
         span = jnp.where(between, high - low, 1.0)
         z = self.scale * vector
@@ -122,7 +122,7 @@ class ParameterSpace(eqx.Module):
         return jnp.where(between, inside, jnp.where(above | below, beyond, y)) / self.scale
 
     def _bounds(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Return bounds with 0 where there is none; and which entries have both, the lower alone, the upper alone."""
+        """Return bounds (0 if missing), and which entries have both, the lower one alone, the upper one alone."""
         has_low, has_high = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         low, high = jnp.where(has_low, self.lower, 0.0), jnp.where(has_high, self.upper, 0.0)
         return low, high, has_low & has_high, has_low & ~has_high, has_high & ~has_low
@@ -213,13 +213,13 @@ def _entry(name: str, leaf: int, place: int, value: float, parameter: Parameter)
 
 
 def _is_log(name: str, start: float, low: float) -> bool:
-    """Return whether a number has no meaning below zero, by the last part of its name, and is tuned above it."""
+    """Return whether a number is positive by its name (its last part), and is tuned in log space."""
     field = name.split("[")[0] if "." not in name else name.rsplit(".", 1)[1].split("[")[0]
     return field in _NEVER_NEGATIVE and start > 0.0 and not (np.isfinite(low) and low < 0.0)
 
 
 def overlap(space: ParameterSpace, loop: Loop, values: Mapping[str, Any]) -> None:
-    """Raise ValueError where scenarios set a number that is tuned."""
+    """Raise ValueError if scenarios set a tuned number."""
     tuned = {slot.leaf for slot in space.slots}
     for name in values:
         both = [loop.names[leaf] for leaf in find_leaves(loop.names, name) if leaf in tuned]

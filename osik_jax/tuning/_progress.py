@@ -1,4 +1,4 @@
-"""A bar with the loss."""
+"""Progress bar with the loss."""
 
 from __future__ import annotations
 

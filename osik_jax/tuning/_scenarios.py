@@ -18,7 +18,7 @@ from ._loop import Loop
 
 
 class Scenarios(eqx.Module):
-    """Situations that a loop is run in, as a batch: every array has one more axis in front, of the same length.
+    """Batch of situations in which a loop is run; every array has a leading axis of scenarios.
 
     ``scenarios[:48]`` and ``scenarios[48:]`` are scenarios too, to train on and to hold out.
 
@@ -56,13 +56,13 @@ class Scenarios(eqx.Module):
         return jax.tree.leaves(self)[0].shape[0]
 
     def __getitem__(self, which: Any) -> Scenarios:
-        """Return some of them: a slice, or an array of indices or of booleans."""
+        """Return some scenarios: by a slice, or an array of indices or booleans."""
         if isinstance(which, int):
             raise OsikTypeError(f"scenarios are many: use [{which} : {which + 1}]")
         return jax.tree.map(lambda leaf: leaf[which], self)
 
     def fitted(self, loop: Loop) -> Scenarios:
-        """Return the same in the precision and shapes of a loop's numbers.
+        """Return the scenarios in the precision and shapes of a loop's numbers.
 
         Raises:
             KeyError: a name that the loop does not have.

@@ -1,4 +1,4 @@
-"""The tuning itself."""
+"""Tuning by gradient descent through rollouts."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ def _step(
     chunks: tuple[int, ...],
     optimizer: optax.GradientTransformationExtraArgs,
 ) -> tuple[Array, Any, dict[str, Array]]:
-    """Return the next vector and optimiser's state, and the row of the history."""
+    """Return the next vector, the next optimiser state, and the history row of this step."""
     problem: Problem = put_together(numbers, static)
     trained, gradient = problem.gradient(vector, batches[0], chunks[0])
     held = (
