@@ -1,4 +1,4 @@
-"""Export a control step as bytes that need JAX alone."""
+"""Export of a control step as bytes that need JAX alone."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def export_controller(
     Raises:
         KeyError: ``inputs`` names a number that does not exist.
         ModuleNotFoundError: ``flatbuffers`` is not installed: ``pip install ".[export]"``.
-        TypeError, ValueError: as in ``solve``; ``batch`` or ``platforms`` is none of those above.
+        TypeError, ValueError: as in ``solve``; invalid ``batch`` or ``platforms``.
     """
     check_setting("export_controller(robot, tasks)", robot, scheme, dt)
     check_tasks(tasks, robot)
@@ -106,7 +106,7 @@ def export_controller(
 
 
 def _check_options(batch: Any, platforms: Any) -> None:
-    """Raise where batch or platforms are not what they may be."""
+    """Raise TypeError or ValueError for invalid batch or platforms."""
     if isinstance(batch, str) and batch != "symbolic":
         raise OsikValueError(f"batch is {batch!r}; it is None, a number of robots or 'symbolic'")
     if batch is not None and batch != "symbolic":
@@ -118,7 +118,7 @@ def _check_options(batch: Any, platforms: Any) -> None:
 def _input_ports(
     robot: Robot, tasks: dict[str, Task], limits: tuple[Limit, ...] | None, inputs: Sequence[str] | None
 ) -> list[Port]:
-    """Return the inputs in the order in which the program takes them."""
+    """Return the inputs in the program's order."""
     if isinstance(inputs, str):
         raise OsikTypeError(f"inputs is a sequence of names, not one string: use ({inputs!r},)")
     names, leaves = leaf_names(tasks), jax.tree.leaves(tasks)

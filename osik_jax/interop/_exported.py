@@ -1,4 +1,4 @@
-"""Load a controller that osik_jax exported. This file needs jax and flatbuffers alone, and travels in the export."""
+"""Loader of exported controllers; it needs jax and flatbuffers alone, and is part of each export."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def load_controller(exported: bytes | str | os.PathLike[str]) -> ExportedControl
 
 
 def _warn_of_few_workers() -> None:
-    """Warn where batched LAPACK calls of jaxlib 0.10 and 0.11.0 may wait for each other for ever."""
+    """Warn if batched LAPACK calls of jaxlib 0.10 and 0.11.0 may wait for each other for ever."""
     jaxlib = tuple(int(part) for part in version("jaxlib").split(".")[:3] if part.isdigit())
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     if (0, 10) <= jaxlib < (0, 11, 1) and 1 < cores < 8 and "PJRT_NPROC" not in os.environ:

@@ -65,7 +65,7 @@ class TaskSpaceAction(eqx.Module):
         robot: the robot.
         tasks: by name, as ``solve`` takes them.
         commanded: names of the ``FrameTask`` that the action moves. Default: every ``FrameTask``.
-        mode: what the action is relative to.
+        mode: "relative" to the frame's pose, or "absolute": to the task's target.
         position_scale: largest motion of a position [m], one number or one for each task by name.
         rotation_scale: largest rotation [rad], in the same way.
         joints: names of the joints whose targets are returned, hinges and slides, such as those of the actuators in
@@ -223,7 +223,7 @@ def _scale(given: float | Mapping[str, float], name: str, what: str) -> float:
 
 
 def _joints(robot: Robot, names: Sequence[str] | None) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Return names and places in q of the joints whose targets are returned."""
+    """Return names and indices in q of the joints whose targets are returned."""
     if isinstance(names, str):
         raise OsikTypeError(f"joints is a sequence of names, not one string: use ({names!r},)")
     if names is None:

@@ -1,4 +1,4 @@
-"""Kinematics of other libraries in place of MJX's, for comparison and for robots that only another library knows."""
+"""Kinematics of other libraries in place of MJX's, for comparison and for robots of other libraries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def kinematics_from(
     rotation: Float[Array, "nbody 3 3"],
     jacobian: Float[Array, "nbody 6 nv"],
 ) -> Kinematics:
-    """Return the kinematics that forward kinematics and Jacobians of another library amount to.
+    """Return the kinematics equivalent to another library's forward kinematics and Jacobians.
 
     Tasks, limits and ``osik_jax.frame_pose`` take the result like that of ``forward_kinematics``; a control step is
     ``scheme.solve(build_problem(robot, q, tasks, kinematics=kinematics))``. The axis of each dof is read from the

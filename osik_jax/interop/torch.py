@@ -13,7 +13,7 @@ from .._errors import OsikTypeError, OsikValueError
 
 
 def wrap(step: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a JAX function as one of PyTorch tensors, which autograd differentiates.
+    """Return a JAX function as a function of PyTorch tensors that autograd differentiates.
 
     Tensors and arrays share their memory (DLPack) where both are on the same device; a tensor that is not contiguous
     is copied. The function is compiled once for each shape, and its derivative once more. On CUDA, JAX waits for what
@@ -43,7 +43,7 @@ def wrap(step: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class StepLayer(torch.nn.Module):
-    """The last layer of a policy: a JAX step as a module without parameters of its own.
+    """Module without parameters that runs a JAX step, as the last layer of a policy.
 
     ``StepLayer(jax.vmap(action))(q, network(observation))`` gives joint targets from the outputs of a network, and
     gradients flow back into the network.
@@ -62,7 +62,7 @@ class StepLayer(torch.nn.Module):
 
 
 class _Bridge:
-    """A JAX function compiled for the leaves of its arguments, alone and with what its derivative needs."""
+    """JAX function compiled for the leaves of its arguments, without and with the data for its derivative."""
 
     def __init__(self, step: Callable[..., Any]):
         def with_pullback(leaves: list[Any], tree: Any, moving: tuple[int, ...]) -> tuple[Any, Any]:
@@ -96,7 +96,7 @@ class _Bridge:
 
 
 class _Step(torch.autograd.Function):
-    """The function as PyTorch's autograd sees it."""
+    """The JAX function as a function of PyTorch's autograd."""
 
     @staticmethod
     def forward(
@@ -124,7 +124,7 @@ class _Step(torch.autograd.Function):
 
 
 def _with_arrays(leaves: list[Any], places: Sequence[int], tensors: Sequence[torch.Tensor]) -> list[Any]:
-    """Return the leaves with arrays in the places of the tensors."""
+    """Return the leaves with the tensors replaced by arrays."""
     arrays = list(leaves)
     for place, tensor in zip(places, tensors, strict=True):
         arrays[place] = _to_jax(tensor)

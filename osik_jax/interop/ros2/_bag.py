@@ -1,4 +1,4 @@
-"""Bags: MCAP files of messages, written while a robot is led, and replayed."""
+"""Bags: MCAP files of messages, recorded and replayed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ._settings import topic_of_frame
 
 
 class Replay(NamedTuple):
-    """Commands of a bag beside those that are computed again.
+    """Commands of a bag, and the commands of its replay.
 
     Attributes:
         names: joints, in the order of the columns. (n,)
@@ -40,7 +40,7 @@ class Replay(NamedTuple):
 
 
 class BagWriter:
-    """A bag that is being written; ``add`` is what a ``Node`` takes as ``record``."""
+    """Writer of a bag; its ``add`` is the argument ``record`` of a ``Node``."""
 
     def __init__(self, path: str | os.PathLike[str]):
         self._file = open(path, "wb")  # noqa: SIM115 - closed in __exit__
@@ -70,7 +70,7 @@ class BagWriter:
 
 
 def replay(controller: Controller, path: str | os.PathLike[str]) -> Replay:
-    """Give a controller the messages of a bag, one period for each command in it, and return both commands.
+    """Replay a bag with a controller, one period for each recorded command; return both commands.
 
     A bag of ``osik ros2 --record`` has the times that the controller saw, so its commands are reproduced exactly. A
     bag of another recorder has its own times: a message near a period's end may count in the next one.
@@ -116,7 +116,7 @@ def _positions(message: Any, controller: Controller) -> list[float]:
 
 
 def _messages(path: str | os.PathLike[str], types: dict[str, Any]) -> Iterator[tuple[str, int, Any]]:
-    """Yield topic, time and message in the order of their times."""
+    """Yield topic, time and message, ordered by time."""
     with Path(path).open("rb") as file:
         try:
             for schema, channel, record in make_reader(file).iter_messages(topics=list(types)):

@@ -1,4 +1,4 @@
-"""The control loop without its messages' transport: what one period makes of what was received."""
+"""Control loop without transport: one period as a function of the received messages."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _SHOWN_NS = 1_000_000_000
 
 
 class Received(NamedTuple):
-    """A message that came in.
+    """Received message.
 
     Attributes:
-        kind: what it is for.
+        kind: kind of the message.
         frame: the frame of a target or clutch; empty for joint states.
         time_ns: when it was received, by the clock of stamps [ns].
         message: JointState, PoseStamped or Bool, of any library: its attributes are read.
@@ -40,7 +40,7 @@ class Received(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Positions and velocities that joints are sent.
+    """Command: positions and velocities of joints.
 
     Attributes:
         names: ROS names. (n,)
@@ -54,7 +54,7 @@ class Command(NamedTuple):
 
 
 class Output(NamedTuple):
-    """Output of a period: a command once every joint of the robot was seen, and the state of the controller.
+    """Output of a period: a command once every joint was measured, and the state of the controller.
 
     Attributes:
         command: None until every joint was measured.
@@ -109,7 +109,7 @@ class Memory:
 
 
 class Controller:
-    """A robot's control loop as a function of what was received, for ``osik ros2`` and for bags that are replayed.
+    """Control loop of a robot as a function of received messages, for ``osik ros2`` and replays of bags.
 
         memory = controller.memory()
         memory, output = controller.tick(memory, now_ns, received)
@@ -140,13 +140,13 @@ class Controller:
         self._rehearse()
 
     def _rehearse(self) -> None:
-        """Go through a start and a step with a press of the clutch, so that nothing is compiled while a robot moves."""
+        """Run a start and a step with a press of the clutch, so that nothing compiles while a robot moves."""
         memory = dataclasses.replace(self.memory(), measured=np.asarray(self.robot.q0)[self.joints.index])
         devices = {frame: (0, (np.zeros(3), np.eye(3))) for frame in self.frames} if self.settings.clutch else {}
         self._moved(dataclasses.replace(self._begun(memory), devices=devices), 0)
 
     def _order(self) -> np.ndarray:
-        """Return the place of each commanded joint."""
+        """Return the index of each commanded joint."""
         names, wanted = self.joints.names, self.settings.joints
         for name in wanted:
             if name not in names:
@@ -156,7 +156,7 @@ class Controller:
         return np.array([names.index(name) for name in wanted or names], int)
 
     def memory(self) -> Memory:
-        """Return the memory of a controller that has seen nothing."""
+        """Return the initial memory."""
         count = len(self.joints.names)
         return Memory(np.full(count, np.nan), np.full(count, _NEVER), {"": np.full(count, _NEVER)})
 
@@ -215,7 +215,7 @@ class Controller:
         return dataclasses.replace(memory, measured=measured, measured_ns=times, stamps_ns=stamps_ns)
 
     def _in_world(self, memory: Memory, frame_id: str, pose: Any) -> Any:
-        """Return a pose that is given in a frame as one in the world."""
+        """Return a pose given in a frame, in the world."""
         if frame_id == self.settings.world_frame:
             return pose
         if frame_id not in self.steps.references:
@@ -233,7 +233,7 @@ class Controller:
         return memory, self._output(memory, now_ns, ERROR, f"holding: no new state of {names}")
 
     def _begun(self, memory: Memory) -> Memory:
-        """Return the memory at rest in the measured configuration, with frames that stay where they are."""
+        """Return the memory at rest at the measured configuration, with targets at the present poses."""
         q = np.array(self.robot.q0)
         q[self.joints.index] = memory.measured
         q, tasks, poses = self.steps.begin(q)

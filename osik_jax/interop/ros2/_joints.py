@@ -1,4 +1,4 @@
-"""Conversion of messages to numbers: joint states by name, poses, stamps; and the reasons to refuse a message."""
+"""Conversion of messages to numbers (joint states by name, poses, stamps), with the reasons to refuse them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ._settings import Settings
 
 
 class Refused(Exception):
-    """A message that is not used, and why."""
+    """Reason why a message is not used."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JointNames:
-    """The joints of a robot under their ROS names.
+    """Joints of a robot under their ROS names.
 
     Attributes:
         names: ROS names of the independent joints, in the order of v. (n,)
@@ -37,7 +37,7 @@ class JointNames:
     ignored: frozenset[str]
 
     def read(self, message: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Return places in ``names``, positions [rad or m], and the names that no joint has.
+        """Return indices in ``names``, positions [rad or m], and the names that no joint has.
 
         Raises:
             Refused: a name that comes twice, a position without a name, or one that is not finite.
@@ -78,7 +78,7 @@ def joint_names(robot: Robot, settings: Settings) -> JointNames:
 
 
 def stamp_of(message: Any, received_ns: int, settings: Settings) -> int:
-    """Return the stamp of a message [ns]; where stamps are not looked at, the time when it was received.
+    """Return the stamp of a message [ns], or its time of reception if stamps are not checked.
 
     Raises:
         Refused: the stamp is zero, or far from this machine's clock.

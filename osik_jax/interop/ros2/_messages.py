@@ -1,4 +1,4 @@
-"""The ROS 2 messages that are spoken, made from their definitions in ROS 2's own language.
+"""Classes of the ROS 2 messages in use, made from their definitions.
 
 ROS 2 serialises a message as plain CDR (XCDR1, final types) under the type name ``package::msg::dds_::Name_``.
 """
@@ -55,7 +55,7 @@ _TYPES: dict[str, Any] = {}
 
 
 def _made(name: str) -> Any:
-    """Return the class of a type: a dataclass with zeros, empty text and empty lists as defaults."""
+    """Return the class of a message type: a dataclass with zeros, empty text and empty lists as defaults."""
     package, _, short = name.partition("/")
     namespace: dict[str, Any] = {"__doc__": f"{name} of ROS 2.", "__annotations__": {}, "__module__": __name__}
     for text, own in _fields(name):
@@ -99,7 +99,7 @@ def ros_name(kind: Any) -> str:
 
 
 def definition(kind: Any) -> str:
-    """Return the definition of a type in ROS 2's own language, those of its fields' types after it."""
+    """Return the ROS 2 definition of a type, followed by those of its fields' types."""
     parts, names = [], [_short_name(kind)]
     for name in names:  # grows
         fields = _fields(name)

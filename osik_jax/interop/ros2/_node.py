@@ -1,4 +1,4 @@
-"""The transport: a controller's messages over DDS, once a period."""
+"""Transport of a controller's messages over DDS, once a period."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Record = Callable[[str, int, Any], None]
 
 
 class Endpoints:
-    """A participant of a DDS domain, with readers and writers as ROS 2 nodes have them.
+    """Participant of a DDS domain, with readers and writers like those of ROS 2 nodes.
 
     Args:
         domain: number of the domain. Default: ``ROS_DOMAIN_ID``, or 0.
@@ -53,11 +53,11 @@ class Endpoints:
         self._participant = DomainParticipant(number)
 
     def reader(self, topic: str, kind: Any, *, reliable: bool, depth: int = 10) -> DataReader:
-        """Return a subscription; one that is not reliable takes publishers of both kinds."""
+        """Return a subscription; one that is not reliable accepts reliable and best-effort publishers."""
         return DataReader(self._participant, self._topic(topic, kind), qos=_qos(reliable, depth))
 
     def writer(self, topic: str, kind: Any) -> DataWriter:
-        """Return a reliable publisher of 10 messages of history, as is ROS 2's default."""
+        """Return a reliable publisher that keeps 10 messages, as by default in ROS 2."""
         return DataWriter(self._participant, self._topic(topic, kind), qos=_qos(True, 10))
 
     def _topic(self, topic: str, kind: Any) -> Topic:
@@ -74,7 +74,7 @@ def _qos(reliable: bool, depth: int) -> Qos:
 
 
 class Node:
-    """A controller with its subscriptions and publishers.
+    """Controller with its subscriptions and publishers.
 
     Args:
         controller: the controller.
@@ -131,7 +131,7 @@ class Node:
                 time.sleep(-late * 1e-9)
 
     def _take(self) -> list[Received]:
-        """Return the messages that have come, those of a reader together, in their order."""
+        """Return the received messages in order, grouped by reader."""
         received = []
         for kind, frame, topic, reader in self._sources:
             for message in self._taken(reader):
@@ -181,7 +181,7 @@ def command_type(settings: Settings) -> Any:
 
 
 def command_message(command: Command, settings: Settings, dt: float) -> Any:
-    """Return a command as a message: a trajectory of one point that is due a period from now, or positions alone."""
+    """Return a command as a message: a trajectory of one point due a period from now, or positions alone."""
     positions = command.positions.tolist()
     if settings.commands == "positions":
         axis = msg.MultiArrayDimension(",".join(command.names), len(positions), len(positions))

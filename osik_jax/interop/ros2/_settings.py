@@ -16,7 +16,7 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 
 @dataclasses.dataclass(frozen=True)
 class Topics:
-    """Names of topics, as ROS 2 has them; ``targets`` and ``clutch`` are followed by ``/`` and the frame's name."""
+    """Names of ROS 2 topics; ``targets`` and ``clutch`` are followed by ``/`` and the frame's name."""
 
     joint_states: str = "/joint_states"
     targets: str = "/osik/targets"
@@ -33,7 +33,7 @@ class Settings:
     Attributes:
         rate: control steps a second [Hz].
         frames: frames that get a topic for targets. Default: the hands, or the frames of the controller's tasks.
-        support: frames that stand on the ground, for a robot that moves freely. Default: those that look like feet.
+        support: frames that stand on the ground, for a floating-base robot. Default: frames named like feet.
         controller: a file of ``osik.save_controller``; its tasks, scheme and limits take the place of the default ones.
         commands: ``"trajectory"`` (JointTrajectory) or ``"positions"`` (Float64MultiArray).
         joints: joints of a Float64MultiArray in the order of its receiver, which has no names; ROS names.
@@ -94,7 +94,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
 
     Raises:
         FileNotFoundError: no such file.
-        KeyError: an unknown key; the message lists those that exist.
+        KeyError: an unknown key; the message lists the known ones.
         TypeError, ValueError: no TOML, or a wrong value.
     """
     try:
@@ -121,7 +121,7 @@ _CHECKS: dict[str, tuple[str, Any]] = {
 
 
 def _made(kind: Any, table: Any, what: str) -> Any:
-    """Return an object of a table; TOML's lists are tuples in it."""
+    """Return an object from a TOML table, with lists as tuples."""
     if not isinstance(table, dict):
         raise OsikTypeError(f"{what}s is {table!r}; it is a table")
     fields = {field.name: field.type for field in dataclasses.fields(kind)}
@@ -144,7 +144,7 @@ def dds_name(topic: str) -> str:
     """Return the DDS name of a topic of ROS 2: ``/joint_states`` is ``rt/joint_states``.
 
     Raises:
-        ValueError: the name is none of ROS 2: absolute, of letters, digits and underscores between slashes.
+        ValueError: not an absolute ROS 2 name of letters, digits and underscores between slashes.
     """
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic):
         raise OsikValueError(

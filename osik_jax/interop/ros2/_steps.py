@@ -1,4 +1,4 @@
-"""The two compiled programs of a controller: where it begins, and one step."""
+"""The two compiled programs of a controller: its start, and one step."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Advance(NamedTuple):
 
 
 class Steps:
-    """Tasks, scheme and limits of a robot, and the programs that are compiled of them.
+    """Tasks, scheme and limits of a robot, and their compiled programs.
 
     Args:
         robot: the robot; that of the settings' controller takes its place.
@@ -89,14 +89,14 @@ class Steps:
         self._look_at_warm_start()
 
     def _look_at_warm_start(self) -> None:
-        """Find what a warm start looks like."""
+        """Find the shapes of a warm start."""
         q, tasks, poses = self.begin(self.robot.q0)
         targets, still = {frame: poses[frame] for frame in self.task_names}, jnp.zeros(self.robot.nv)
         warm = jax.eval_shape(self._advance, q, still, None, tasks, targets).warm_start
         self.no_warm_start = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), warm)
 
     def _begin(self, q: Array) -> tuple[Array, dict[str, Task], dict[str, Pose]]:
-        """Return a configuration with its base where the support stands, the tasks aimed there, and the poses."""
+        """Return a configuration with its base placed by the support, the tasks with targets there, and the poses."""
         q = _stood(self.robot, q, self.support)
         tasks = {n: t.at(self.robot, q) if n in self._at_start else t for n, t in self.tasks.items()}
         return q, tasks, self._poses(forward_kinematics(self.robot, q))
@@ -119,7 +119,7 @@ class Steps:
 
 
 def _default_tasks(robot: Robot, settings: Settings) -> tuple[dict[str, Task], tuple[str, ...]]:
-    """Return the tasks of a robot without a controller of its own, and the frames that are led."""
+    """Return the default tasks of a robot, and the frames that receive targets."""
     frames, feet = settings.frames or find_hands(robot), _support(robot, settings)
     if not frames:
         raise OsikValueError("no frame looks like a hand: name those that get targets in the setting frames")
@@ -135,7 +135,7 @@ def _default_tasks(robot: Robot, settings: Settings) -> tuple[dict[str, Task], t
 
 
 def _support(robot: Robot, settings: Settings) -> tuple[str, ...]:
-    """Return the frames on which a robot stands; none where its base is fixed."""
+    """Return the frames on which a robot stands; none for a fixed base."""
     if not robot.floating_base:
         return ()
     feet = settings.support or guess_feet(robot)
@@ -147,7 +147,7 @@ def _support(robot: Robot, settings: Settings) -> tuple[str, ...]:
 
 
 def _tasks_of_frames(tasks: Mapping[str, Task], frames: tuple[str, ...]) -> dict[str, str]:
-    """Return the name of the task of each frame that is led."""
+    """Return the task name of each frame that receives targets."""
     found: dict[str, str] = {}
     for name, task in tasks.items():
         if isinstance(task, FrameTask) and not task.bounded and (not frames or task.frame in frames):
@@ -163,7 +163,7 @@ def _tasks_of_frames(tasks: Mapping[str, Task], frames: tuple[str, ...]) -> dict
 
 
 def _bounded(robot: Robot, limits: tuple[Limit, ...], settings: Settings) -> tuple[Limit, ...]:
-    """Return limits with the speeds and accelerations of the settings among them, and the robot's own."""
+    """Return the limits with the settings' speeds and accelerations, and the robot's own limits."""
     hinges_and_slides, _ = scalar_layout(robot)
     speed = jnp.where(hinges_and_slides, jnp.minimum(robot.velocity_limit, settings.speed), robot.velocity_limit)
     own = robot.acceleration_limit
@@ -177,14 +177,14 @@ def _bounded(robot: Robot, limits: tuple[Limit, ...], settings: Settings) -> tup
 
 
 def _references(robot: Robot) -> tuple[str, ...]:
-    """Return the frames that targets may be given in: those fixed to the world, and the base that moves freely."""
+    """Return the frames in which targets may be given: those fixed to the world, and a free base."""
     tree = robot.tree
     fixed = [name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body == 0]
     return (*fixed, tree.body_names[tree.root]) if robot.floating_base else tuple(fixed)
 
 
 def _stood(robot: Robot, q: Array, support: tuple[str, ...]) -> Array:
-    """Return q with the free base where it has to be for the supporting frame to stand as at home."""
+    """Return q with the free base placed so that the supporting frame stands as at home."""
     if not support:
         return q
     base = robot.tree.qpos_address[robot.tree.free_bases[0]]
