@@ -103,7 +103,7 @@ def load_controller(exported: bytes | str | os.PathLike[str]) -> ExportedControl
         position})`` returns the outputs by name. It may be called inside ``jax.jit``.
 
         - ``inputs``, ``outputs``: by name, each with ``shape``, ``dtype`` and ``unit``; ``"q"`` is the first input. An
-          input that is left out has its ``default`` in every lane.
+            input that is left out has its ``default`` in every lane.
         - ``dt``: time of a step [s].
         - ``batch``: None, a number of lanes or ``"symbolic"``.
         - ``platforms``: the platforms that it was exported for.

@@ -96,7 +96,7 @@ def build_world(
 
         - ``robot``: the robot.
         - ``model``: the compiled world: bodies and joints of ``robot.mj_model`` in its order, a floor, spheres that
-          touch it at the contact points, an actuator a servo. Its timestep is that of the simulation.
+            touch it at the contact points, an actuator a servo. Its timestep is that of the simulation.
         - ``servos``: by joint; the actuators have the same names and order.
         - ``feet``: frame to its contact points in the frame [m]. Each (k, 3)
         - ``floor``: height of the floor [m].

@@ -77,15 +77,14 @@ def reachability_map(
         - ``rotations``: orientations that were asked for, frame axes to world axes. (m, 3, 3)
         - ``reached``: whether a configuration was found for each pose. (nx, ny, nz, m)
         - ``share``: share of the orientations that are reached at each position. (nx, ny, nz)
-        - ``beyond_reach``: how far the position is at least from all that the frame could ever reach, from the lengths
-          of the links alone [m]: more than 0 proves that nothing is reached there. (nx, ny, nz)
-        - ``manipulability``: the largest index of Yoshikawa's among the configurations found at the position, of the
-          six rows of the frame's Jacobian, or of its columns where there are fewer than six; NaN where none is found.
-          (nx, ny, nz)
-        - ``q``: the configuration that has it; NaN where there is none. (nx, ny, nz, nq)
-        - ``links``: points on the joints that carry the frame, and the frame's own, at home [m]. (k, 3)
-        - ``save(path)`` writes it for ``load_map``; ``figure(at=None)`` returns a matplotlib figure of slices across x,
-          y and z through a point, by default where most is reached.
+        - ``beyond_reach``: lower bound on the distance from the position to the workspace, from the lengths of the
+            links [m]: above 0 it proves that the position is out of reach. (nx, ny, nz)
+        - ``manipulability``: largest index of Yoshikawa among the configurations found at the position, of the six rows
+            of the frame's Jacobian, or of its columns if there are fewer; NaN if none is found. (nx, ny, nz)
+        - ``q``: the configuration with this index; NaN if none is found. (nx, ny, nz, nq)
+        - ``links``: positions at home of the joints of the frame's chain, and of the frame [m]. (k, 3)
+        - ``save(path)`` writes the map for ``load_map``. ``figure(at=None)`` returns a matplotlib figure of slices
+            across x, y and z through a point, by default where most is reached.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.

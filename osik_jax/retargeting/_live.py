@@ -182,7 +182,7 @@ class LiveRetargeter(OnRobot):
             - ``status``: a ``LiveStatus``.
             - ``off_plan``: largest distance of a joint from the plan because of a limit [rad or m].
             - ``feet_off``: largest distance of a contact point from its landing place or the floor, or of a sole below
-              the floor [m].
+                the floor [m].
             - ``iterations``: iterations of the plan.
             - ``seconds``: computing time [s].
 

@@ -104,9 +104,9 @@ def tune(
         - ``held_out``: the held-out loss of that iteration; NaN if nothing was held out.
         - ``iteration``: which one it was.
         - ``history``: of all k iterations, each at the parameters that it began with: ``loss`` and ``held_out``, means
-          over the scenarios kept (k,); ``dropped`` and ``held_out_dropped``, numbers of scenarios not kept (k,);
-          ``gradient_norm``, of the mean loss in the space that the optimiser moves in (k,); ``seconds``, the first
-          compiles (k,); ``vectors``, the parameters in that space (k, p); ``best``, the iteration.
+            over the scenarios kept (k,); ``dropped`` and ``held_out_dropped``, numbers of scenarios not kept (k,);
+            ``gradient_norm``, of the mean loss in the space that the optimiser moves in (k,); ``seconds``, the first
+            compiles (k,); ``vectors``, the parameters in that space (k, p); ``best``, the iteration.
         - ``stopped``: ``"iterations"`` or ``"patience"``.
         - ``space``: maps between parameters and the vector without bounds that the optimiser moves.
         - ``state``: to go on from with ``tune(..., resume=tuned)``; ``save(path)`` writes it as .npz.

@@ -185,10 +185,10 @@ def serve(
 
         - ``url``: address of the page.
         - ``aim(task, target, timeout=None)``: sets the target of a task, as ``replace(target=...)`` takes it; the robot
-          stops if no further call follows within the timeout [s].
+            stops if no further call follows within the timeout [s].
         - ``session``: the present controller. ``save(path)`` writes it for ``load_session``.
         - ``loop``: the control loop. ``wait_until_ready()`` returns when the controller is compiled;
-          ``snapshot`` has the last step's ``q`` and ``status``, ``timing`` the loop's times.
+            ``snapshot`` has the last step's ``q`` and ``status``, ``timing`` the loop's times.
         - ``wait()`` keeps a program going until Ctrl-C; ``stop()`` ends page and loop, as the end of ``with`` does.
 
     Raises:

@@ -260,9 +260,9 @@ def serve_reach(
         The view, with ``url``, ``wait()`` and ``stop()`` as in ``serve``.
 
         - ``show(across, at)``: shows the slice across an axis, ``"x"``, ``"y"`` or ``"z"``, at the nearest coordinate
-          [m].
+            [m].
         - ``stand(position)``: shows the map's most manipulable configuration at the nearest grid position [m]; None:
-          home. Returns whether the map has one.
+            home. Returns whether the map has one.
         - ``map``: what is shown.
 
     Raises:
