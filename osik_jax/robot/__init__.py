@@ -1,4 +1,4 @@
-"""The kinematic model that everything else takes: from files to an immutable pytree."""
+"""Kinematic model of a robot as an immutable pytree, and its readers."""
 
 from ._load_robot import load_robot as load_robot
 from ._robot import Robot as Robot

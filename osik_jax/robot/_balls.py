@@ -1,4 +1,4 @@
-"""Ranges of ball joints: the angle by which one is turned, and configurations that are within the ranges."""
+"""Ranges of ball joints: their rotation angles, and configurations inside the ranges."""
 
 from __future__ import annotations
 

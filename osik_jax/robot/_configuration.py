@@ -1,4 +1,4 @@
-"""Configurations by the names of joints, and what may be wrong with one."""
+"""Configurations by joint names, and checks of configurations."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
 
 
 def configuration(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
-    """Return ``Robot.configuration``, described there."""
+    """Return a configuration; see ``Robot.configuration``."""
     q = with_joints(robot, joints, base)
     if np.shape(q) == (robot.nq,):
         warn_of_far_joints(robot, q, "configuration")

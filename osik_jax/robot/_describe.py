@@ -1,4 +1,4 @@
-"""A robot in five lines."""
+"""Description of a robot in five lines."""
 
 from __future__ import annotations
 

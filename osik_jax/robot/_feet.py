@@ -1,4 +1,4 @@
-"""Recognition of feet among frames, which decides whether a robot stands freely if nobody says so."""
+"""Recognition of feet among frames, which decides whether a base floats if the user does not say so."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ _OUTSIDE = 1e-6
 
 
 def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
-    """Return the configuration that is meant, checked and with unit quaternions.
+    """Return a checked home configuration with unit quaternions.
 
     Raises:
         KeyError: no such keyframe or joint.
@@ -107,7 +107,7 @@ def _with_unit_quaternions(robot: RobotModel, q: Float[Array, " nq"]) -> Float[A
 
 
 def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
-    """Return the configuration with roundings beyond a range taken off; warn of joints that are further out."""
+    """Return the configuration with roundoff beyond ranges removed; warn of joints farther outside."""
     if isinstance(robot.position_lower, Tracer):
         return jnp.asarray(q)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)

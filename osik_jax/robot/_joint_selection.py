@@ -17,7 +17,7 @@ from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
 
 
 def select_joints(robot: Robot, pattern: str) -> list[int]:
-    """Return independent joints called ``pattern``, or those but the free ones that match it as a glob.
+    """Return the independent joints named ``pattern``, else those (except free joints) that match it as a glob.
 
     Raises:
         KeyError: there are none; the message lists the independent joints.
@@ -80,7 +80,7 @@ def dof_names(robot: Robot) -> list[str]:
 
 
 def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str) -> Float[Array, " nv"]:
-    """Return an array over v from a user's input: nothing, an array (nv,), or a mapping from names or globs to values.
+    """Return an array over v from a user's input: None, an array (nv,), or a mapping from names or globs to values.
 
     Raises:
         KeyError: the mapping names a joint that does not exist.

@@ -1,4 +1,4 @@
-"""A robot with longer or heavier links."""
+"""Scaling of links: longer or heavier ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
 
 def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str, Array]:
-    """Return the leaves of a robot that other lengths and masses change, by field."""
+    """Return the leaves of a robot with scaled lengths and masses, by field."""
     tree, dtype = robot.tree, robot.body_position.dtype
     longer, heavier = _factors(tree, length, "length", dtype), _factors(tree, mass, "mass", dtype)
     parent, carrier = np.asarray(tree.body_parents, int), np.asarray(tree.frame_bodies, int)
@@ -52,7 +52,7 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
 
 
 def _bodies(tree: KinematicTree, pattern: str) -> list[int]:
-    """Return moving bodies called ``pattern``, or that match it as a glob."""
+    """Return the moving bodies named ``pattern``, else those that match it as a glob."""
     names = dict(zip(tree.body_names[1:], range(1, len(tree.body_names)), strict=True))
     found = [body for name, body in names.items() if name == pattern] or [
         body for name, body in names.items() if fnmatch.fnmatchcase(name, pattern)

@@ -1,4 +1,4 @@
-"""The table of what a file asks for and a robot does not keep."""
+"""Report of the elements of a file that a robot does not keep."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class LoadNote(NamedTuple):
 
 
 class LoadReport(tuple[LoadNote, ...]):
-    """Everything that constrains motion in a file and is not kept by the robot; empty where all is kept.
+    """Elements of a file that constrain motion and that the robot does not keep.
 
     A tuple of ``LoadNote``; ``print(robot.load_report)`` shows it as a table.
     """

@@ -1,4 +1,4 @@
-"""Robots by name: those that come with the package, and those of robot_descriptions."""
+"""Robots by name: of this package, example-robot-data and robot_descriptions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parts of a problem that belong to one robot: each remembers which, so that another robot's is found out."""
+"""Base of tasks and limits, which remember the robot that they were made for."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _takes_robot(cls: type) -> bool:
 
 
 def check_robot(robot: Any, where: str) -> None:
-    """Raise TypeError where it is no robot, ValueError where it is a stack of robots."""
+    """Raise TypeError unless the argument is a robot, ValueError for a stack of robots."""
     if not isinstance(robot, Robot):
         raise OsikTypeError(
             f"{where}: robot is {robot!r}; it is a Robot, as osik_jax.load_robot and Robot.from_urdf return"
@@ -51,7 +51,7 @@ def check_robot(robot: Any, where: str) -> None:
 
 
 def check_made_for(part: MadeForRobot, robot: Robot, what: str) -> None:
-    """Raise ValueError where the part was made for a robot with other joints."""
+    """Raise ValueError if the part was made for a robot with other joints."""
     if part.made_for is not None and part.made_for != robot.tree.dof_owners:
         raise OsikValueError(
             f"{what} is a {type(part).__name__} that was made for another robot, whose joints are: {part.made_for}. "

@@ -1,4 +1,4 @@
-"""Names and numbers of a robot, as read from a file, and properties that follow from them alone."""
+"""Names and numbers of a robot as read from a file, and properties derived from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ._tree import FREE, KinematicTree, ModelHolder
 
 
 class RobotModel(eqx.Module):
-    """Names and numbers of a robot: what ``loading`` returns, and the base of ``Robot``, which says what they mean."""
+    """Names and numbers of a robot, as returned by ``loading``; base of ``Robot``, which documents them."""
 
     tree: KinematicTree = eqx.field(static=True)
     body_position: Float[Array, "nbody 3"]
@@ -60,7 +60,7 @@ class RobotModel(eqx.Module):
 
     @property
     def frame_names(self) -> tuple[str, ...]:
-        """Return every frame that can be asked for by name: bodies, URDF links (fused or not), sites, geoms."""
+        """Return the names of all frames: bodies, URDF links (fused or not), sites and geoms."""
         return self.tree.frame_names
 
     @property
@@ -76,7 +76,7 @@ class RobotModel(eqx.Module):
 
     @property
     def floating_base(self) -> bool:
-        """Return whether the robot hangs from a free joint that is not locked; loose bodies of a scene do not count."""
+        """Return whether the robot's base is a free joint that is not locked; loose bodies of a scene do not count."""
         return bool(self.tree.free_bases)
 
     @property
@@ -94,7 +94,7 @@ class RobotModel(eqx.Module):
 
     @property
     def load_report(self) -> LoadReport:
-        """Return what the file asks for and the robot does not keep: element, name, and what was done instead."""
+        """Return the elements of the file that the robot does not keep, with the replacement of each."""
         return self.holder.report
 
     def joint_qpos_index(self, name: str) -> int:

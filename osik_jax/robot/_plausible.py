@@ -1,4 +1,4 @@
-"""Numbers that are probably in other units than radians, metres and seconds: told once, and taken as they are."""
+"""Warnings about numbers that are probably not in radians, metres and seconds; they are used as given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Robot: the kinematic model that everything else takes, as an immutable pytree."""
+"""Robot: the kinematic model as an immutable pytree."""
 
 from __future__ import annotations
 
@@ -215,7 +215,7 @@ class Robot(RobotModel):
 
     @classmethod
     def _of(cls, model: RobotModel, home: Home | None) -> Self:
-        """Return the robot with the names and numbers that were read, and with another ``q0`` where one is given."""
+        """Return the robot of a model that was read, with another ``q0`` if one is given."""
         robot = cls(*(getattr(model, field.name) for field in dataclasses.fields(RobotModel)))
         return robot if home is None else robot.with_home(home)
 
@@ -236,7 +236,7 @@ class Robot(RobotModel):
         return configuration(self, joints, base)
 
     def with_home(self, home: Home) -> Self:
-        """Return the same robot with another ``q0``, which is what tasks made from then on aim at by default.
+        """Return the robot with another ``q0``, the default target of tasks that are made for it.
 
         Works inside ``jit``, where values are not checked; nothing is compiled again.
 
@@ -257,7 +257,7 @@ class Robot(RobotModel):
         return eqx.tree_at(lambda robot: robot.q0, self, q0)
 
     def astype(self, dtype: DTypeLike) -> Self:
-        """Return the same robot in another precision: every number is cast, and everything else stays.
+        """Return the robot in another precision, with every number cast.
 
         A robot has the precision that was in force when it was made. After ``jax_enable_x64`` was switched on or off,
         ``robot.astype(float)`` is the robot in the precision now in force; tasks, limits and schemes are to be made
@@ -274,7 +274,7 @@ class Robot(RobotModel):
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
-        """Return the same robot with longer or heavier links; limits, ``q0`` and ``mj_model`` stay as they are.
+        """Return the robot with longer or heavier links; limits, ``q0`` and ``mj_model`` are unchanged.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
         geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
@@ -293,7 +293,7 @@ class Robot(RobotModel):
         return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
 
     def to_mjcf(self, path: str | os.PathLike[str] | None = None) -> str:
-        """Return the robot as MJCF, as its leaves have it now: scaled, edited, joints locked.
+        """Return the robot as MJCF with its present numbers: scaled, edited, joints locked.
 
         Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
         with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
@@ -320,7 +320,7 @@ class Robot(RobotModel):
         return text
 
     def check_configuration(self, q: Num[ArrayLike, " nq"], name: str = "q") -> None:
-        """Raise ValueError where q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
+        """Raise ValueError if q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
 
         Args:
             q: what should be a configuration. (nq,)

@@ -1,4 +1,4 @@
-"""Size of a robot: how long its levers are."""
+"""Size of a robot: the length of its longest chain of links."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The static half of a robot: what is hashed, compared and never traced."""
+"""Static structure of a robot: hashed, compared and never traced."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 
 @dataclasses.dataclass(frozen=True)
 class UnreadMesh:
-    """A collision mesh of a URDF whose file is read when distances to it are asked for.
+    """Collision mesh of a URDF, whose file is read when distances to it are needed.
 
     Attributes:
         link: name of its link.
@@ -76,13 +76,13 @@ class ModelHolder:
         return self.model is other.model or self._content == other._content
 
     def __hash__(self) -> int:
-        """Return a hash of sizes alone: every call of a jitted function asks for it."""
+        """Return a hash of sizes alone, because every call of a jitted function needs it."""
         model = self.model
         return hash(None if model is None else (model.nq, model.nv, model.nbody, model.ngeom, len(self.meshes)))
 
     @cached_property
     def _content(self) -> bytes:
-        """Return the digest of all that the model is made of."""
+        """Return a digest of the whole model."""
         if self.model is None:
             return b""
         buffer = np.empty(mujoco.mj_sizeModel(self.model), np.uint8)
@@ -94,7 +94,7 @@ _Arrays = TypeVar("_Arrays")
 
 
 class cached_arrays(Generic[_Arrays]):
-    """A ``cached_property`` for NumPy arrays: computed once, and copied at each access.
+    """Variant of ``cached_property`` for NumPy arrays: computed once, and copied at each access.
 
     JAX remembers in which precision it has read an array object. Where ``jax_enable_x64`` changes while a robot lives,
     an object that was read before would have the wrong one.
@@ -157,7 +157,7 @@ class KinematicTree:
 
     @cached_property
     def _hash(self) -> int:
-        """Return the hash, computed once because every call of a jitted function asks for it."""
+        """Return the hash, computed once because every call of a jitted function needs it."""
         return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
 
     @cached_property
@@ -168,7 +168,7 @@ class KinematicTree:
 
     @cached_property
     def dof_owners(self) -> str:
-        """Return the names of the joints that own entries of v, in its order; robots with different ones do not mix."""
+        """Return the names of the joints that own entries of v, in its order; a task's robot must have the same."""
         return ", ".join(self.joint_names[j] for j in self.independent)
 
     @cached_arrays
@@ -205,7 +205,7 @@ class KinematicTree:
 
     @cached_arrays
     def turning(self) -> np.ndarray:
-        """Return the entries of v that turn something; slides and a base's translation bend no path. (nv,), bool."""
+        """Return which entries of v rotate a body; slides and a base's translation bend no path. (nv,), bool."""
         parts = {FREE: [False] * 3 + [True] * 3, BALL: [True] * 3, SLIDE: [False], HINGE: [True]}
         return np.array([turns for j in self.independent for turns in parts[self.joint_types[j]]], bool)
 
@@ -263,7 +263,7 @@ class KinematicTree:
 
     @cached_property
     def reference_body(self) -> int:
-        """Return the first moving body, or the world where nothing moves: points nearby are summed about its origin."""
+        """Return the first moving body (else the world), about whose origin points are summed to keep digits."""
         return min(1, len(self.body_parents) - 1)
 
     @cached_property
@@ -302,7 +302,7 @@ class KinematicTree:
 
     @cached_property
     def free_bases(self) -> tuple[int, ...]:
-        """Return the free joints, not locked, on which the robot hangs; those of all robots if several may be meant."""
+        """Return the free joints, not locked, of the robot's base; those of all robots if several may be meant."""
         tops = {top for tops in self.robots for top in tops} or set(self._below_the_world)
         return tuple(j for j in self.independent if self.joint_types[j] == FREE and self.joint_bodies[j] in tops)
 

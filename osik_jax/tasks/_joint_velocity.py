@@ -185,9 +185,9 @@ class JointVelocityTask(VelocityTask):
 class LowAccelerationTask(VelocityTask):
     """Task that keeps the joint velocities of the step before: ``v_i = velocity_i``.
 
-    At a low weight it makes motions smooth. It takes no energy out of a motion, so have something beside it that does,
-    such as a ``PostureTask`` or a ``DampingTask``. ``rollout`` hands the velocity from step to step; with ``solve``,
-    write ``task = task.after(solution.velocity)``.
+    At a low weight it makes motions smooth. It does not slow a motion down, so add a ``PostureTask`` or a
+    ``DampingTask``. ``rollout`` passes the velocity from step to step; with ``solve``, write
+    ``task = task.after(solution.velocity)``.
 
     Args:
         robot: the robot.

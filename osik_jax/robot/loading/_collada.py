@@ -1,4 +1,4 @@
-"""COLLADA files (.dae) as triangles with colours, which MuJoCo cannot read: what robot files need of the format."""
+"""Reader of COLLADA files (.dae), which MuJoCo cannot read: triangles with colours."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Triangles(NamedTuple):
 
 
 def read_collada(path: Path) -> list[Triangles]:
-    """Return the triangles and polygons of the scene in metres, its axes as they are, whatever ``up_axis`` says.
+    """Return the triangles and polygons of the scene in metres, in the file's axes; ``up_axis`` is ignored.
 
     Skins, splines and lines are left out; of a texture, the mean colour is taken.
 
@@ -63,7 +63,7 @@ def _without_namespaces(root: _Element) -> _Element:
 
 
 class _Document:
-    """A file's elements by their ids."""
+    """Elements of a file by their ids."""
 
     def __init__(self, root: _Element, path: Path) -> None:
         self._root, self._path = root, path

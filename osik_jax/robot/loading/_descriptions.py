@@ -1,4 +1,4 @@
-"""Robots of the package robot_descriptions, which clones their repositories when they are first asked for."""
+"""Robots of the package robot_descriptions, which clones their repositories at first use."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
 
 
 def _known(name: str) -> tuple[str, ...]:
-    """Return the robots that the package lists; none without the package, unless one is asked for by its full name."""
+    """Return the robots that the package lists; empty without the package, unless a full name is given."""
     try:
         package = importlib.import_module("robot_descriptions")
     except ImportError as missing:

@@ -1,4 +1,4 @@
-"""Equality constraints of a MuJoCo model that a robot's tree does not keep: closed loops and curved couplings."""
+"""Equality constraints of a MuJoCo model that are not in a robot's tree: closed loops and polynomial couplings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mimic joints and locked joints of a MuJoCo model: which joints follow others, and which have one value."""
+"""Mimic joints and locked joints of a MuJoCo model."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ class Follower(NamedTuple):
 
 
 class Lock(NamedTuple):
-    """The qpos entries that a joint is to be locked at, and whether the user gave them."""
+    """Entries of qpos at which a joint is locked, and whether the user gave them."""
 
     value: np.ndarray
     given: bool
 
 
 def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
-    """Return names or globs of joints to lock; None where no value is given."""
+    """Return the names or globs of joints to lock, with their values or None."""
     if isinstance(locked, str):
         raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
     return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
 
 
 def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
-    """Return joints whose name is, or else matches the glob, ``pattern``; KeyError with the names where none does."""
+    """Return the joints named ``pattern``, else those that match it as a glob; raise KeyError if there are none."""
     if pattern in names:
         return [names.index(pattern)]
     found = [j for j, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
@@ -51,7 +51,7 @@ def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
 
 
 def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
-    """Return what is asked of each locked joint, by joint index; without a value, a joint stays where qpos0 has it."""
+    """Return the requested value of each locked joint, by joint index; the default is its value in qpos0."""
     out: dict[int, Lock] = {}
     for pattern, value in asked.items():
         for joint in match_joints(pattern, names):
@@ -119,7 +119,7 @@ def resolve_followers(
 
 
 def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: int) -> Follower:
-    """Return the follower in terms of a leader that follows nobody."""
+    """Return the follower in terms of an independent leader."""
     _, leader, multiplier, offset = table[joint]
     seen = [joint]
     while leader in table:

@@ -1,4 +1,4 @@
-"""MJCF to the names and numbers of a robot."""
+"""Reader of MJCF files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _free_joints(model: mujoco.MjModel) -> list[str]:
 
 
 def _compile(spec: mujoco.MjSpec) -> tuple[mujoco.MjModel, list[LoadNote]]:
-    """Compile as is; if that fails, without what comes from files, then with some mass where MuJoCo demands it."""
+    """Compile the model; if that fails, without assets from files, then with masses that MuJoCo requires."""
     notes: list[LoadNote] = []
     try:
         return spec.compile(), notes

@@ -1,4 +1,4 @@
-"""Choice of the trees of a scene that are the robot: those with driven or limited joints."""
+"""Choice of the robot among the trees of a scene: trees with driven or limited joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""XML given as a path or as text: found, read and parsed, with errors that say where."""
+"""XML from a path or as text: found, read and parsed, with errors that name the source."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _ROOTS = {"robot": "a URDF: use Robot.from_urdf", "mujoco": "an MJCF: use Robot.
 
 
 def is_mjcf(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is in MuJoCo's format, told by what is in it."""
+    """Return whether a file is in MuJoCo's format, by its content."""
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     return "<mujoco" in text and "<robot" not in text.split("<mujoco")[0]
 
@@ -72,7 +72,7 @@ def parse_xml(source: Source) -> ElementTree.Element:
 
 
 def check_root(root: ElementTree.Element, expected: str, source: Source) -> None:
-    """Raise ValueError where the root element is not ``expected`` ("robot" or "mujoco")."""
+    """Raise ValueError unless the root element is ``expected`` ("robot" or "mujoco")."""
     if root.tag != expected:
         what = _ROOTS.get(root.tag, "not a robot description that can be read here")
         raise OsikValueError(f"{source.label}: the root element is <{root.tag}>, not <{expected}>: this is {what}")

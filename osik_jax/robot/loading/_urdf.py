@@ -1,4 +1,4 @@
-"""URDF to a robot's names and numbers, by way of a MuJoCo model that holds all that it says about the kinematics."""
+"""Reader of URDF files, by way of a MuJoCo model with the same kinematics."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
-    """Add the floating base, as a joint from the world to the root link, where there should be one."""
+    """Add the floating base, a joint from the world to the root link, if there should be one."""
     has_one = any(joint.kind == "floating" for joint in urdf.joints)
     wanted = _guess_floats(urdf, has_one, label) if floating_base is None else floating_base
     if urdf.root == WORLD:
@@ -89,7 +89,7 @@ def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:
 
 
 def _guess_floats(urdf: Urdf, has_free_joint: bool, label: str) -> bool:
-    """Return whether the base floats if nobody says so: with feet it does; without feet it does not.
+    """Return whether the base floats if the user does not say so: it does if the robot has feet.
 
     Where it does not, a warning is given.
     """

@@ -174,7 +174,7 @@ def _numbers(text: str, count: int, where: str) -> np.ndarray:
 
 
 def _floats(text: str) -> np.ndarray:
-    """Return the numbers in a text; empty where one of its words is none."""
+    """Return the numbers in a text; empty if a word is not a number."""
     try:
         return np.array([float(word) for word in text.split()])
     except ValueError:
@@ -192,7 +192,7 @@ def _number(element: ElementTree.Element, name: str, where: str, default: str | 
 
 
 def _bound(element: ElementTree.Element, name: str, where: str) -> float:
-    """Return a number that may be infinite, 0 where it is absent."""
+    """Return a number that may be infinite; 0 if it is absent."""
     text = _text(element, name, "0")
     values = _floats(text)
     if len(values) != 1 or np.isnan(values[0]):

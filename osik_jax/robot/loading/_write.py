@@ -1,4 +1,4 @@
-"""A Robot as the text of an MJCF file, from its leaves."""
+"""Writer of MJCF text from a robot's leaves."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _SAME = 1e-6
 
 
 class _JointPlace(NamedTuple):
-    """A joint that stays, with its anchor and axis in its body."""
+    """Independent or follower joint to write, with its anchor and axis in its body."""
 
     joint: int
     anchor: np.ndarray
@@ -153,7 +153,7 @@ def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:
 
 
 def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
-    """Return a joint of the same body, told in the frame that a locked joint after it has moved.
+    """Return a joint of the same body, in the frame moved by a locked joint after it.
 
     That does not change its coordinate: MuJoCo lets nothing that turns come after a ball joint.
     """
@@ -269,7 +269,7 @@ def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str
 
 
 def _appearance(model: mujoco.MjModel, geom: int) -> dict[str, str | ArrayLike]:
-    """Return kind, colour and what it collides with; masses are the bodies'."""
+    """Return the attributes of a geom for kind, colour and collisions; masses belong to the bodies."""
     material = model.geom_matid[geom]
     return dict(
         type=_SHAPES[int(model.geom_type[geom])],

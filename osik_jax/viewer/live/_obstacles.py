@@ -1,8 +1,7 @@
 """Obstacles of a page, and the limits that avoid them and self-collision.
 
-Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has room
-for so many of each kind: those that are not in use are far below the floor, so that adding, moving and removing one
-compiles nothing.
+Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has a fixed
+number of each kind. Unused ones are far below the floor, so adding, moving and removing one compiles nothing.
 """
 
 from __future__ import annotations

@@ -85,8 +85,8 @@ class Program:
 def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
     """Compile one step of a controller in the calling thread; takes seconds.
 
-    The push is a velocity (nv,) that the robot has on top of what the controller asks for. Of a batch, all numbers,
-    states and pushes have a leading axis.
+    The push is a velocity (nv,) that is added to the controller's. For a batch, all numbers, states and pushes have a
+    leading axis.
     """
     tree = jax.tree.structure(controller.parts())
     numbers, lead = controller.numbers(), () if batch is None else (batch,)
