@@ -53,7 +53,7 @@ OPTIONAL = (
 
 BLOCK = re.compile(r"^```python(?: title=\"([\w-]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 """A block's title may be one of ``LIBRARIES``; the block runs where that is installed."""
-LIBRARIES = ("mink", "pink", "pinocchio", "flatbuffers", "torch", "gymnasium")
+LIBRARIES = ("mink", "pinocchio", "flatbuffers", "torch", "gymnasium")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 REPOSITORY = "https://github.com/osik-jax/osik-jax"
 IN_REPOSITORY = re.compile(  # as a package index shows the README, its links have to be whole
