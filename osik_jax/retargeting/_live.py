@@ -109,7 +109,9 @@ class LiveRetargeter(OnRobot):
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         mapping: role to joint name of the stream, see ``find_roles``. None: by common names.
-        profile, acceleration, balance: as of ``Retargeter``.
+        profile: as in ``Retargeter``.
+        acceleration: as in ``Retargeter``.
+        balance: as in ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
         budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five
