@@ -156,7 +156,7 @@ class ChainSearch(eqx.Module):
     def finishing(self, exact: bool) -> ChainSearch:
         """Return the search for the last steps, without the term that pulls towards the first configuration.
 
-        ``exact``: it goes on beyond what the tolerances ask for.
+        ``exact``: the search continues beyond the tolerances.
         """
         enough = jnp.zeros_like(self.enough) if exact else self.enough
         return dataclasses.replace(self, near=False, enough=enough)
