@@ -25,7 +25,7 @@ pytestmark = needs_core
 
 LANES = 40
 SHAPES = ["6-5", "1-0", "1-3", "6-0", "24-30", "60-40"]
-NULL_SPACES = ["nullspace", "reverse", "saturated"]
+LEVELS = ["hqp", "nullspace", "reverse", "saturated"]
 
 
 def hard_rows(rng, m, n, dtype):
@@ -110,34 +110,22 @@ def test_weighted(shape):
     assert judged > LANES / 2
 
 
-@pytest.mark.variants(slow=["60-40"], release=["24-30", "1-0", "1-3", "6-0"])
+IN_THE_GATE = ["60-40-hqp", "6-5-nullspace", "6-5-reverse", "60-40-saturated"]
+AT_NIGHT = [name for shape in SHAPES for solver in LEVELS if (name := f"{shape}-{solver}") not in IN_THE_GATE][1:]
+
+
+@pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
+@pytest.mark.parametrize("solver", LEVELS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_hierarchies(shape):
-    n, m = map(int, shape.split("-"))
-    p = hard_levels(n, m, float)
-    found, plain = by_both(partial(solve_levels, solver="hqp"), p)
-    np.testing.assert_array_equal(found.status, plain.status)
-    assert (found.status == Status.SOLVED).all()
-    assert levels_difference(p, found, plain).max() < 1e-7
-    for i in range(0, LANES, 4):
-        assert certificate(p, i, found.x[i]).max() < 1e-8
-
-
-IN_THE_GATE = ["6-5-nullspace", "6-5-reverse", "60-40-saturated"]
-AT_NIGHT = [f"{shape}-{solver}" for shape in SHAPES for solver in NULL_SPACES]
-
-
-@pytest.mark.variants(release=[name for name in AT_NIGHT if name not in IN_THE_GATE])
-@pytest.mark.slow
-@pytest.mark.parametrize("solver", NULL_SPACES)
-@pytest.mark.parametrize("shape", SHAPES)
-def test_null_spaces(shape, solver):
+def test_levels(shape, solver):
     n, m = map(int, shape.split("-"))
     p = hard_levels(n, m, float)
     found, plain = by_both(partial(solve_levels, solver=solver), p)
     np.testing.assert_array_equal(found.status, plain.status)
     assert (found.status == Status.SOLVED).all()
     assert levels_difference(p, found, plain).max() < 1e-7
+    for i in range(0, LANES, 4) if solver == "hqp" else ():
+        assert certificate(p, i, found.x[i]).max() < 1e-8
 
 
 @pytest.mark.variants(release=["qp", "hqp", "saturated"])
