@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -11,6 +10,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from small_files import files_of_at_most
 
 import osik_jax as osik
 from osik_jax import cli
@@ -145,12 +145,8 @@ def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tm
 def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
     """The system refuses to write files of more than 32 kB: smaller than the comparison."""
     words = ["demo", "--robot", str(arm_file), "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
-    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (32_000, hard))
-    try:
+    with files_of_at_most(32_000):
         code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
     told = capsys.readouterr().err.strip().splitlines()
     assert code == 2 and len(told) == 1
     assert told[0] == f"osik: cannot write to {tmp_path / 'out'}: File too large; it may be incomplete"

@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import json
 import os
-import resource
 import shutil
 import warnings
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.core import Tracer
+from small_files import files_of_at_most
 
 from osik_jax import scaling
 from osik_jax._progress import Pace
@@ -297,19 +298,16 @@ def test_a_disk_that_is_too_small_is_found_before_the_work(tmp_path):
 
 def test_a_disk_that_fills_up(tmp_path):
     """From the fourth chunk on no file may be larger than 500 bytes: those written stay, the rest comes later."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     function = Counted()
+    with ExitStack() as full:
 
-    def batch(start: int, stop: int) -> Any:
-        if start == 12 and function.ran == [0, 4, 8]:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (500, hard))
-        return X[start:stop]
+        def batch(start: int, stop: int) -> Any:
+            if start == 12 and function.ran == [0, 4, 8]:
+                full.enter_context(files_of_at_most(500))
+            return X[start:stop]
 
-    try:
         with pytest.raises(OSError, match=r"00000002\.npz cannot be written: File too large; chunks .* stay") as caught:
             run(tmp_path, function, batch, count=20, shared=(3.0,))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert caught.value.filename == str(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["00000000.npz", "00000001.npz", "manifest.json"]
     function.ran.clear()
