@@ -271,11 +271,9 @@ DAMPED_RANK = 1e-14
 """Least pivot of a damped level's rows that counts in its step, relative to its longest row; all above roundoff count.
 """
 EXTRA_DAMPING = 1e-9
-"""Damping in units of the square of the level's longest row, added to the level's own so that the Hessian is regular. A
-kernel takes one step with it along directions that the rank tolerance left out.
+"""Damping in units of the square of the level's longest row, with which a kernel takes one step along directions that
+the rank tolerance left out.
 """
-GUESS_ROUNDOFF = 1e-10
-"""Roundoff of a row's value, in units of the terms that add up to it."""
 WORKING_SET_SOLVES = 2
 """Solves per factorisation, each against exact residuals: the first, and one refinement."""
 MAX_STALLED = 20

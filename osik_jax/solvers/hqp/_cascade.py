@@ -1,7 +1,7 @@
 """Search for hierarchies in plain JAX: level after level, each over the minimisers of the levels above (eq. 9).
 
-Each level solves on guessed working sets (``_working_set_solve.py``), goes on by the primal active-set method where no
-guess is right (``_primal_active_set.py``), and freezes what it determines (``_freeze.py``).
+Each level solves on the working set of the warm start (``_working_set_solve.py``), goes on by the primal active-set
+method where that is not the optimum (``_primal_active_set.py``), and freezes what it determines (``_freeze.py``).
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from ._implicit_diff import ActiveSets
 from ._padding import Layout, LevelProblem, PaddedHierarchy
 from ._primal_active_set import PrimalState, primal_active_set
 from ._problem import Tolerances, WorkingSet
-from ._working_set_guess import guess_working_set
 from ._working_set_solve import WorkingSetSolution, placeholder, solve_on_working_set
 
 
@@ -93,8 +92,6 @@ def solve_cascade(
     hierarchy: PaddedHierarchy,
     tolerances: Tolerances,
     warm_start: WorkingSet | None,
-    *,
-    by_guesses: bool = True,
 ) -> CascadeResult:
     """Solve all levels of a batch of hierarchies; arrays have a leading axis of problems, then of levels if any.
 
@@ -103,17 +100,15 @@ def solve_cascade(
         max_iterations: limit on the active-set iterations of one level (static).
         hierarchy: the numbers.
         tolerances: what counts as zero.
-        warm_start: working sets to try first; all zeros in a problem for none.
-        by_guesses: whether working sets are guessed before the primal method searches for them (static). A kernel has
-            tried that by then, and it is much of what there is to compile.
+        warm_start: working sets to try first, or None; all zeros in a problem for none.
     """
+    everywhere = jnp.ones(hierarchy.hard.shape[0], bool)
     # all zeros stand for no warm start: an equality of a solution has a 2
-    known = None if warm_start is None else jnp.any(warm_start.own != 0, (1, 2))
+    known = ~everywhere if warm_start is None else jnp.any(warm_start.own != 0, (1, 2))
     levels, guesses = (jax.tree.map(lambda a: jnp.swapaxes(a, 0, 1), tree) for tree in (hierarchy.levels, warm_start))
     first = jax.vmap(_start)(hierarchy)
-    no_changes = jnp.zeros(first.x.shape[0], jnp.int32)
 
-    def solve_levels(wanted: Bool[Array, " B"], known: Bool[Array, " B"] | None) -> tuple[CascadeState, LevelOutcome]:
+    def solve_levels(wanted: Bool[Array, " B"], known: Bool[Array, " B"]) -> tuple[CascadeState, LevelOutcome]:
         def solve_next(
             state: CascadeState, now: tuple[Array, Any, WorkingSet | None]
         ) -> tuple[CascadeState, LevelOutcome]:
@@ -124,19 +119,17 @@ def solve_cascade(
             skipped = skip(state, problem)
 
             def solve() -> tuple[CascadeState, LevelOutcome]:
-                if by_guesses:
-                    attempts = _solve_on_guesses(problem, is_free, tolerances, guess, known, max_iterations)
-                else:
-                    attempts = jax.vmap(placeholder)(problem)._replace(optimal=~is_free), no_changes, no_changes
-                solved = _solve_level(state, problem, attempts, tolerances, max_iterations)
+                usable = is_free & known
+                first = _solve_on_warm_start(problem, usable, tolerances, guess)
+                counted = state._replace(factorizations=state.factorizations + 2 * usable)  # of active rows and cost
+                solved = _solve_level(counted, problem, is_free, first, tolerances, max_iterations)
                 return choose(is_free, solved, skipped)
 
             return jax.lax.cond(jnp.any(is_free), solve, lambda: skipped)
 
         return jax.lax.scan(solve_next, first, (jnp.arange(layout.levels), levels, guesses))
 
-    everywhere = jnp.ones(first.x.shape[0], bool)
-    if known is None or not by_guesses:
+    if warm_start is None:
         state, outcomes = solve_levels(everywhere, known)
     else:
         state, outcomes = _solve_again_without_guesses(solve_levels, everywhere, known)
@@ -270,88 +263,54 @@ def _level_problem(
 def _solve_level(
     state: CascadeState,
     problem: LevelProblem,
-    attempts: tuple[WorkingSetSolution, Int[Array, " B"], Int[Array, " B"]],
+    wanted: Bool[Array, " B"],
+    first: WorkingSetSolution,
     tolerances: Tolerances,
     max_iterations: int,
 ) -> tuple[CascadeState, LevelOutcome]:
-    """Solve one level by the primal method if no guess is optimal, and freeze the rows that it determines."""
-    best, changes, factorizations = attempts
+    """Solve one level by the primal method where ``first`` is not optimal, and freeze the rows that it determines."""
+    done = first.optimal | ~wanted
 
-    def search() -> tuple[PrimalState, Array]:
-        start = jax.vmap(_primal_start)(problem, state.active, best, tolerances)
+    def search() -> PrimalState:
+        start = jax.vmap(_primal_start)(problem, state.active, first, tolerances)._replace(done=done)
         end = jax.vmap(partial(primal_active_set, max_iterations=max_iterations))(problem, start, tolerances)
-        return end, end.iterations
+        exact = jax.vmap(solve_on_working_set)(problem, end.x, jax.vmap(_working_set)(problem, end), tolerances)
+        exact_end = jax.vmap(_as_primal_state)(exact)._replace(iterations=end.iterations)
+        return choose(exact.optimal & ~done, exact_end, end)
 
-    def accept() -> tuple[PrimalState, Array]:
-        return jax.vmap(_as_primal_state)(best), jnp.zeros_like(changes)
-
-    end, iterations = jax.lax.cond(jnp.all(best.optimal), accept, search)
+    end = jax.lax.cond(jnp.all(done), lambda: jax.vmap(_as_primal_state)(first), search)
     # an iteration of the primal method factors active rows and least squares, and freezing factors once
     counted = state._replace(
-        largest=jnp.maximum(state.largest, jnp.where(best.feasible, jnp.max(jnp.abs(best.x), 1), 0.0)),
-        iterations=state.iterations + changes + iterations,
-        factorizations=state.factorizations + factorizations + 2 * iterations + 1,
+        largest=jnp.maximum(state.largest, jnp.where(first.feasible, jnp.max(jnp.abs(first.x), 1), 0.0)),
+        iterations=state.iterations + end.iterations,
+        factorizations=state.factorizations + 2 * end.iterations + 1,
     )
     return jax.vmap(freeze)(counted, problem, end, tolerances)
 
 
-class _Attempts(NamedTuple):
-    """Solutions on the warm start's working sets, then on those guessed by the dual method."""
-
-    count: Int[Array, ""]
-    best: WorkingSetSolution
-    changes: Int[Array, " B"]
-    factorizations: Int[Array, " B"]
-
-
-def _solve_on_guesses(
-    problem: LevelProblem,
-    wanted: Bool[Array, " B"],
-    tolerances: Tolerances,
-    guess: WorkingSet | None,
-    known: Bool[Array, " B"] | None,
-    max_iterations: int,
-) -> tuple[WorkingSetSolution, Int[Array, " B"], Int[Array, " B"]]:
-    """Solve on the warm start's working sets; where these are not optimal, on those of the dual method.
+def _solve_on_warm_start(
+    problem: LevelProblem, usable: Bool[Array, " B"], tolerances: Tolerances, guess: WorkingSet | None
+) -> WorkingSetSolution:
+    """Solve each level on the warm start's working set.
 
     Args:
         problem: the levels.
-        wanted: problems whose level is to be solved. (B,)
+        usable: problems with a warm start whose level is to be solved. (B,)
         tolerances: what counts as zero.
         guess: the warm start's working sets of this level, or None.
-        known: problems that have a warm start. (B,)
-        max_iterations: limit on the iterations of the dual method (static).
 
     Returns:
-        The solutions, the changes of the working sets, and the factorisations.
+        The solutions; placeholders in problems without a usable warm start.
     """
+    nothing = jax.vmap(placeholder)(problem)
+    if guess is None:
+        return nothing
 
-    def from_warm_start() -> tuple[Array, WorkingSet, Array]:
-        assert guess is not None
-        return problem.x, jax.vmap(_usable_guess)(problem, guess), zeros
+    def solve() -> WorkingSetSolution:
+        working_set = jax.vmap(_usable_guess)(problem, guess)
+        return choose(usable, jax.vmap(solve_on_working_set)(problem, problem.x, working_set, tolerances), nothing)
 
-    def is_running(s: _Attempts) -> Bool[Array, ""]:
-        return (s.count < 2) & ~jnp.all(s.best.optimal)
-
-    def attempt(s: _Attempts) -> _Attempts:
-        def from_dual_method() -> tuple[Array, WorkingSet, Array]:
-            return guess_working_set(problem, ~s.best.optimal, max_iterations)
-
-        if guess is None:
-            x, working_set, changes = from_dual_method()
-        else:
-            x, working_set, changes = jax.lax.cond(s.count == 0, from_warm_start, from_dual_method)
-        solved = jax.vmap(solve_on_working_set)(problem, x, working_set, tolerances)
-        skipped = s.best.optimal if known is None else s.best.optimal | ((s.count == 0) & ~known)
-        # two for active rows and least squares; the dual method has factored the damped Hessian too
-        factorizations = jnp.where(skipped, 0, 2 + s.count)
-        best = choose(skipped, s.best, solved)
-        return _Attempts(s.count + 1, best, s.changes + changes, s.factorizations + factorizations)
-
-    zeros = jnp.zeros(wanted.shape[0], jnp.int32)
-    nothing_yet = jax.vmap(placeholder)(problem)._replace(optimal=~wanted)
-    first = jnp.asarray(1 if guess is None else 0, jnp.int32)
-    return jax.lax.while_loop(is_running, attempt, _Attempts(first, nothing_yet, zeros, zeros))[1:]
+    return jax.lax.cond(jnp.any(usable), solve, lambda: nothing)
 
 
 def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
@@ -370,7 +329,14 @@ def _usable_guess(problem: LevelProblem, warm_start: WorkingSet) -> WorkingSet:
 def _as_primal_state(solution: WorkingSetSolution) -> PrimalState:
     """Return a solution on a working set as the final state of the primal method."""
     zero = jnp.asarray(0, jnp.int32)
-    return PrimalState(*solution[:-2], zero, zero, solution.optimal)
+    return PrimalState(*solution[:-2], zero, jnp.asarray(False), zero, solution.optimal)
+
+
+def _working_set(problem: LevelProblem, end: PrimalState) -> WorkingSet:
+    """Return the working set at the end of the primal method."""
+    side = jnp.where(problem.level.distance(end.x) > 0.0, 1, -1)
+    own = jnp.where(problem.is_equality, 2, jnp.where(end.in_cost, side, 0))
+    return WorkingSet(end.active, own.astype(jnp.int32))
 
 
 def _primal_start(

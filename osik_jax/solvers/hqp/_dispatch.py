@@ -83,8 +83,9 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve) -> Cand
         result: CascadeResult, hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None
     ) -> CascadeResult:
         def search_block(at: Array, result: CascadeResult) -> CascadeResult:
-            block = jax.tree.map(lambda a: a[at], (hierarchy, tolerances, warm_start))
-            return solve_cascade(layout, max_iterations, *block, by_guesses=False)
+            block, block_tolerances = jax.tree.map(lambda a: a[at], (hierarchy, tolerances))
+            # without the warm start, which the kernel has tried
+            return solve_cascade(layout, max_iterations, block, block_tolerances, None)
 
         return with_the_rest(result, result.done, search_block, min(_BLOCK, len(result.done)))
 

@@ -1,12 +1,13 @@
-"""Primal active-set method for one level, for working sets that no guess found.
+"""Primal active-set method for one level.
 
     min 1/2 |dist(A x, [l, u])|^2 + 1/2 damping |x|^2   over   {x: frozen rows keep their values},  hard rows hold
 
 The start is feasible and all iterates stay so. Each iteration takes the least-squares step in the null space of the
 frozen and the active rows (rank-revealing QR) and follows it to the first hard row that blocks it, with an exact line
 search where a row of the level enters or leaves its interval. Where the step vanishes, the row with the most wrongly
-signed multiplier becomes inactive; without one the point is optimal. After a run of steps of zero length the choices
-follow the least index (R. G. Bland, "New finite pivoting rules for the simplex method", 1977), which cannot cycle.
+signed multiplier becomes inactive; without one the point is optimal. Where the rank tolerance leaves directions out of
+the least-squares step, one step follows the gradient first. After a run of steps of zero length the choices follow the
+least index (R. G. Bland, "New finite pivoting rules for the simplex method", 1977), which cannot cycle.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import first_smallest
-from ...numerics._constants import MAX_STALLED
+from ...numerics._constants import EXTRA_DAMPING, MAX_STALLED, STATIONARITY_TOL
 from ...numerics._dense import apply
 from ._active_rows import ActiveRows, factor_active_rows, multipliers
 from ._padding import LevelProblem
@@ -36,6 +37,7 @@ class PrimalState(NamedTuple):
     rank: Int[Array, ""]  # of those, within what the active rows leave free
     residual: Float[Array, ""]  # largest component of the projected gradient (stationarity)
     stalled: Int[Array, ""]  # steps of zero length in a row
+    tried_weak: Bool[Array, ""]  # a step along directions of weak rows, since a row became active
     iterations: Int[Array, ""]
     done: Bool[Array, ""]
 
@@ -68,9 +70,13 @@ def primal_active_set(
         gradient = problem.gradient(s.x, slack)
         # the step vanishes where it changes the rows by no more than roundoff, or is no descent direction
         is_zero = (problem.root_cost(step, change) <= roundoff) | ~(jnp.sum(gradient * step) < 0.0)
+        downhill = -apply(rows.projector, gradient)
+        zero_gradient = problem.size * (roundoff + tolerances.multiplier * problem.root_cost(s.x, slack))
+        weak = is_zero & ~s.tried_weak & (jnp.max(jnp.abs(downhill)) > STATIONARITY_TOL * zero_gradient)
+        weak_step = downhill / jnp.where(weak, EXTRA_DAMPING * problem.size**2 + problem.damping, 1.0)
         released = _release(problem, s, gradient, roundoff * problem.size, rows, tolerances)
-        moved = _advance(problem, s, step, tolerances)
-        out = jax.tree.map(lambda a, b: jnp.where(is_zero, a, b), released, moved)
+        moved = _advance(problem, s, jnp.where(weak, weak_step, step), weak, tolerances)
+        out = jax.tree.map(lambda a, b: jnp.where(is_zero & ~weak, a, b), released, moved)
         return out._replace(in_cost=in_cost, rank=rank, iterations=s.iterations + 1)
 
     def is_running(s: PrimalState) -> Bool[Array, ""]:
@@ -102,8 +108,10 @@ def _release(
     )
 
 
-def _advance(problem: LevelProblem, s: PrimalState, step: Float[Array, " n"], tolerances: Tolerances) -> PrimalState:
-    """Follow the step as far as the hard rows and the exact line search allow."""
+def _advance(
+    problem: LevelProblem, s: PrimalState, step: Float[Array, " n"], weak: Bool[Array, ""], tolerances: Tolerances
+) -> PrimalState:
+    """Follow the step as far as the hard rows and the exact line search allow; a weak one as far as these rows do."""
     level = problem.level
     value, rate = apply(problem.hard, s.x), apply(problem.hard, step)
     # a row whose rate is below the rank tolerance is dependent on active rows and cannot block
@@ -117,13 +125,14 @@ def _advance(problem: LevelProblem, s: PrimalState, step: Float[Array, " n"], to
     # 1/2 damping |x + t d|^2 has the derivative damping (x'd + t d'd)
     damping_terms = problem.damping * jnp.stack([jnp.sum(s.x * step), jnp.sum(step**2)])
     ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper, damping_terms)
+    ideal = jnp.where(weak, 1.0, ideal)
     blocked = longest <= ideal
     length = jnp.minimum(longest, ideal)
     first = first_smallest(ratios)  # the least index among ties
     x = s.x + length * step
     stalled = jnp.where(length * jnp.max(jnp.abs(step)) > 0.0, 0, s.stalled + 1)
     active = s.active.at[first].set(jnp.where(blocked, jnp.where(rate[first] > 0.0, 1, -1), s.active[first]))
-    return s._replace(x=x, active=active, stalled=stalled)
+    return s._replace(x=x, active=active, stalled=stalled, tried_weak=(s.tried_weak | weak) & ~blocked)
 
 
 def _line_search(

@@ -41,8 +41,8 @@ def solve_hqp(
     ``lower <= x <= upper`` is hard at every level. What freedom is left after the last level goes into the smallest
     |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
 
-    Each level is solved on the working set of the warm start, then on one that a dual method guesses, and the exact
-    solution is judged by its multipliers; where neither is the optimum, a primal active-set method goes on. A row
+    Each level is solved on the working set of the warm start, and the exact solution is judged by its multipliers;
+    where it is not the optimum, or without a warm start, a primal active-set method goes on. A row
     violated at its optimum, and every hard row with a nonzero multiplier, has one value on the whole face of
     minimisers: it is frozen as an equality before the next level and eliminated by its null space. The search is in
     double precision also where the data are single.
