@@ -1,4 +1,4 @@
-"""Grasps of a person on a hand, beside dex-retargeting if it is installed: python -m benchmarks.hands [ROBOT] [--help].
+"""A right hand grasps as a person, beside dex-retargeting if it is installed: python -m benchmarks.hands [--help].
 
 Grasps are made of a hand's bones and angles of its joints: from the open hand to each grasp and back, while the hand is
 carried and turned. Fingertips are those of MuJoCo's kinematics of the URDF; the distance is to the person's,
@@ -24,9 +24,8 @@ from scipy.spatial.transform import Rotation
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Profile, Retargeter, guess_profile
 from osik_jax.retargeting._person import palm_axes
+from osik_jax.robot.loading import example_urdf
 from osik_jax.runtime import configure_cpu
-
-from .robots_table import file_of
 
 BONES = dict(thumb=(0.045, 0.035, 0.028), index=(0.043, 0.025, 0.022), middle=(0.046, 0.029, 0.023),
              ring=(0.042, 0.027, 0.023), little=(0.033, 0.02, 0.02))  # fmt: skip
@@ -131,11 +130,11 @@ def peer(urdf: str, profile: Profile, vectors: np.ndarray) -> tuple[list[str], n
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("robot", nargs="?", default="allegro", help="a hand of robots_table, or a URDF")
+    parser.add_argument("robot", nargs="?", default="allegro", help="a right hand by name, or a URDF")
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", True)
-    file = Path(options.robot) if options.robot.endswith(".urdf") else file_of(options.robot)
+    file = Path(options.robot) if options.robot.endswith(".urdf") else example_urdf(options.robot)
     urdf = re.sub(r"<(visual|collision)\b.*?</\1>", "", file.read_text(encoding="utf-8"), flags=re.S)
     robot = osik.Robot.from_urdf(file, floating_base=False)
     with warnings.catch_warnings():

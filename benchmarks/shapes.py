@@ -6,7 +6,7 @@ A robot is a name of ``load_robot`` or ``robots_table``, or a file; ``:fixed`` b
 bundled or guessed. Each robot takes the clips of people (robots on four feet those of ``--dogs``, hands the grasps of
 ``benchmarks.hands``). The judge reads the motion that was written: ranges and speeds from the text of the URDF, poses
 from MuJoCo C's kinematics of that file, overlaps of the profile's capsules from MuJoCo's collision detection. The
-kinematics of this library take no part. The exit code is 1 if a bar of ``BARS`` is not met.
+kinematics of this library take no part. The exit code is 1 if a bar of ``FIGURES`` is not met.
 """
 
 from __future__ import annotations
@@ -27,18 +27,32 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Profile, Retargeted, Retargeter, load_motion
+from osik_jax.robot.loading import example_urdf
+from osik_jax.robot.loading._embedded import EXAMPLES
 from osik_jax.runtime import configure_cpu
 
+from .data_file import write_csv
 from .hands import grasps
-from .robots_table import ROBOTS, file_of
+from .robots_table import ROBOTS as TESTED
+from .robots_table import file_of
 
 JUMP = 15.0
 """A change of joint speed from one frame to the next that is a jump [rad/s]."""
 APART = 3
 """Joints between two links, at least, where their shapes are kept apart."""
-BARS = {"over": 1e-9, "speed": 1.0 + 1e-6, "jumps": 0.0, "slip": 0.5, "float": 0.5, "below": 0.5, "penetration": 1.0}
-"""Largest values: beyond ranges [rad or m], speed over its limit, jump frames, and lengths [mm]."""
-DIGITS = {"over": 3, "speed": 3, "jumps": 0}
+FIGURES = {
+    "over": ("rad or m", 3, 1e-9),
+    "speed": ("of the limit", 3, 1.0 + 1e-6),
+    "jumps": ("frames", 0, 0.0),
+    "slip": ("mm", 2, 0.5),
+    "float": ("mm", 2, 0.5),
+    "below": ("mm", 2, 0.5),
+    "overlap": ("mm", 2, 1.0),
+    "angle": ("deg", 1, np.inf),
+}
+"""Unit, digits and bar of what is judged: beyond ranges, speed over its limit, frames with a jump, slip of standing
+points, their height, soles below the floor, overlap of capsules, and the mean angle between segments.
+"""
 
 
 class Source(NamedTuple):
@@ -52,8 +66,10 @@ class Source(NamedTuple):
 def source_of(text: str) -> Source:
     """The file of a robot by name or path."""
     name, _, fixed = text.partition(":")
-    if name in ROBOTS and ROBOTS[name][0]:
-        return Source(Path(name).stem, file_of(name), False if fixed else ROBOTS[name][1])
+    if name in EXAMPLES:
+        return Source(name, example_urdf(name), False if fixed else EXAMPLES[name][1])
+    if name in TESTED and TESTED[name][0]:
+        return Source(name, file_of(name), False if fixed else TESTED[name][1])
     embedded = Path(str(resources.files("osik_jax") / "robot" / "models" / f"{name}.xml"))
     return Source(Path(name).stem, embedded if embedded.is_file() else Path(name), False if fixed else None)
 
@@ -119,7 +135,7 @@ class Judge:
             deepest = max([deepest, *(depth for pair, depth in self._overlaps().items() if pair not in at_rest)])
             corners.append(self._corners())
             angles.append([self._angle(limb, human, frame) for limb in self.profile.followed])
-        out |= {"penetration": 1e3 * deepest, "angle": float(np.mean(angles))}
+        out |= {"overlap": 1e3 * deepest, "angle": float(np.mean(angles))}
         return out | self._feet(np.array(corners), clip["contact"].astype(bool), base > 0)
 
     def _joints(self, names: list[str], q: np.ndarray, fps: float) -> dict[str, float | None]:
@@ -177,7 +193,7 @@ class Judge:
                 landed = None if not contact[frame, k] else points[frame, k, :2] if landed is None else landed
                 slip = slip if landed is None else max(slip, float(np.linalg.norm(points[frame, k, :2] - landed)))
         height = points[..., 2][contact].max(initial=0.0)
-        below = -min(float(corners[..., 2].min()), 0.0)
+        below = max(-float(corners[..., 2].min()), 0.0)
         return {"slip": None if self.profile.rolls else 1e3 * slip, "float": 1e3 * height, "below": 1e3 * below}
 
 
@@ -237,32 +253,32 @@ def main() -> int:
         "--robots", nargs="+", default=["g1", "nao", "talos"], help="names or files, :fixed behind them"
     )
     parser.add_argument("--dogs", nargs="+", default=[], help="motion files of animals, for robots on four feet")
+    parser.add_argument("--csv", type=Path, help="file for the figures of each clip")
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", True)
     people, dogs = ([load_motion(path) for path in paths] for paths in (options.clips, options.dogs))
-    heads = "robot", "clips", "limits over, speed, jumps", "slip, float, below [mm]", "overlap [mm]", "off [deg]"
-    lines, failed = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"], []
+    heads = [f"{key} [{unit}]" for key, (unit, _, _) in FIGURES.items()]
+    table, rows, failed = [["robot", "clips", *heads], ["---"] * (2 + len(heads))], [], []
     for text in options.robots:
-        source, found = source_of(text), {}
+        source, found = source_of(text), []
+        label = source.name + (", fixed" if text.endswith(":fixed") else "")
         for name, figures in judged(source, people, dogs):
-            found[name] = figures
-            broken = [key for key, most in BARS.items() if (figures[key] or 0.0) > most]
-            failed += [f"{text} in {name}: {key} {figures[key]:.4g}" for key in broken]
-            shown = ", ".join(f"{key} {_cell(key, value)}" for key, value in figures.items())
-            print(f"{text} {name}: {shown}", file=sys.stderr, flush=True)
-        worst = {key: max((own[key] for own in found.values() if own[key] is not None), default=None) for key in BARS}
-        cells = [_cell(key, value) for key, value in worst.items()]
-        angles = ", ".join(f"{own['angle']:.1f}" for own in found.values())
-        shown = source.name + (", fixed" if text.endswith(":fixed") else "")
-        groups = [", ".join(cells[:3]), ", ".join(cells[3:6]), cells[6]]
-        lines.append("| " + " | ".join([shown, str(len(found)), *groups, angles]) + " |")
-    print("\n".join([*lines, *failed]))
+            found.append([figures[key] for key in FIGURES])
+            rows.append([label, name, *map(_cell, FIGURES, found[-1])])
+            print(*rows[-1], sep=", ", file=sys.stderr, flush=True)
+            broken = [key for key, (_, _, bar) in FIGURES.items() if (figures[key] or 0.0) > bar]
+            failed += [f"{label} in {name}: {key} {figures[key]:.4g}" for key in broken]
+        worst = [None if None in values else max(values) for values in zip(*found, strict=True)]
+        table.append([label, str(len(found)), *map(_cell, FIGURES, worst)])
+    if options.csv:
+        write_csv(options.csv, ["robot", "clip", *heads], rows)
+    print("\n".join([*("| " + " | ".join(row) + " |" for row in table), *failed]))
     return int(bool(failed))
 
 
 def _cell(key: str, value: float | None) -> str:
-    return "-" if value is None else f"{value:.{DIGITS.get(key, 2)}f}"
+    return "-" if value is None else f"{value:.{FIGURES[key][1]}f}"
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from .._errors import warn
+from ._contact import find_noise, mean_over, noise_steps
 from ._motion import HumanMotion
 from ._roles import SIDES
 
@@ -33,6 +34,8 @@ def with_path(motion: HumanMotion, roles: Mapping[str, str]) -> HumanMotion:
     if np.linalg.norm(points["left_hip"] + points["right_hip"], axis=-1).max() > 2.0 * _CENTERED:
         return motion
     feet = np.stack([points[role] for role in ends], 1)
+    steps = noise_steps(find_noise(feet), motion.fps)
+    feet = mean_over(feet.reshape(motion.frames, -1), steps).reshape(feet.shape)
     # a point that stands is among the lowest before and after a step
     lowest = np.maximum(feet[:-1, :, 2], feet[1:, :, 2]).argmin(1)
     path = np.zeros((motion.frames, 3))

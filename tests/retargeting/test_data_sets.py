@@ -16,6 +16,7 @@ from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Retargeter, find_roles, load_motion, report
+from osik_jax.retargeting._path import with_path
 from osik_jax.retargeting._person import read_person
 
 SAME = ("directions", "pelvis", "torso", "feet", "root", "contact")
@@ -250,6 +251,22 @@ def test_poses_about_the_hips_walk(tmp_path, kind):
     assert result.contact.any(1).all() and 0.5 < result.contact[:, 0].mean() < 0.8
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
     assert figures["tracking"]["segment_angle_deg_mean"] < 3.0
+
+
+def test_the_path_of_noisy_poses_is_smooth_and_feet_stand():
+    """With 5 mm of white noise the path of 4 m is 3 % short at most, and standing points are found."""
+    own, rng = walk(150), np.random.default_rng(0)
+    noisy = own.positions + 0.005 * rng.normal(size=own.positions.shape)
+    middle = noisy[:, [own.joint_names.index(f"{side}_hip") for side in SIDES.values()]].mean(1)
+    roles = find_roles(own.joint_names)
+    with pytest.warns(osik.OsikWarning, match="path is inferred"):
+        motion = with_path(dataclasses.replace(own, positions=noisy - middle[:, None]), roles)
+    person, truth = read_person(motion, roles), read_person(own, roles)
+    off = person.root - truth.root
+    assert np.abs(off[-1] - off[0])[:2].max() < 0.03 * 4.0
+    assert np.abs(np.diff(person.root - middle, axis=0)).max() < 0.03
+    assert (person.contact == truth.contact).mean() > 0.9
+    np.testing.assert_allclose(person.contact.mean(0), truth.contact.mean(0), atol=0.06)
 
 
 CMU_TREE = {  # bones of the CMU database's skeletons: parent and degrees of freedom
