@@ -72,7 +72,7 @@ class Retargeter(OnRobot):
         acceleration: float | Mapping[str, float] = ACCELERATION,
         smoothness: float = 0.0,
         balance: float | None = None,
-        max_iterations: int = 100,
+        max_iterations: int = 300,
     ):
         super().__init__(robot, profile, acceleration, balance)
         if not (np.isfinite(smoothness) and smoothness >= 0.0):
@@ -227,7 +227,7 @@ def retarget(
     acceleration: float | Mapping[str, float] = ACCELERATION,
     smoothness: float = 0.0,
     balance: float | None = None,
-    max_iterations: int = 100,
+    max_iterations: int = 300,
 ) -> Retargeted:
     """Retarget a person's motion to a robot: limbs keep their directions, standing feet keep their place.
 
