@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import mujoco
 import numpy as np
-import scipy.spatial
 from jaxtyping import Float
 
 from ..robot import Robot
+from ..tasks._polygon import Polygon, hull
 from ..viewer import mujoco_frame_pose, mujoco_poses, robot_com
 from ._motion import Motion, Stance
 
@@ -78,7 +79,7 @@ def measure(motion: Motion, q: Float[np.ndarray, "T nq"], dt: float) -> Measurem
         wanted[label] = tuple(np.asarray(part) for part in jax.jit(jax.vmap(goal.path.at))(time)[0])
         settled = goal.path.still(time)
         goals[label] = _track(poses[goal.frame], wanted[label], settled, turns=goal.rows == "pose")
-    support = _support(motion, poses, time) if motion.balanced else []
+    hulls = _hulls(motion, poses, time) if motion.balanced else []
     position_margin, position_violations = _position_limits(robot.mj_model, qpos)
     velocity_margin, velocity_violations = _velocity_limits(robot, qpos, dt)
     return Measurement(
@@ -86,8 +87,8 @@ def measure(motion: Motion, q: Float[np.ndarray, "T nq"], dt: float) -> Measurem
         stances={s.frame: _drift(poses[s.frame], s, time) for s in motion.stances},
         goals=goals,
         com=com,
-        com_margin=margins(com[:, :2], support),
-        support=support,
+        com_margin=margins(com[:, :2], hulls),
+        support=[vertices for _, _, vertices in hulls],
         displacement={label: poses[g.frame][0] - poses[g.frame][0][0] for label, g in motion.goals.items()},
         wanted={label: position - position[0] for label, (position, _) in wanted.items()},
         position_margin=position_margin,
@@ -130,29 +131,23 @@ def _drift(poses: _Poses, stance: Stance, time: np.ndarray) -> Track:
     return Track(position, orientation, standing)
 
 
-def _support(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list[Float[np.ndarray, "m 2"]]:
-    """Return the vertices of the hull of the corners on the ground, at the feet's first poses [m]."""
+def _hulls(motion: Motion, poses: dict[str, _Poses], time: np.ndarray) -> list[Polygon]:
+    """Return the hull of the corners on the ground at each time, at the feet's first poses."""
     corners = {s.frame: poses[s.frame][0][0] + s.corners @ poses[s.frame][1][0].T for s in motion.stances}
     standing = np.stack([s.on_ground(time) for s in motion.stances], -1)
-    hulls = {}
+    hulls: dict[tuple[bool, ...], Polygon] = {}
     for row in {tuple(row) for row in standing}:
-        points = np.concatenate([corners[s.frame] for s, down in zip(motion.stances, row, strict=True) if down])[:, :2]
-        hulls[row] = points[scipy.spatial.ConvexHull(points).vertices]
+        points = [corners[s.frame][:, :2] for s, down in zip(motion.stances, row, strict=True) if down]
+        found = hull(np.concatenate(points))
+        assert found is not None  # support_polygon has refused corners that span no area
+        hulls[row] = found
     return [hulls[tuple(row)] for row in standing]
 
 
-def margins(points: Float[np.ndarray, "T 2"], support: list[Float[np.ndarray, "m 2"]]) -> Float[np.ndarray, " T"]:
-    """Return the least signed distance of points to the polygons' edge lines [m], positive inside.
-
-    NaN where a polygon has no vertices, and empty without polygons.
-    """
-    out = np.full(len(support), np.nan)
-    for k, (point, vertices) in enumerate(zip(points, support, strict=False)):
-        if len(vertices):
-            edges = np.roll(vertices, -1, 0) - vertices
-            inward = np.stack([-edges[:, 1], edges[:, 0]], -1) / np.linalg.norm(edges, axis=-1, keepdims=True)
-            out[k] = np.min(np.sum(inward * (point - vertices), -1))
-    return out
+def margins(points: Float[np.ndarray, "T 2"], hulls: Sequence[Polygon | None]) -> Float[np.ndarray, " T"]:
+    """Return the least signed distance of points to the edge lines of hulls [m], positive inside; NaN without hull."""
+    pairs = zip(points, hulls, strict=False)
+    return np.array([np.nan if edges is None else np.min(edges[1] - edges[0] @ point) for point, edges in pairs])
 
 
 def _position_limits(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, int]:

@@ -10,7 +10,6 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
-import scipy.spatial
 from jaxtyping import Float
 
 from ..physics import Servo, Simulation, build_world, simulate
@@ -19,6 +18,7 @@ from ..physics._world import World
 from ..robot import Robot
 from ..robot._tree import HINGE
 from ..tasks import PostureTask, Task
+from ..tasks._polygon import hull
 from ._measure import margins, measure
 from ._motion import Motion
 from ._run import Run, make_scheme, run_scheme
@@ -186,9 +186,5 @@ def _pressure_margin(
     weights = np.concatenate([f[..., 2:] for _, f in feet], 1)
     total = weights.sum(1)
     pressure = (weights * points).sum(1) / np.where(total > 0.0, total, np.nan)
-    hulls = []
-    for k in range(len(points)):
-        soles = [p[k, :, :2] for p, f in feet if f[k, :, 2].max() > 0.0]
-        corners = np.concatenate(soles or [np.zeros((0, 2))])
-        hulls.append(corners[scipy.spatial.ConvexHull(corners).vertices] if soles else corners)
-    return margins(pressure, hulls)
+    soles = [[p[k, :, :2] for p, f in feet if f[k, :, 2].max() > 0.0] for k in range(len(points))]
+    return margins(pressure, [hull(np.concatenate(down)) if down else None for down in soles])

@@ -44,7 +44,7 @@ def strides(robot: Robot, size: float) -> Float[np.ndarray, " nv"]:
     return out
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class JointPath(Path):
     """Path of a frame while the joints move together along a line in joint space.
 
@@ -56,14 +56,13 @@ class JointPath(Path):
         strokes: moves of the parameter along the line, 0 to 1.
     """
 
-    robot: Robot | None = None
-    q0: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
-    frame: str = ""
-    line: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
+    robot: Robot
+    q0: np.ndarray
+    frame: str
+    line: np.ndarray
 
     def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
         """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""
-        assert self.robot is not None
         part, rate = follow(self.strokes, t, 1)
         q = integrate(self.robot, jnp.asarray(self.q0), jnp.asarray(self.line), part[0])
         kinematics = forward_kinematics(self.robot, q)
@@ -91,7 +90,8 @@ def sway(robot: Robot, q0: Array, frame: str, *, size: float, duration: float) -
     rooms = [_room(robot, q0, sign * line) for sign in (1.0, -1.0)]
     line *= rooms[0] if rooms[0] >= rooms[1] else -rooms[1]
     strokes = tuple(Stroke(*time, (side,)) for time, side in zip(times, (1.0, -1.0), strict=True))
-    return Goal(frame, JointPath(position, rotation, strokes, robot, np.asarray(q0), frame, line))
+    path = JointPath(position, rotation, strokes, robot=robot, q0=np.asarray(q0), frame=frame, line=line)
+    return Goal(frame, path)
 
 
 def _can(J: Float[np.ndarray, "rows nv"], move: Float[np.ndarray, " rows"]) -> bool:

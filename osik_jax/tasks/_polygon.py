@@ -89,7 +89,8 @@ def support_polygon(
     return SupportPolygon(normals, offsets, vertices)
 
 
-_Polygon = tuple[np.ndarray, np.ndarray, np.ndarray]
+Polygon = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Normals, offsets and vertices, as in ``SupportPolygon``."""
 
 
 def _ground_points(robot: Robot, q: Array, frame: str, corners: ArrayLike | None) -> np.ndarray:
@@ -122,7 +123,7 @@ def _corner_names(robot: Robot, frame: str) -> list[str]:
     return names
 
 
-def hull(points: np.ndarray) -> _Polygon | None:
+def hull(points: np.ndarray) -> Polygon | None:
     """Return normals, offsets and vertices of the convex hull; None if its area is 0."""
     if len(points) < 3:
         return None
@@ -150,7 +151,7 @@ def _merge_collinear(vertices: np.ndarray) -> np.ndarray:
     return vertices
 
 
-def _draw_in(polygon: _Polygon, margin: float) -> _Polygon | None:
+def _draw_in(polygon: Polygon, margin: float) -> Polygon | None:
     """Return the polygon with each edge moved inwards; edges that become redundant are dropped."""
     normals, offsets = polygon[0], polygon[1] - margin
     i, j = np.triu_indices(len(offsets), 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import webbrowser
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -27,19 +26,15 @@ from ._gizmos import Gizmos, Pose, gizmo_target
 from ._loop import ControlLoop
 from ._readout import error_text, state_text, timing_text
 from ._robot_nodes import RobotNodes, add_label, side_by_side
-from ._server import Served
+from ._server import FRAME, WORDS, Served
 from ._step import Controller, stacked
 from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
     from viser import ClientHandle, GuiEvent
 
-_FRAME = 1.0 / 30.0
-"""Time between pictures [s]."""
 _APART = 0.6
 """Least distance between robots, in sizes of a robot, so that they can move."""
-_WORDS = 6
-"""Number of pictures between updates of the panel's text."""
 
 
 class BatchView(Served):
@@ -131,12 +126,12 @@ class BatchView(Served):
 
     def _run(self) -> None:
         count = 0
-        while not self._end.wait(_FRAME):
+        while not self._end.wait(FRAME):
             with self._server.atomic():
                 for lane, data in enumerate(mujoco_poses(self._robot, self.loop.snapshot.q)):
                     self._nodes[lane].place(data)
                     self._gizmos[lane].show(self._tasks[lane])
-            if count % _WORDS == 0:
+            if count % WORDS == 0:
                 self._tell()
             count += 1
 
@@ -246,7 +241,6 @@ def serve_batch(
         scheme = scheme_for(next(iter(tasks.values())), robot.q0.dtype)
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
-    view = BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax")
-    if open_browser:
-        webbrowser.open(view.url)
-    return view
+    return BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax").opened(
+        open_browser
+    )

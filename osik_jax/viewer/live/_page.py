@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import webbrowser
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -28,18 +27,13 @@ from ._marks import BalanceMarks
 from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
-from ._server import Served
+from ._server import FRAME, WORDS, Served
 from ._session import Session
 from ._source import RobotSource
 from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
     from viser import ClientHandle
-
-_FRAME = 1.0 / 30.0
-"""Time between pictures [s]."""
-_WORDS = 6
-"""Number of pictures between updates of the panel's text."""
 
 
 class LiveView(Served):
@@ -94,11 +88,11 @@ class LiveView(Served):
         while not self._end.is_set():
             begin = time.perf_counter()
             self._draw()
-            if count % _WORDS == 0:
+            if count % WORDS == 0:
                 self._panel.tell()
             count += 1
             # a pause even when drawing is late, so that the control loop gets the GIL
-            self._end.wait(max(_FRAME - (time.perf_counter() - begin), 0.2 * _FRAME))
+            self._end.wait(max(FRAME - (time.perf_counter() - begin), 0.2 * FRAME))
 
     def _draw(self) -> None:
         """Draw the current state of the robot."""
@@ -231,10 +225,7 @@ def serve_session(
     check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
     check_tasks(session.tasks, session.robot)
     checked_limits(session.robot, session.limits)
-    view = LiveView(session, look=look, host=host, port=port, title="osik-jax")
-    if open_browser:
-        webbrowser.open(view.url)
-    return view
+    return LiveView(session, look=look, host=host, port=port, title="osik-jax").opened(open_browser)
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:

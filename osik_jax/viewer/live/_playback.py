@@ -18,12 +18,10 @@ from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes, add_label, side_by_side
-from ._server import Served
+from ._server import FRAME, Served
 from ._stick_figure import StickFigure, StickNodes
 from ._surroundings import add_surroundings
 
-_FRAME = 1.0 / 30.0
-"""Time between pictures [s]."""
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
 _RATE = 200.0
 """Sample rate of an array without times [Hz]."""
@@ -184,7 +182,7 @@ class Player(Served):
 
     def _run(self) -> None:
         before = time.perf_counter()
-        while not self._end.wait(_FRAME):
+        while not self._end.wait(FRAME):
             now = time.perf_counter()
             if self._play.value:
                 ahead = self._time.value + (now - before) * float(self._speed.value)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import webbrowser
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -18,15 +17,13 @@ from .._look import Look
 from .._mujoco import mujoco_poses
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes
-from ._server import Served
+from ._server import FRAME, Served
 from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
     from viser import GuiEvent, ImageHandle, SceneClickEvent
 
 Axis = Literal["x", "y", "z"]
-_FRAME = 1.0 / 30.0
-"""Time between checks of the panel [s]."""
 _AXES = ("x", "y", "z")
 _PIXELS = 768
 """Pixels along the longer side of a slice; many pixels per cell keep cells sharp."""
@@ -125,7 +122,7 @@ class ReachView(Served):
 
     def _run(self) -> None:
         """Run the drawing thread."""
-        while not self._end.wait(_FRAME):
+        while not self._end.wait(FRAME):
             self._draw()
 
     def _draw(self) -> None:
@@ -270,10 +267,9 @@ def serve_reach(
         ValueError: the map is of another robot.
     """
     check_map(robot, found)
-    view = ReachView(robot, found, look=look, host=host, port=port, title=f"Reach of {found.frame}")
-    if open_browser:
-        webbrowser.open(view.url)
-    return view
+    return ReachView(robot, found, look=look, host=host, port=port, title=f"Reach of {found.frame}").opened(
+        open_browser
+    )
 
 
 def check_map(robot: Robot, found: ReachabilityMap) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import socket
 import threading
+import webbrowser
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Self
 
@@ -15,6 +16,10 @@ from ._priority import run_after_others
 if TYPE_CHECKING:
     from viser import ViserServer
 
+FRAME = 1.0 / 30.0
+"""Time between pictures [s]."""
+WORDS = 6
+"""Number of pictures between updates of the panel's text."""
 _BLUE = (28, 111, 184)
 
 
@@ -31,6 +36,12 @@ class Served(ABC):
         self.url = f"http://{host}:{self._server.get_port()}"
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._draw_all, name="osik-page", daemon=True)
+
+    def opened(self, browser: bool) -> Self:
+        """Return the page, after opening it in a browser if that is wanted."""
+        if browser:
+            webbrowser.open(self.url)
+        return self
 
     def wait(self) -> None:
         """Block until ``stop`` is called elsewhere, or Ctrl-C."""
