@@ -60,7 +60,7 @@ def _draw(axes: Axes, row: Sequence[Figure], names: Sequence[str], dt: float) ->
         axes.yaxis.set_major_locator(MaxNLocator(5))
     else:
         axes.set_yscale("log")
-        axes.set_ylim(first.floor, max(high, 100.0 * first.floor))
+        axes.set_ylim(first.floor, max(2.0 * high, 100.0 * first.floor))
     axes.set_title(first.label, loc="left", fontsize=10.5, color=_INK)
     axes.grid(color=_GRID, lw=0.7)
     axes.tick_params(labelsize=8.5, colors=_INK, length=3)

@@ -76,8 +76,8 @@ def figures(motion: Motion, run: Run) -> list[Figure]:
         return [*_physics(run.physics), balance, *_goals(m, None), fast, *solver]
     broken = Figure("position_limits_broken", "position limits broken", m.position_violations, most=0)
     limits = [
-        Figure("position_margin", "room to a position limit (1: mid-range)", m.position_margin, least=_ROOM, span=0.1),
-        Figure("velocity_margin", "room to a speed limit (1: at rest)", m.velocity_margin, least=_ROOM, span=0.1),
+        Figure("position_margin", "room to position limits (0 to 1)", m.position_margin, least=_ROOM, span=0.1),
+        Figure("velocity_margin", "room to speed limits (0 to 1)", m.velocity_margin, least=_ROOM, span=0.1),
     ]
     drift = _drift(m, scale) if m.stances else []
     return [*drift, *([balance] if motion.balanced else []), *_goals(m, scale), *limits, broken, fast, *solver]

@@ -52,7 +52,7 @@ class Integrated(Command):
     """
 
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """Return the configuration to servo to, as ``Command`` says."""
+        """Return the configuration to servo to until the next step, as ``simulate`` asks for it."""
         return integrate(robot, last, velocity, dt)
 
 
@@ -73,7 +73,7 @@ class Lookahead(Command):
         self.time = jnp.asarray(time, float)
 
     def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """Return the configuration to servo to, as ``Command`` says."""
+        """Return the configuration to servo to until the next step, as ``simulate`` asks for it."""
         return integrate(robot, sensed, velocity, self.time)
 
 

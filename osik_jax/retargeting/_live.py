@@ -155,7 +155,7 @@ class LiveRetargeter(OnRobot):
 
     @property
     def latency(self) -> float:
-        """Return the delay of the robot behind the person [s], without the computing time (``LiveFrame.seconds``)."""
+        """Return the delay of the robot behind the person [s], without the computing time (``seconds`` of a frame)."""
         return self.frames_ahead * self._dt
 
     def reset(self) -> None:

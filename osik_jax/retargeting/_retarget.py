@@ -51,7 +51,7 @@ class Retargeter(OnRobot):
 
     Args:
         robot: robot with limbs of a person (``guess_profile``), z up at home.
-        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess (``find_profile``).
+        profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess.
         acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: time below which motion is smoothed out [s]: its fourth power is added to the weight of
             accelerations, relative to 1 for limb directions. 0: the profile's weights only. Changes do not recompile.

@@ -28,7 +28,7 @@ class SourceMotion:
     Attributes:
         robot: the robot that moves; joints that the motion does not name stay at home.
         motion: its motion; missing contacts are detected as for a person.
-        profile: its profile; None: a bundled one or a guess (``find_profile``).
+        profile: its profile; None: a bundled one or a guess.
         name: name of the clip, for display.
 
     Raises:
