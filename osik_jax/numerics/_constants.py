@@ -291,34 +291,12 @@ NULL_SPACE_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 """Part of a row outside the span of other rows relative to the level's Frobenius norm, below which it is dependent. In
 single precision roundoff makes dependent rows look independent, so the value is larger.
 """
-MISSING_COMPLIANCE = 1e-7
-"""Compliance of the missing part of the motion: the squared length of x that it outweighs."""
-STIFFER_COMPLIANCE = 0.1
-"""Factor on that compliance in every second attempt, which penalises the missing part more."""
 SATURATION_ROUNDOFF = 1e-11
 """Violation of a bound relative to the terms that add up to x, below which it counts as zero."""
-INDEPENDENCE_TOL = 1e-5
-"""Change of a combination of joints by the null space, relative to the combination, below which it counts as
-unchanged.
-"""
-PROJECTOR_ROUNDOFF = 0.1
-"""Least diagonal of a projector (at most 1) that scales its dependence tolerance; smaller diagonals use this value."""
 NEGLIGIBLE_ENTRY = 1e-7
 """Entry in the combination of joints, below which a joint does not block the motion."""
 ENTRY_ROUNDOFF = 2.0
 """Entry in units of machine epsilon times the row's largest entry, below which it is the rounding of 0."""
-SATURATION_ATTEMPTS = 6
-"""Largest number of attempts. After a rejected answer the next attempt has a lower compliance and only the part of the
-motion near the found scale: motions too large for their box by orders of magnitude lose digits.
-"""
-ATTEMPT_GROWTH = 8.0
-"""Factor on the part of the motion that is considered, after an accepted attempt with less than the whole motion."""
-ATTEMPT_SCALE = 1e-3, 0.25
-"""Least and largest scale found by a rejected attempt that is used; the next attempt considers twice as much motion."""
-SATURATION_ACCURACY = 1e-15
-"""Residual relative to the terms that add up to x, below which an answer is not refined."""
-MAX_SATURATION_REFINEMENTS = 5
-"""Largest number of refinements of an answer; one is usual."""
 DERIVATIVE_RANK = 1e-7
 """Part of a saturated joint's column of the projector outside the span of the others, below which the joint has no
 derivative of its own.

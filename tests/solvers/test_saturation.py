@@ -650,8 +650,7 @@ def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, ex
 
     What y is beyond its bound is more than roundoff of the numbers, and less than that of the scale, which falls by a
     65th of it. So nothing is blocked, and y follows what is asked. Without bounds x is 8, beyond its bound by
-    ``excess``: the larger one tries the core, the smaller one plain JAX, whose penalty lowers the scale by a
-    share of it.
+    ``excess``: a larger and a smaller multiplier of that bound.
     """
     x = 8.0 - excess
     y = 8.0 * x - 65.0

@@ -2,27 +2,16 @@
 
     min 1/2 |x - target|^2   over   x = start + scale motion + P u,   lower <= x <= upper
 
-for the largest scale <= 1 for which there is such an x: a linear program, and among its optima a QP. One strictly
-convex QP has both, by a quadratic penalty on the missing part of the motion that outweighs all else:
-
-    min 1/2 |x - target|^2 + 1/2 |motion|^2 (1 - scale)^2 / compliance
-
-With multipliers y of the joints that are at a bound, its optimality conditions are
-
-    x = x(scale 1) + (P + compliance m m') y,   m = motion / |motion|,   1 - scale = -compliance m . y / |motion|
-
-so the projector plus one outer product is the tableau of the dual active-set method (``_goldfarb_idnani.py``): nothing
-is factored, and where x without bounds is inside them, nothing is searched. The method starts there, saturates joints
-and releases those whose multiplier reaches 0.
-
-The active set is then solved without the penalty. Where multipliers are of the order 1 / compliance, their direction
-``normal`` is a combination of joints that the null space does not change,
+for the largest scale <= 1 for which there is such an x. That is a hierarchy of two levels, each solved by the primal
+active-set method (``hqp/_primal_active_set.py``). The motion m has no part in the range of P, so the first level is one
+row, ``m . x = m . (start + m)``, over the range of P and m. Joints with a multiplier at its optimum block the motion:
+their combination ``normal``, the multipliers, is one that the null space does not change,
 
     normal . x = constant + rate scale,     normal >= 0 at lower bounds, <= 0 at upper ones,
 
 which proves (Farkas), for every x in the box, that the scale is no larger than with these joints at their bounds; one
-of them is then where the others put it. Otherwise the scale is 1. The tableau's block of the saturated joints is nearly
-the inverse of the projector's, and refines that answer until it is exact.
+of them is then where the others put it. The second level is the nearest x to the target, with these joints where they
+are.
 
 The basic algorithm of Flacco, De Luca and Khatib saturates joints and never releases one; this is their optimal
 variant (T-RO 2015).
@@ -30,6 +19,7 @@ variant (T-RO 2015).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -38,26 +28,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._double import first_smallest
 from ...execution._lanes import choose
-from ...numerics._constants import (
-    AT_UPPER,
-    ATTEMPT_GROWTH,
-    ATTEMPT_SCALE,
-    INACTIVE,
-    INDEPENDENCE_TOL,
-    MAX_SATURATION_REFINEMENTS,
-    MISSING_COMPLIANCE,
-    NEGLIGIBLE_ENTRY,
-    PROJECTOR_ROUNDOFF,
-    SATURATION_ACCURACY,
-    SATURATION_ATTEMPTS,
-    SATURATION_RESIDUAL,
-    SATURATION_ROUNDOFF,
-    STIFFER_COMPLIANCE,
-)
+from ...numerics._constants import NEGLIGIBLE_ENTRY, SATURATION_RESIDUAL, SATURATION_ROUNDOFF
 from ...numerics._dense import apply
 from ...numerics._guarded import quotient
 from .._box import clip_to_box
-from .._goldfarb_idnani import Constraints, DualState, Roundoff, dual_active_set, initial_state
+from .._damping import Damping
+from ..hqp import Level
+from ..hqp._active_rows import drop_dependent, factor_active_rows
+from ..hqp._padding import LevelProblem
+from ..hqp._primal_active_set import PrimalState, primal_active_set
+from ..hqp._problem import Tolerances
 
 
 class ScaledMotion(NamedTuple):
@@ -75,7 +55,7 @@ class ScaledMotion(NamedTuple):
         return self.start + self.unbounded_step(scale)
 
     def unbounded_step(self, scale: Array) -> Float[Array, " n"]:
-        """Return the step from the start to the answer without bounds."""
+        """Return the step from the start to that answer."""
         return scale * self.motion + apply(self.projector, self.target - self.start)
 
     def size(self, scale: Array) -> Float[Array, ""]:
@@ -104,191 +84,93 @@ def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> Saturatio
 
     Args:
         problem: every array has a leading axis of problems.
-        max_iterations: limit on the changes of the active set (static).
+        max_iterations: limit on the iterations of the primal method (static).
     """
-    batch = problem.start.shape[0]
-    inactive, zeros = jnp.zeros(problem.start.shape, jnp.int32), jnp.zeros(batch, jnp.int32)
-    ones = jnp.ones(batch, problem.start.dtype)
-    start = SaturationResult(problem.start, 0.0 * ones, inactive, inactive, zeros, zeros, zeros > 0)
+    unbounded = jax.vmap(_unbounded)(problem)
 
-    def attempt(carry: tuple[Array, Array, SaturationResult]) -> tuple[Array, Array, SaturationResult]:
-        # ``part``: of the motion that this attempt considers
-        number, part, before = carry
-        # a lower compliance in every other attempt: a stiffer penalty on the missing part
-        compliance = MISSING_COMPLIANCE * jnp.where(number % 2 == 1, STIFFER_COMPLIANCE, 1.0).astype(part.dtype)
-        partial_motion = problem._replace(motion=part[:, None] * problem.motion)
-        result = _attempt(partial_motion, compliance, ~before.done, max_iterations)
-        is_blocked = (result.blocking != 0).any(-1)
-        is_final = result.done & (is_blocked | (part == 1.0))
-        # after a success more of the motion is considered, after a failure the part near the scale that was found
-        growth = jnp.where(result.done, ATTEMPT_GROWTH, 2.0 * jnp.clip(jnp.nan_to_num(result.scale), *ATTEMPT_SCALE))
-        iterations = before.iterations + result.iterations
-        result = result._replace(scale=part * result.scale, iterations=iterations, done=is_final)
-        return number + 1, jnp.minimum(part * growth, 1.0), choose(before.done, before, result)
+    def search() -> SaturationResult:
+        found = jax.vmap(partial(_saturate, max_iterations=max_iterations))(problem, unbounded.done)
+        return choose(unbounded.done, unbounded, found)
 
-    def is_running(carry: tuple[Array, Array, SaturationResult]) -> Array:
-        number, _, result = carry
-        return (number < SATURATION_ATTEMPTS) & ~jnp.all(result.done) & jnp.any(result.iterations < max_iterations)
-
-    return jax.lax.while_loop(is_running, attempt, (zeros[0], ones, start))[2]
+    return jax.lax.cond(jnp.all(unbounded.done), lambda: unbounded, search)
 
 
-def _attempt(
-    problem: ScaledMotion, compliance: Float[Array, ""], searching: Bool[Array, " B"], max_iterations: int
-) -> SaturationResult:
-    constraints, root, start = jax.vmap(_tableau, (0, None))(problem, compliance)
-    zeros = jnp.zeros(root.shape[0], jnp.int32)
-    end = dual_active_set(constraints, start, searching=searching, iterations=zeros, max_iterations=max_iterations)
-    active_set = jax.vmap(_active_set)(problem, root, end)
-    result = jax.vmap(_result)(problem, active_set, _refined(problem, active_set), end.iterations)
-    return result._replace(done=result.done & (end.iterations < max_iterations))
+def _unbounded(problem: ScaledMotion) -> SaturationResult:
+    """Return the answer without bounds, ``done`` where it is in the box."""
+    one, zero = jnp.ones((), problem.start.dtype), jnp.zeros((), jnp.int32)
+    x = problem.unbounded(one)
+    inactive = jnp.zeros(x.shape, jnp.int32)
+    roundoff = SATURATION_ROUNDOFF * problem.size(one)
+    inside = jnp.all((problem.lower - roundoff <= x) & (x <= problem.upper + roundoff))
+    return SaturationResult(clip_to_box(x, problem.lower, problem.upper), one, inactive, inactive, zero, zero, inside)
 
 
-def _tableau(problem: ScaledMotion, compliance: Float[Array, ""]) -> tuple[Constraints, Float[Array, " n"], DualState]:
-    """Return bounds and start of the dual method without active joints, and the scale of each joint."""
-    # T = P + compliance m m', in units in which its diagonal is 1
-    unit = _motion_direction(problem)
-    tableau = problem.projector + compliance * unit[:, None] * unit[None, :]
-    diagonal = jnp.diagonal(tableau)
-    root = 1.0 / jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
-    value = problem.unbounded(jnp.ones((), unit.dtype))
-    roundoff = root * SATURATION_ROUNDOFF * problem.size(jnp.ones((), unit.dtype))
-    constraints = Constraints(
-        lower=problem.lower * root,
-        upper=problem.upper * root,
-        equality=jnp.zeros(len(value), bool),
-        roundoff=Roundoff(roundoff, roundoff),
-        # of a joint that hardly moves, the projector's roundoff is no way to move it
-        scale=jnp.where(diagonal > 0.0, jnp.maximum(1.0, PROJECTOR_ROUNDOFF * root**2), 0.0).astype(value.dtype),
-    )
-    inactive = jnp.full(len(value), INACTIVE, jnp.int32)
-    scaled = tableau * root[:, None] * root[None, :]
-    start = initial_state(scaled, value * root, jnp.zeros_like(value), inactive)
-    return constraints, root, start
-
-
-def _motion_direction(problem: ScaledMotion) -> Float[Array, " n"]:
-    """Return the motion scaled to unit length."""
+def _saturate(problem: ScaledMotion, skip: Bool[Array, ""], max_iterations: int) -> SaturationResult:
+    """Return the answer with bounds; nothing is searched where ``skip``."""
+    tolerances, inactive = Tolerances(), jnp.zeros(problem.start.shape, jnp.int32)
+    # the first level: as far as the motion goes
     length = jnp.sqrt(jnp.sum(problem.motion**2))
-    return problem.motion / jnp.where(length > 0.0, length, 1.0)
-
-
-class _ActiveSet(NamedTuple):
-    """Active set, with the quantities for solving it without the penalty."""
-
-    active: Int[Array, " n"]
-    y: Float[Array, " n"]  # multipliers
-    inverse: Float[Array, "n n"]  # nearly that of the projector's block of the saturated joints; 0 outside of it
-    normal: Float[Array, " n"]  # 0 where nothing blocks the motion
-    blocking: Int[Array, " n"]
-    blocker: Int[Array, ""]
-
-
-def _active_set(problem: ScaledMotion, root: Float[Array, " n"], end: DualState) -> _ActiveSet:
-    """Return the saturated joints, without one joint of a linearly dependent set.
-
-    If the set blocks the motion, that joint is the one which the others determine best. If the whole motion ends on
-    its bounds, it is the joint whose removal leaves all multipliers with the right sign.
-    """
-    # the dual method's answer, back in the units of the joints
-    active = jnp.where(end.active == INACTIVE, 0, jnp.where(end.active == AT_UPPER, 1, -1)).astype(jnp.int32)
-    is_active = active != 0
-    y = jnp.where(is_active, end.multiplier * root, 0.0)
-    block = is_active[:, None] & is_active[None, :]
-    inverse = jnp.where(block, end.tableau * root[:, None] * root[None, :], 0.0)
-    # the block times the motion is the one combination that the null space does not change, if there is any
-    normal = -apply(inverse, _motion_direction(problem))
-    largest = jnp.max(jnp.abs(normal))
-    normal = normal / jnp.where(largest > 0.0, largest, 1.0)
-    normal = jnp.where(jnp.abs(normal) > NEGLIGIBLE_ENTRY, normal, 0.0)
-    blocks = (largest > 0.0) & (jnp.max(jnp.abs(apply(problem.projector, normal))) <= INDEPENDENCE_TOL)
-    # where the whole motion ends, multipliers are not of the penalty's order: the one that reaches 0 first is released
-    ratios = jnp.where(normal != 0.0, y / jnp.where(normal != 0.0, normal, 1.0), jnp.inf)
-    is_whole = blocked_scale(problem, active, normal) >= 1.0 - SATURATION_ROUNDOFF
-    blocker = first_smallest(jnp.where(is_whole, ratios, -jnp.abs(normal)))
-    removed = blocks & (jnp.arange(len(normal)) == blocker)
-    # the inverse of the block without the blocker, and multipliers without the part of the penalty's order
-    column = inverse[blocker]
-    pivot = column[blocker]
-    reduced = inverse - column[:, None] * column[None, :] / jnp.where(pivot != 0.0, pivot, 1.0)
-    at_blocker = normal[blocker]
-    remaining = y - y[blocker] * normal / jnp.where(at_blocker != 0.0, at_blocker, 1.0)
-    return _ActiveSet(
-        active=jnp.where(removed, 0, active),
-        y=jnp.where(blocks, jnp.where(removed, 0.0, remaining), y),
-        inverse=jnp.where(blocks, jnp.where(removed[:, None] | removed[None, :], 0.0, reduced), inverse),
-        normal=jnp.where(blocks, normal, 0.0),
-        blocking=jnp.where(blocks & (normal != 0.0), active, 0),
-        blocker=blocker,
-    )
-
-
-class _Iterate(NamedTuple):
-    """Iterate of the refinement with its residuals."""
-
-    normal: Float[Array, " n"]
-    y: Float[Array, " n"]
-    scale: Float[Array, ""]
-    x: Float[Array, " n"]  # with the rows of all levels where they should be
-    bound_residual: Float[Array, ""]  # of the saturated joints, relative to the size
-    normal_residual: Float[Array, ""]  # the part of the normal that the null space changes
-
-
-def _refined(problem: ScaledMotion, active_set: _ActiveSet) -> _Iterate:
-    """Refine the answer until the active joints are at their bounds; every array has a leading axis of problems."""
-
-    def body(carry: tuple[Array, _Iterate]) -> tuple[Array, _Iterate]:
-        return carry[0] + 1, jax.vmap(_refine)(problem, active_set, carry[1])
-
-    def is_running(carry: tuple[Array, _Iterate]) -> Array:
-        residual = jnp.maximum(carry[1].bound_residual, carry[1].normal_residual)
-        return (carry[0] < MAX_SATURATION_REFINEMENTS) & jnp.any(residual > SATURATION_ACCURACY)
-
-    first = jax.vmap(_evaluate)(problem, active_set, active_set.normal, active_set.y)
-    return jax.lax.while_loop(is_running, body, (jnp.zeros((), jnp.int32), first))[1]
-
-
-def _refine(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate) -> _Iterate:
-    # one step of iterative refinement each, with the tableau's block as the approximate inverse
-    normal = at.normal - apply(active_set.inverse, apply(problem.projector, at.normal))
-    gap = jnp.where(active_set.active != 0, problem.bound(active_set.active) - at.x, 0.0)
-    return _evaluate(problem, active_set, normal, at.y + apply(active_set.inverse, gap))
-
-
-def _evaluate(problem: ScaledMotion, active_set: _ActiveSet, normal: Array, y: Array) -> _Iterate:
-    # the scale that the blocking joints allow, x on it, and what is left of both conditions
-    is_blocked = (active_set.blocking != 0).any()
-    active = jnp.where(active_set.active != 0, active_set.active, active_set.blocking)
-    scale = jnp.where(is_blocked, blocked_scale(problem, active, normal), 1.0)
-    x = problem.unbounded(scale) + apply(problem.projector, y)
-    off = jnp.max(jnp.abs(jnp.where(active_set.active != 0, problem.bound(active_set.active) - x, 0.0)))
-    changed = jnp.max(jnp.abs(apply(problem.projector, normal)))
-    changed = changed / jnp.maximum(jnp.max(jnp.abs(normal)), jnp.finfo(x.dtype).tiny)
-    return _Iterate(normal, y, scale, x, off / jnp.maximum(problem.size(scale), jnp.finfo(x.dtype).tiny), changed)
-
-
-def _result(problem: ScaledMotion, active_set: _ActiveSet, at: _Iterate, iterations: Array) -> SaturationResult:
-    # the blocker is at its bound up to roundoff
-    active = jnp.where(active_set.active != 0, active_set.active, active_set.blocking)
-    x = clip_to_box(jnp.where(active != 0, problem.bound(active), at.x), problem.lower, problem.upper)
-    residual = jnp.max(jnp.abs(x - at.x))
+    unit = problem.motion / jnp.where(length > 0.0, length, 1.0)
+    rows, goal = unit[None], jnp.sum(unit * problem.start)[None] + length
+    space = problem.projector + unit[:, None] * unit[None, :]
+    first = _level(problem, Level(rows, goal), problem.start, space)
+    far = primal_active_set(first, _primal_state(first, inactive, skip), tolerances, max_iterations)
+    is_whole = jnp.sum(unit * (far.x - problem.start)) >= (1.0 - SATURATION_ROUNDOFF) * length
+    largest = jnp.max(jnp.abs(far.multiplier))
+    normal = far.multiplier / jnp.where(largest > 0.0, largest, 1.0)
+    blocking = jnp.where(~is_whole & (jnp.abs(normal) > NEGLIGIBLE_ENTRY), far.active, 0)
+    normal = jnp.where(blocking != 0, normal, 0.0)
+    # of a dependent set the others determine that joint best which has the largest part
+    blocker = first_smallest(-jnp.abs(normal))
+    others = blocking.at[blocker].set(0)
+    scale = jnp.where(is_whole, 1.0, blocked_scale(problem, blocking, normal))
+    # the second level: the nearest point to the target, with the blocking joints where they are
+    start = _level(problem, Level(jnp.eye(len(unit), dtype=unit.dtype), problem.target), far.x, problem.projector)
+    left = factor_active_rows(start, others, tolerances.rank).projector
+    second = start._replace(projector=left, may_block=start.may_block & (blocking == 0))
+    kept = jnp.where(blocking != 0, 0, far.active)
+    kept = drop_dependent(kept, factor_active_rows(second, kept, tolerances.rank))
+    end = primal_active_set(second, _primal_state(second, kept, skip), tolerances, max_iterations)
+    active = jnp.where(others != 0, others, end.active)
+    # what roundoff has added outside of the motion and the null space is taken away
+    at = problem.start + scale * problem.motion + apply(problem.projector, end.x - problem.start)
+    saturated = jnp.where(blocking != 0, blocking, active)
+    x = clip_to_box(jnp.where(saturated != 0, problem.bound(saturated), at), problem.lower, problem.upper)
     # a motion whose scale is 0 leaves roundoff of its own
     roundoff = jnp.finfo(x.dtype).eps * problem.size(jnp.ones((), x.dtype))
-    # joints that are at their bounds where the whole motion ends do not stop it
-    is_whole = at.scale >= 1.0 - SATURATION_ROUNDOFF
-    return SaturationResult(
+    is_exact = jnp.max(jnp.abs(x - at)) <= SATURATION_RESIDUAL * problem.size(scale) + roundoff
+    iterations = far.iterations + end.iterations
+    return SaturationResult(x, scale, active, blocking, blocker, iterations, far.done & end.done & is_exact)
+
+
+def _level(problem: ScaledMotion, level: Level, x: Float[Array, " n"], projector: Float[Array, "n n"]) -> LevelProblem:
+    """Return a level of equalities over x + the range of the projector, in the box."""
+    n, no = len(x), jnp.zeros(len(x), bool)
+    return LevelProblem(
+        level=level,
+        damping=jnp.zeros((), x.dtype),
+        damping_terms=Damping(),
+        is_equality=jnp.ones(level.lower.shape, bool),
+        hard=jnp.eye(n, dtype=x.dtype),
+        lower=problem.lower,
+        upper=problem.upper,
+        may_block=problem.lower < problem.upper,
+        is_own=no,
+        is_own_inequality=no,
+        hard_of_row=jnp.full(level.lower.shape, n, jnp.int32),
+        projector=projector,
         x=x,
-        scale=at.scale,
-        active=active_set.active,
-        blocking=jnp.where(is_whole, 0, active_set.blocking),
-        blocker=active_set.blocker,
-        iterations=iterations,
-        done=(residual <= SATURATION_RESIDUAL * problem.size(at.scale) + roundoff) & jnp.isfinite(at.x).all(),
     )
+
+
+def _primal_state(problem: LevelProblem, active: Int[Array, " n"], done: Bool[Array, ""]) -> PrimalState:
+    """Return the start of the primal method at the level's x."""
+    zero, zeros = jnp.zeros((), jnp.int32), jnp.zeros_like(problem.x)
+    return PrimalState(problem.x, active, zeros, problem.is_equality, zero, zeros[0], zero, zero > 0, zero, done)
 
 
 def blocked_scale(problem: ScaledMotion, active: Int[Array, " n"], normal: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the scale that puts the active joints at their bounds; no null-space motion changes ``normal . x``.
+    """Return the scale for active joints at their bounds, if their combination is not changed by the null space.
 
     ``normal . bound = normal . start + scale normal . motion``.
     """
