@@ -105,13 +105,19 @@ def test_the_polygon_shrinks_from_both_feet_to_one(nao):
     both = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"), margin=0.01)
     foot = osik.support_polygon(nao, nao.q0, ("l_sole",), margin=0.01)
     tasks = demo.single_support(8.0).tasks
+
+    def polygon_at(t: float) -> osik.SupportPolygon:
+        task = tasks(t)["com"]
+        assert isinstance(task, osik.ComTask) and task.polygon is not None
+        return task.polygon
+
     for t in (0.0, 8.0):
-        polygon = tasks(t)["com"].polygon
+        polygon = polygon_at(t)
         beyond = np.asarray(both.vertices) @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
         np.testing.assert_allclose(beyond.max(0), 0.0, atol=1e-12)
-    np.testing.assert_allclose(tasks(4.0)["com"].polygon.offsets, foot.offsets, atol=1e-12)
-    early = np.asarray(tasks(1.0)["com"].polygon.offsets)
-    assert (early <= np.asarray(tasks(0.0)["com"].polygon.offsets) + 1e-12).all()
+    np.testing.assert_allclose(polygon_at(4.0).offsets, foot.offsets, atol=1e-12)
+    early = np.asarray(polygon_at(1.0).offsets)
+    assert (early <= np.asarray(polygon_at(0.0).offsets) + 1e-12).all()
     assert (early >= np.asarray(foot.offsets) - 1e-12).all() and early.sum() > np.asarray(foot.offsets).sum() + 1e-3
 
 
@@ -264,9 +270,9 @@ def test_comparison_draws_the_curves_it_gets(tmp_path):
     page.savefig(tmp_path / "f.png")
     log, linear, steady, zero = page.axes[:4]
     assert [bool(axes.lines) for axes in page.axes] == [True] * 4 + [False] * 2
-    np.testing.assert_allclose(log.lines[0].get_xydata(), np.stack([time, curves["weighted"]], -1))
-    np.testing.assert_allclose(log.lines[1].get_ydata(), 1e-5)
-    np.testing.assert_allclose(linear.lines[1].get_ydata(), curves["hierarchical"])
+    np.testing.assert_allclose(np.asarray(log.lines[0].get_xydata()), np.stack([time, curves["weighted"]], -1))
+    np.testing.assert_allclose(np.asarray(log.lines[1].get_ydata()), 1e-5)
+    np.testing.assert_allclose(np.asarray(linear.lines[1].get_ydata()), curves["hierarchical"])
     assert log.get_yscale() == "log" and log.get_ylim()[1] > 0.1 and linear.get_ylim()[0] < 0.0
     assert np.ptp(steady.get_ylim()) >= 0.1 and zero.get_ylim() == pytest.approx((1e-5, 1e-3))
     with Image.open(tmp_path / "f.png") as picture:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax
 import mujoco
@@ -38,7 +39,7 @@ def poses(motion, q):
         yield data
 
 
-def judged(motion, run, **changes):
+def judged(motion, run, **changes) -> dict[str, Any]:
     """Figures of a recording with something changed: their worst values, and the names of those that miss."""
     recording = dataclasses.replace(run.recording, **changes)
     physics = measure_physics(motion, run.world, recording, run.plan.q)

@@ -180,7 +180,7 @@ def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit,
     ball = before + np.array([0.0, -0.15, 0.0])
     view._desk.move_obstacle("ball 1", position=ball, size=np.array([0.04, 0.0, 0.0]))
     let_it_draw(page, 1500)
-    handle = view._obstacles._shown["ball 1"].handle
+    handle = view._obstacles._handles["ball 1"]
     pull(view, page, ball + 0.75 * handle.scale * left, left, 0.14)
     moved = view._desk.obstacles["ball 1"].position
     assert moved[1] - ball[1] > 0.1
