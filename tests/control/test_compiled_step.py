@@ -168,7 +168,7 @@ def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
 
 
-@pytest.mark.variants(slow=["hierarchy"])
+@pytest.mark.variants(slow=["hierarchy", "weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_are_those_of_plain_jax(scheme):
     robot = robot_of("arm7")
@@ -280,7 +280,8 @@ def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
 
 
 @pytest.mark.variants(
-    slow=["ball-weighted", "locked-weighted"], release=["mimic-weighted", "ball-hierarchy", "locked-hierarchy"]
+    slow=["ball-weighted", "locked-weighted", "mimic-hierarchy"],
+    release=["mimic-weighted", "ball-hierarchy", "locked-hierarchy"],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("kind", ["mimic", "ball", "locked"])

@@ -44,6 +44,7 @@ def counted():
     return velocity, count
 
 
+@pytest.mark.slow
 def test_tasks_made_inside_are_of_the_robot_that_is_given():
     velocity, count = counted()
     robots = first(), second()

@@ -121,6 +121,7 @@ def test_the_reverse_order_with_the_factors_of_the_kernel(name):
 
 
 @pytest.mark.variants(
+    slow=["damped inequalities"],
     release=[
         "level without rows",
         "repeated and damped",
@@ -128,7 +129,7 @@ def test_the_reverse_order_with_the_factors_of_the_kernel(name):
         "more rows than variables",
         "dependent",
         "a humanoid's",
-    ]
+    ],
 )
 @pytest.mark.parametrize(
     "name",

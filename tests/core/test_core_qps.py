@@ -55,7 +55,7 @@ def assert_same(p: Problems, found, expected) -> None:
     assert np.asarray(found.active == expected.active)[good].all(1).mean() > 0.99
 
 
-@pytest.mark.variants(release=["7"])
+@pytest.mark.variants(slow=["16"], release=["7"])
 @pytest.mark.parametrize("m", [M, MANY])
 def test_lane_by_lane_as_the_plain_method(m):
     p = problems(m=m)

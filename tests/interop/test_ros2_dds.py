@@ -200,6 +200,7 @@ def test_a_robot_that_is_killed_is_held_within_100_ms(session):
     assert {"phase", "periods", "missed periods", "refused messages"} <= {value.key for value in last.values}
 
 
+@pytest.mark.slow
 def test_a_bag_gives_the_same_commands_again_to_the_last_bit(session, capsys):
     found = dds.replay(Controller(osik.load_robot("arm7"), Settings()), session.bag)
     assert len(found.recorded) > 300 and np.ptp(found.recorded, axis=0).max() > 0.2

@@ -67,6 +67,7 @@ def least_distance(robot, cost, rng, starts=30):
     return np.sqrt(2.0 * min(minimize(cost, rng.uniform(low, high), **options).fun for _ in range(starts)))
 
 
+@pytest.mark.slow
 def test_least_error_beside_scipy(arm, rng):
     """Positions beyond the links, one proven so, and one inside the arm's base, by numbers and while tracing."""
     targets = np.array([[1.4, 0.1, 0.3], [0.0, 0.0, -1.5], [-0.4, 0.3, 1.2], [0.02, 0.01, -0.55]])
@@ -135,6 +136,7 @@ def test_hessian_of_the_error_by_central_differences(rng, rows):
     np.testing.assert_allclose(hessian, np.stack(columns, 1), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_explain_counts_rows_and_names_those_to_leave_out(arm):
     robot = osik.load_robot("arm7", locked_joints={"joint3": 0.0, "joint5": 0.0})
     pose = (np.array([0.4, 0.2, 0.3]), np.array([0.5, 0.5, 0.5, 0.5]))

@@ -35,6 +35,7 @@ def strips(page: str) -> dict[str, np.ndarray]:
     return out
 
 
+@pytest.mark.slow
 def test_the_page_says_what_the_motion_is(written: Path) -> None:
     page = (written / "report.html").read_text(encoding="utf-8")
     assert "dance &lt;1>" in page and "dance &lt;1&gt;" in page and f"{FRAMES} frames, 30 a second" in page

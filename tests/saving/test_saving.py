@@ -137,7 +137,7 @@ def with_what_an_arm_has_not(robot) -> tuple[dict[str, osik.Task], list[osik.Lim
 SCHEMES = [osik.WeightedQP(), osik.HierarchicalQP(), *(osik.NullSpace(method=m) for m in ("classical", "saturated"))]
 
 
-@pytest.mark.variants(release=["scheme1", "scheme3", "scheme0"])
+@pytest.mark.variants(slow=["scheme2"], release=["scheme1", "scheme3", "scheme0"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_loops_wheels_and_limits_of_a_base_come_back(tmp_path, scheme):
     with pytest.warns(osik.OsikWarning, match="EqualityConstraintTask"):
@@ -205,6 +205,7 @@ FUSED = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom
 GEAR = '<equality><joint joint1="d" joint2="a" polycoef="0 1 .5 0 0"/></equality>'
 
 
+@pytest.mark.variants(slow=["None"])
 @pytest.mark.parametrize("source", [None, "arm7"])
 def test_a_robot_of_single_precision_stays_one(arm, tmp_path, source):
     """The whole controller is of one precision, so a step of it is too."""

@@ -142,6 +142,7 @@ def test_written_and_read_again_they_are_the_same(locked):
         np.testing.assert_allclose(before.jacobian.T @ before.jacobian, jacobian.T @ jacobian, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_sites_of_a_user_are_frames_whatever_their_names():
     """Also where a written end of a constraint would have the name; a second file is the same as the first."""
     own = "".join(f'<site name="equality_end/{name}" pos="0.01 0.02 0.{k}"/>' for k, name in enumerate(("loop/1", "x")))
