@@ -113,7 +113,7 @@ class Judge:
         return site.xpos + site.xmat.reshape(3, 3) @ point
 
     def figures(self, result: Retargeted) -> dict[str, float | None]:
-        """What the written motion shows; lengths in mm, None where there is no such thing."""
+        """Return the figures of ``FIGURES`` from the written motion; None where the robot has no such part."""
         with tempfile.TemporaryDirectory() as folder:
             result.save(Path(folder) / "motion.npz")
             with np.load(Path(folder) / "motion.npz") as file:

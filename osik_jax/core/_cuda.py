@@ -112,8 +112,8 @@ def call_lanes(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inp
         The results, in the precision of the inputs.
     """
     arrays = [jnp.asarray(a) for a in inputs]
-    real = next(a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating))
-    arrays = [a.astype(real if jnp.issubdtype(a.dtype, jnp.floating) else jnp.int32) for a in arrays]
+    real = next(a.dtype for a in arrays if _is_real(a))
+    arrays = [a.astype(real if _is_real(a) else jnp.int32) for a in arrays]
     lanes = outputs[0][0][0]
     given = tuple((2 if len(a) > 1 else 1, *a.shape[1:]) if _is_real(a) else a.shape for a in arrays)
     integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))

@@ -37,14 +37,14 @@ def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: 
     def anywhere(**options: Any) -> Callable[..., Any]:
         wide = over_lanes(partial(plain, **options))
 
-        def computed(*args: Any) -> Any:
+        def everywhere(*args: Any) -> Any:
             calls = {"core": _library.call}
             if on_gpu and cuda_is_default() and _cuda.installed():
                 calls["core-cuda"] = _cuda.call_lanes
             kernels = {name: partial(kernel, call, **options) for name, call in calls.items()}
             return on_platforms(kernels, wide, *args)
 
-        return in_shared_lanes(computed)
+        return in_shared_lanes(everywhere)
 
     @custom_jvp
     def computed(*args: Any, **options: Any) -> Any:

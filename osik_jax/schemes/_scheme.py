@@ -167,10 +167,7 @@ class VelocityProblem(eqx.Module):
     def _bending(self, names: Sequence[str]) -> Float[Array, ""]:
         """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their norm."""
         rows = [self.rows[name] for name in names]
-        weight, squared = (
-            jnp.concatenate(of_each) for of_each in ([r.weight for r in rows], [r.squared_lengths() for r in rows])
-        )
-        squared = weight * squared
+        squared = jnp.concatenate([own.weight * own.squared_lengths() for own in rows])
         # NaN where the step is not valid, and times NaN a derivative of 0 is NaN
         size = positive_root(jnp.sum(jnp.where(jnp.isnan(squared), 0.0, squared)))
         return quotient(greatest(self.bends(names)), jnp.where(size > 0.0, size, 1.0))

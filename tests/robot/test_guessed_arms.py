@@ -3,21 +3,13 @@
 import numpy as np
 import pytest
 from motion_files import dancer, write_bvh
+from small_robots import LEG
 
 import osik_jax as osik
 from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import guess_profile, load_motion, report, retarget
 
 UPPER, FOREARM = 0.3, 0.28
-LEG = """<body name="{s}_hip_yaw" pos="0 {y} 0"><joint name="{s}_hip_yaw" axis="0 0 1" range="-60 60"/>
-  <geom size="0.04"/><body name="{s}_hip_roll"><joint name="{s}_hip_roll" axis="1 0 0" range="-40 40"/>
-  <geom size="0.04"/>  <body name="{s}_hip_pitch"><joint name="{s}_hip_pitch" axis="0 1 0" range="-120 90"/>
-    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.05"/>
-  <body name="{s}_shin" pos="0 0 -0.4"><joint name="{s}_knee" axis="0 1 0" range="0 140"/>
-    <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04"/>
-  <body name="{s}_ankle" pos="0 0 -0.4"><joint name="{s}_ankle_pitch" axis="0 1 0" range="-50 50"/><geom size="0.03"/>
-  <body name="{s}_foot"><joint name="{s}_ankle_roll" axis="1 0 0" range="-30 30"/>
-    <geom type="box" pos="0.04 0 -0.05" size="0.1 0.04 0.02"/></body></body></body></body></body></body>"""
 ARM = """<body name="{s}_pitch" pos="0 {y} 0.4"><joint name="{s}_pitch" axis="0 1 0" range="-170 170"/>
   <geom size="0.03"/><body name="{s}_roll" pos="0 {dy} 0"><joint name="{s}_roll" axis="1 0 0" range="-150 150"/>
   <geom size="0.04"/>

@@ -89,7 +89,7 @@ def trotting(frames: int = 36, speed: float = 0.4, period: float = 0.6, lift: fl
 
 
 def quietly(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """What a function returns; the warning that says what a guess has found is left out."""
+    """Return the result of a function, without the warning in which a guess says what it found."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", osik.OsikWarning)
         return make(*arguments, **options)
