@@ -42,6 +42,7 @@ import jax
 import numpy as np
 import pytest
 
+import osik_jax as osik
 from osik_jax.core import _build
 from osik_jax.runtime import configure_cpu
 
@@ -92,6 +93,18 @@ def pytest_sessionfinish() -> None:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20240229)
+
+
+@pytest.fixture(scope="session")
+def arm() -> osik.Robot:
+    """The embedded arm of seven joints."""
+    return osik.load_robot("arm7")
+
+
+@pytest.fixture(scope="session")
+def nao() -> osik.Robot:
+    """The embedded NAO."""
+    return osik.load_robot("nao")
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
-from made_up_arm import SIX_JOINTS
 
 import osik_jax as osik
 from osik_jax.control import _compiled_step, _step
@@ -26,21 +25,11 @@ pytestmark = needs_core
 DT, LANES = 0.005, 6
 
 
-def robot_of(name: str) -> osik.Robot:
-    if name == "ur5":
-        return osik.Robot.from_mjcf(SIX_JOINTS)
-    return osik.load_robot(name)
-
-
 def frames_of(robot: osik.Robot) -> list[str]:
     """Two frames at the ends of the tree."""
     parents = set(np.asarray(robot.tree.body_parents).tolist())
     ends = [name for body, name in enumerate(robot.tree.body_names) if body not in parents]
     return [ends[-1], robot.tree.body_names[2]]
-
-
-def center_of(robot: osik.Robot) -> Any:
-    return osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))
 
 
 def mixed(robot: osik.Robot) -> dict[str, osik.Task]:
@@ -61,7 +50,7 @@ def bounded(robot: osik.Robot) -> dict[str, osik.Task]:
     """Inequalities of every supported kind beside equalities."""
     hand, root = frames_of(robot)
     normals = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    offsets = normals @ center_of(robot)[:2] + 0.02
+    offsets = normals @ osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))[:2] + 0.02
     corners = jnp.zeros((4, 2))  # which no rows depend on
     weight = np.array([1.0, 2.0, 0.0, 1.0])
     polygon = osik.SupportPolygon(normals, offsets, corners)
@@ -128,10 +117,9 @@ def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance)
 
 
-CASES = [("ur5", "standing"), *((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded"))]
-CASES += [("nao", "standing")]
+CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
 ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy"]
-IN_THE_GATE = ["ur5-standing-weighted", "arm7-bounded-hierarchy", "nao-mixed-weighted", "g1-mixed-hierarchy"]
+IN_THE_GATE = ["nao-standing-weighted", "arm7-bounded-hierarchy", "nao-mixed-weighted", "g1-mixed-hierarchy"]
 AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
@@ -139,7 +127,7 @@ AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SC
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize(("name", "tasks"), CASES)
 def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
-    robot = robot_of(name)
+    robot = osik.load_robot(name)
     given = arguments(robot, SETS[tasks](robot), SCHEMES[scheme]())
     q = lanes_of(robot)
     assert _step.is_compiled(robot, q[0], *given)
@@ -157,12 +145,12 @@ def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     with jax.enable_x64(False):
-        robot = robot_of("nao")
+        robot = osik.load_robot("nao")
         given = arguments(robot, mixed(robot), SCHEMES[scheme]())
         q = lanes_of(robot)
         found, done = by_core(robot, q, *given)
         assert found.velocity.dtype == jnp.float32 and done.all()
-    robot = robot_of("nao")
+    robot = osik.load_robot("nao")
     given = arguments(robot, mixed(robot), SCHEMES[scheme]())
     wanted = plain(robot, jnp.asarray(q, float), *given)
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
@@ -171,7 +159,7 @@ def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
 @pytest.mark.variants(slow=["hierarchy", "weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_are_those_of_plain_jax(scheme):
-    robot = robot_of("arm7")
+    robot = osik.load_robot("arm7")
     q = lanes_of(robot)[0]
 
     def cost(q: Any, point: Any, gain: Any, backend: Any) -> Any:
@@ -192,13 +180,13 @@ def test_derivatives_are_those_of_plain_jax(scheme):
 @pytest.mark.variants(slow=["weighted"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
-    robot = robot_of("nao")
+    robot = osik.load_robot("arm7")
     tasks = bounded(robot)
     hand = tasks["hand"]
     assert isinstance(hand, osik.FrameTask)
     points = jnp.asarray(hand.target[0]) + jnp.linspace(0.0, 3.0, LANES)[:, None]  # the last ones are out of reach
     points = points.at[2].set(jnp.nan)
-    q = lanes_of(robot).at[4, 7].set(jnp.nan)
+    q = lanes_of(robot).at[4, 6].set(jnp.nan)
 
     def velocity(q: Any, point: Any) -> osik.Solution:
         return _step.step(robot, q, tasks | {"hand": hand.replace(target=point)}, SCHEMES[scheme](), None, DT)
@@ -217,7 +205,7 @@ def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("tasks", [mixed, bounded])
 def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
-    robot = robot_of("arm7")
+    robot = osik.load_robot("arm7")
     given = robot, lanes_of(robot)[0], *arguments(robot, tasks(robot), SCHEMES[scheme]())
     leaves, tree = jax.tree.flatten(given)
     names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(given)[0]]
@@ -305,7 +293,7 @@ def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):
 
 
 def test_a_step_is_one_call_with_few_operations_around_it():
-    robot = robot_of("nao")
+    robot = osik.load_robot("nao")
     tasks = standing(robot)
     hand = tasks["hand"]
     assert isinstance(hand, osik.FrameTask)
@@ -323,23 +311,8 @@ def test_a_step_is_one_call_with_few_operations_around_it():
     assert "conditional" not in text and "while" not in text and len(text.splitlines()) < 300
 
 
-def test_numbers_are_swept_without_compiling():
-    robot = robot_of("arm7")
-    hand, _ = frames_of(robot)
-    task = osik.FrameTask(robot, hand)
-    rest = osik.PostureTask(robot, weight=0.1)
-    compiled: Any = _step.step
-    before, found = compiled._cache_size(), []
-    for number in (1.0, 2.0, 5.0):
-        tasks = {"hand": task.replace(weight=number, gain=number), "rest": rest.replace(gain=number)}
-        scheme = osik.WeightedQP(damping=1e-4 * number)
-        found.append(osik.solve(robot, robot.q0 + 0.1, tasks, scheme=scheme, dt=DT / number).velocity)
-    assert compiled._cache_size() == before + 1
-    assert float(jnp.abs(found[0] - found[2]).max()) > 0.1
-
-
 def test_other_steps_take_the_plain_path():
-    robot = robot_of("arm7")
+    robot = osik.load_robot("arm7")
     hand, _ = frames_of(robot)
     own = {"hand": osik.FrameTask(robot, hand)}
     q, limits = robot.q0, with_own_limits(robot, None)

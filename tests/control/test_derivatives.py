@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivative_checks import assert_exact, check, nearest_side
+from derivative_checks import assert_exact, assert_hessian, check, nearest_side
 
-from osik_jax.solvers import Level, Status, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
+from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
 
 CASES = 1000
 N = 8
@@ -91,7 +91,6 @@ def qp_answer(s):
 
 @pytest.mark.slow
 class TestArrays:
-    @pytest.mark.release
     def test_quadratic_programs(self, rng):
         """With respect to H, g, box, rows and their bounds: minimiser, multipliers and slacks."""
         out = check(lambda a: qp_answer(solve_qp(*a)), straight, quadratic_programs(rng, rows=5))
@@ -129,7 +128,7 @@ class TestArrays:
                 "damped": {"damping": damping},
                 "undamped": {},
                 "reverse": {"damping": damping, "order": "reverse"},
-                "saturated": {"lower": lower, "upper": upper},
+                "saturated": {"lower": lower, "upper": upper, "damping": damping},
             }
             s = solve_nullspace(as_levels(levels), secondary=secondary, **options[method])
             return (s.x, s.slacks, s.scales), (s.status, s.active)
@@ -177,56 +176,8 @@ class TestSwitches:
         np.testing.assert_array_equal(answer(column), [1.0, 0.3])
         np.testing.assert_allclose(jax.jacfwd(answer)(column), 0.0, rtol=0, atol=1e-9)
 
-    @pytest.mark.release
-    def test_contradictions_have_finite_derivatives(self, rng):
-        """Infeasible lanes, forward and reverse, of every output."""
-        H, g, *box, C, low, high = quadratic_programs(rng, rows=4)[0]
-        C[:, 1], low[:, 0], high[:, 0] = C[:, 0], 1.0, 1.0
-        low[:, 1], high[:, 1] = 2.0, 2.0
-        data = (H, g, *box, C, low, high)
-        change = changes(rng, data)
-
-        @jax.jit
-        @jax.vmap
-        def both(x, d):
-            value, forward, status = jax.jvp(lambda x: qp_answer(solve_qp(*x)), (x,), (d,), has_aux=True)
-            pulled = jax.vjp(lambda x: qp_answer(solve_qp(*x)), x, has_aux=True)[1](value)
-            return status[0], forward, pulled
-
-        status, *derivatives = both(data, change)
-        assert (np.asarray(status) == Status.INFEASIBLE).mean() > 0.95
-        assert all(np.isfinite(a).all() for a in jax.tree.leaves(derivatives))
-
 
 class TestHessian:
-    @pytest.mark.release
-    def test_of_a_quadratic_program(self, rng):
-        """Forward over reverse at a fixed active set, against central differences of the gradient."""
-        data = [jnp.asarray(a[0]) for a in quadratic_programs(rng, rows=5)[0]]
-        g, C = data[1], data[4]
-
-        def loss(z):
-            s = solve_qp(data[0], z[:N], *data[2:4], z[N:].reshape(C.shape), *data[5:])
-            return jnp.sum(jnp.sin(s.x)), s.active
-
-        z = jnp.concatenate([g, C.ravel()])
-        hessian = np.asarray(jax.jit(jax.hessian(lambda z: loss(z)[0]))(z))
-        expected, active = self.differences(loss, z)
-        assert (active != 0).sum() >= 2
-        assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
-        assert np.abs(hessian - hessian.T).max() < 1e-9 * np.abs(hessian).max()
-
-    @staticmethod
-    def differences(loss, z):
-        """Of the gradient, extrapolated; and the active set, which has to be the same at all points."""
-        gradient = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)))
-        h = 1e-4 * np.eye(len(z))
-        slopes, active = gradient(np.concatenate([z + h, z - h, z + 2 * h, z - 2 * h]))
-        active = [np.asarray(a) for a in jax.tree.leaves(active)]
-        assert all((a == a[0]).all() for a in active)
-        one, back, two, far = np.split(np.asarray(slopes), 4)
-        return (8.0 * (one - back) - (two - far)) / 12e-4, np.concatenate([a[0].ravel() for a in active])
-
     @pytest.mark.variants(release=["saturated", "projections", "quadratic program", "hierarchy"])
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
@@ -251,8 +202,7 @@ class TestHessian:
             end, active = jax.lax.scan(step, x, jnp.array([0.1, 0.3]))
             return jnp.sum(jnp.sin(end)), active
 
-        x = jnp.array([0.4, -0.7, 0.2])
-        hessian = np.asarray(jax.jit(jax.hessian(lambda x: cost(x)[0]))(x))
-        expected, active = self.differences(cost, x)
-        assert active.any() or name == "projections"
-        assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
+        def some_are_active(active):
+            return any(a.any() for a in jax.tree.leaves(active)) or name == "projections"
+
+        assert_hessian(cost, jnp.array([0.4, -0.7, 0.2]), some_are_active)

@@ -20,11 +20,6 @@ CASES = 1000
 all_schemes = pytest.mark.parametrize("name", SCHEMES)
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
-
-
 def scattered(rng, setting, spread, cases=CASES):
     """Cases around a setting and a change of each: all finite numbers, q along the tangent, rotations as rotations."""
     numbers, structure = eqx.partition(setting, eqx.is_inexact_array)

@@ -46,14 +46,14 @@ def held(arm, q: Any) -> dict[str, osik.Task]:
     return {"tip": osik.FrameTask(arm, "tip", rows="position", target=pose), "rest": osik.PostureTask(arm, target=q)}
 
 
-@pytest.mark.variants(slow=["0.005-hierarchy"], release=["0.005-weighted", "0.005-saturated"])
+@pytest.mark.variants(slow=["hierarchy", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("dt", [0.005, 1.0 / 30.0])
-def test_joints_without_speed_limits_return_at_the_default_speed(arm, scheme, dt):
-    """In one step, as until now, the second joint would have 20 rad/s at 200 Hz."""
-    answer = osik.solve(arm, OUT, held(arm, OUT), scheme=SCHEMES[scheme], dt=dt)
-    assert answer.status == osik.Status.SOLVED
-    np.testing.assert_allclose(answer.velocity, [-0.5, -0.5, -0.25], atol=1e-9)
+def test_joints_without_speed_limits_return_at_the_default_speed(arm, scheme):
+    """In one step the second joint would have 20 rad/s at 200 Hz."""
+    for dt in (0.005, 1.0 / 30.0):
+        answer = osik.solve(arm, OUT, held(arm, OUT), scheme=SCHEMES[scheme], dt=dt)
+        assert answer.status == osik.Status.SOLVED
+        np.testing.assert_allclose(answer.velocity, [-0.5, -0.5, -0.25], atol=1e-9)
 
 
 def test_the_way_back_ends_inside_and_takes_as_long_as_it_has_to(arm):

@@ -2,63 +2,32 @@
 
 from __future__ import annotations
 
-import logging
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compilations import Compilations
 from task_checks import kinematics_at
 
 import osik_jax as osik
 
 STEPS = 4
-ONE_OPERATION = ("jit(convert_element_type)", "jit(broadcast_in_dim)")
-"""What JAX itself runs on single numbers outside jit, such as turning a weakly typed dt into that of q."""
 SCHEMES = {
-    "weighted": (osik.WeightedQP(), osik.WeightedQP(damping=1e-3)),
+    "weighted": (osik.WeightedQP(), osik.WeightedQP(damping=1e-3, curvature_damping=0.5)),
     "null-space": (
         osik.NullSpace(),
-        osik.NullSpace(damping=1, potential_gain=0, margin=0.1, rank_tolerance=1e-8),
+        osik.NullSpace(damping=1, potential_gain=0, margin=0.1, rank_tolerance=1e-8, curvature_damping=0.5),
     ),
     "hierarchical": (osik.HierarchicalQP(), osik.HierarchicalQP()),
 }
 all_schemes = pytest.mark.parametrize("name", SCHEMES)
 
 
-class Compilations(logging.Handler):
-    """Counts what JAX says it compiles."""
-
-    def __init__(self):
-        super().__init__()
-        self.names: list[str] = []
-
-    def emit(self, record):
-        message = record.getMessage()
-        if message.startswith("Compiling") and message.split()[1] not in ONE_OPERATION:
-            self.names.append(message.split()[1])
-
-    def __enter__(self):
-        self.context = jax.log_compiles()
-        self.context.__enter__()
-        logging.getLogger("jax").addHandler(self)
-        return self
-
-    def __exit__(self, *error):
-        logging.getLogger("jax").removeHandler(self)
-        self.context.__exit__(*error)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def nothing_is_compiled_yet():
     """Whatever other files have left in this process."""
     jax.clear_caches()
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,6 @@ POINT = [0.4, 0.1, 0.5]
 
 
 @pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
-
-
-@pytest.fixture(scope="module")
 def tasks(arm):
     return {"hand": osik.FrameTask(arm, "hand", rows="position", target=POINT)}
 

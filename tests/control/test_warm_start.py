@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from problem_families import PLANTED
-from recorded import QP_DAMPING, recorded_hierarchies, recorded_qps
+from recorded import QP_DAMPING, recorded_qps
 from task_checks import kinematics_at
 
 import osik_jax as osik
@@ -37,14 +37,6 @@ def test_the_right_active_set_takes_one_factorisation(qps):
     np.testing.assert_allclose(warm.x, cold.x, rtol=0, atol=1e-13)
 
 
-def test_a_random_active_set_costs_time_only(qps, rng):
-    p, cold = qps
-    warm = warm_least_squares(p.A, p.b, p.lower, p.upper, rng.integers(-1, 3, p.lower.shape))
-    assert (np.asarray(warm.status) == Status.SOLVED).all()
-    np.testing.assert_allclose(warm.x, p.solution, rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(warm.active, cold.active)
-
-
 @pytest.mark.variants(slow=["pinned"], release=["mixed", "duplicated_rows"])
 @pytest.mark.parametrize("family", ["mixed", "duplicated_rows", "pinned", "scaled_altogether"])
 def test_random_active_sets_with_rows(family, rng):
@@ -53,32 +45,6 @@ def test_random_active_sets_with_rows(family, rng):
     warm = jax.jit(jax.vmap(lambda *data: solve_qp(*data[:-1], warm_start=data[-1])))(*p.data, guess)
     assert (np.asarray(warm.status) == Status.SOLVED).all()
     np.testing.assert_allclose((warm.x - p.x) / p.unit, 0.0, atol=1e-9)
-
-
-@jax.jit
-@jax.vmap
-def warm_hierarchy(levels, lower, upper, working):
-    (A1, b1, _), ineq, (A3, b3, _), (A4, b4, _) = levels
-    return solve_hqp([Level(A1, b1), Level(*ineq), Level(A3, b3), Level(A4, b4)], lower, upper, warm_start=working)
-
-
-def norms(s):
-    return np.stack([np.linalg.norm(w, axis=1) for w in s.slacks], 1)
-
-
-@pytest.mark.release
-def test_hierarchies(rng):
-    r = recorded_hierarchies(unit_rows=False)
-    longest = max(level[0].shape[1] for level in r.levels)
-    none = WorkingSet(jnp.zeros((256, 5, 34), jnp.int32), jnp.zeros((256, 5, longest), jnp.int32))
-    cold = warm_hierarchy(r.levels, r.lower, r.upper, none)
-    warm = warm_hierarchy(r.levels, r.lower, r.upper, cold.warm_start)
-    assert np.mean(warm.factorizations) < 0.8 * np.mean(cold.factorizations)
-    wrong = WorkingSet(*(jnp.asarray(rng.integers(-1, 3, a.shape)) for a in none))
-    lost = warm_hierarchy(r.levels, r.lower, r.upper, wrong)
-    for other in (warm, lost):
-        assert (np.asarray(other.status) == Status.SOLVED).all()
-        np.testing.assert_allclose(norms(other), norms(cold), rtol=0, atol=1e-7)
 
 
 def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):

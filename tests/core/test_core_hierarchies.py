@@ -10,12 +10,13 @@ from core_checks import needs_core
 from hierarchy_families import SMALL, Hierarchies
 from lexicographic import certificate
 from recorded import recorded_hierarchies
+from refusals import refuses
 
-from osik_jax import HierarchicalQP, OsikWarning
+from osik_jax import HierarchicalQP, NullSpace, OsikWarning
 from osik_jax.core import _library
 from osik_jax.execution import _backends
-from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers.hqp import _core, _dispatch
+from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_nullspace
+from osik_jax.solvers.hqp import _dispatch
 
 pytestmark = needs_core
 COUNT = 24
@@ -80,26 +81,6 @@ def test_answers_are_those_of_the_search(families, damped):
     assert agree.mean() > 0.99  # what is left: rows whose rank is at the tolerance
 
 
-@pytest.mark.slow
-@pytest.mark.variants(release=["False"])
-@pytest.mark.parametrize("damped", [False, True])
-def test_foreign_warm_starts_change_no_answer(families, damped, rng):
-    """Working sets of other problems, and bounds of 1e10; ties that roundoff may break in two ways are among them."""
-    huge = (rng.random(families.lower.shape) < 0.4) & (families.lower < families.upper)
-    p = families._replace(
-        lower=np.where(huge, -1e10, np.maximum(families.lower, -1e10)),
-        upper=np.where(huge, 1e10, np.minimum(families.upper, 1e10)),
-    )
-    cold = solved(*given(p), damped=damped)
-    for other in (1, 7, len(huge) // 2):
-        guess = jax.tree.map(lambda a, other=other: jnp.roll(a, other, 0), cold.warm_start)
-        warm = solved(*given(p), guess, damped=damped)
-        both = (np.asarray(warm.status) == Status.SOLVED) & (np.asarray(cold.status) == Status.SOLVED)
-        assert both.mean() > 0.99 and np.asarray(warm.kkt_residual)[both].max() < 1e-9
-        scale = 1.0 + np.abs(cold.x).max(1, keepdims=True)
-        np.testing.assert_allclose((warm.x / scale)[both], (cold.x / scale)[both], rtol=0, atol=1e-7)
-
-
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 def test_recorded_hierarchies(precision, nothing_is_searched):
     r = recorded_hierarchies(unit_rows=True)
@@ -117,77 +98,28 @@ def test_recorded_hierarchies(precision, nothing_is_searched):
     assert np.mean(warm.factorizations) < 0.3 * np.mean(cold.factorizations)
 
 
-@pytest.mark.release
-def test_vmap_is_a_loop_and_a_bad_lane_leaves_its_neighbours_alone(families):
-    p = jax.tree.map(lambda a: a[:5].copy(), families)
-    p.levels[1].A[3, 0, 0] = np.nan
-    levels, lower, upper = given(p)
-    s = solved(levels, lower, upper)
-    assert s.status[3] == Status.NUMERICAL_ERROR and np.isfinite(s.x).all()
-    nested = jax.tree.map(lambda a: a[None], (levels, lower, upper))
-    np.testing.assert_array_equal(jax.vmap(solved)(*nested).x[0], s.x)
-    for i in (0, 4):
-        alone = solved(*jax.tree.map(lambda a, i=i: a[i : i + 1], (levels, lower, upper)))
-        np.testing.assert_array_equal(alone.x[0], s.x[i])
-
-
-@pytest.mark.release
-def test_what_the_kernel_leaves_over_is_searched(families, monkeypatch):
-    """A kernel that gives wrong answers in every third lane."""
-    p = jax.tree.map(lambda a: a[:6], families)
-    right, solve = solved(*given(p)), _core.solve
-
-    def wrong(*args):
-        end = solve(*args)
-        return end._replace(x=jnp.where(jnp.arange(len(end.x))[:, None] % 3 == 0, jnp.nan, end.x))
-
-    monkeypatch.setattr(_core, "solve", wrong)
-    _dispatch.hierarchy_solver.cache_clear()
-    jax.clear_caches()
-    s = solved(*given(p))
-    _dispatch.hierarchy_solver.cache_clear()
-    jax.clear_caches()
-    np.testing.assert_array_equal(s.status, Status.SOLVED)
-    np.testing.assert_allclose(s.x, right.x, atol=1e-9)
-
-
-@pytest.mark.release
-def test_derivatives_are_those_of_differences():
-    A = np.random.default_rng(3).normal(size=(7, 5))
-    box = np.full(5, 0.4)
-
-    def norm(t):
-        levels = [Level(A[:2], jnp.array([0.3, -0.2]) + t), Level(A[2:], A[2:, 0] * t + 0.5)]
-        return jnp.sum(jnp.sin(solve_hqp(levels, -box, box, backend="core").x))
-
-    both, step = jax.jit(jax.value_and_grad(norm)), 1e-6
-    by_differences = (both(0.2 + step)[0] - both(0.2 - step)[0]) / (2 * step)
-    np.testing.assert_allclose(both(0.2)[1], by_differences, rtol=1e-6)
-    forward = jax.jit(lambda t: jax.jvp(norm, (t,), (1.0,))[1])
-    np.testing.assert_allclose(forward(0.2), by_differences, rtol=1e-6)
-    ends = jax.jit(lambda t: jax.lax.scan(lambda t, _: (t + 0.01, norm(t)), t, length=3)[1])(0.2)
-    np.testing.assert_allclose(ends, [both(t)[0] for t in (0.2, 0.21, 0.22)], atol=1e-12)
-
-
 def test_a_backend_that_is_not_there(monkeypatch):
-    with pytest.raises(ValueError, match="backend is 'cuda'; backends: auto, jax, core"):
-        HierarchicalQP(backend="cuda")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="backend='warp' is gone: the compiled core has its kernels"):
-        HierarchicalQP(backend="warp")  # pyright: ignore[reportArgumentType]
+    for scheme in (HierarchicalQP, NullSpace):
+        refuses(ValueError, "backend is 'cuda'; backends: auto, jax, core", scheme, backend="cuda")
+        for gone in ("warp", "numba"):
+            refuses(ValueError, f"backend='{gone}' is gone: the compiled core has its kernels", scheme, backend=gone)
     monkeypatch.setattr(_library, "core", lambda: _library.Core(None, None, "no compiled core: install g++"))
-    with pytest.raises(ModuleNotFoundError, match=r"backend='core': no compiled core: install g\+\+"):
-        HierarchicalQP(backend="core")
+    for scheme in (HierarchicalQP, NullSpace):
+        refuses(ModuleNotFoundError, r"backend='core': no compiled core: install g\+\+", scheme, backend="core")
     with pytest.warns(OsikWarning, match="install g"):
         _library._warn_once.cache_clear()
         assert not _backends.takes("auto", "core", fits=True)
 
 
-def test_programs_for_other_machines():
-    """Which platform a program is for is decided when it is lowered."""
+@pytest.mark.parametrize(
+    ("solver", "call"), [(solve_hqp, "osik_hierarchy"), (solve_nullspace, "osik_projection")], ids=["hqp", "null space"]
+)
+def test_programs_for_other_machines(solver, call):
+    """Which platform a program is for is decided when it is lowered; with "jax" there is no kernel at all."""
+    box = (-np.ones(3), np.ones(3)) if solver is solve_hqp else ()
 
-    def solve(target):
-        return solve_hqp([Level(np.ones((1, 3)), target)], -np.ones(3), np.ones(3), backend="core").x
+    def text(backend, platform):
+        traced = jax.jit(lambda b: solver([Level(np.ones((1, 3)), b)], *box, backend=backend).x).trace(np.ones(1))
+        return traced.lower(lowering_platforms=(platform,)).as_text()
 
-    traced = jax.jit(solve).trace(np.ones(1))
-    assert "osik_hierarchy" in traced.lower(lowering_platforms=("cpu",)).as_text()
-    assert "osik_hierarchy" not in traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert call in text("core", "cpu") and call not in text("core", "cuda") and call not in text("jax", "cpu")

@@ -1,11 +1,9 @@
 """Motions of robots that somebody brings along: where they start, what moves, and how far."""
 
-import importlib.metadata
-from pathlib import Path
-
 import jax
 import numpy as np
 import pytest
+from example_files import example_file
 from task_checks import kinematics_at
 
 import osik_jax as osik
@@ -123,15 +121,10 @@ def test_an_arm_rises_above_its_base_and_a_hanging_one_hangs():
         assert side * height > 0.0, (turn, height)
 
 
-def urdf(ending):
-    (found,) = (f for f in importlib.metadata.files("example-robot-data") or [] if str(f).endswith(ending))
-    return Path(str(found.locate()))
-
-
 @pytest.mark.release
 def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
-    path = urdf("solo_description/robots/solo12.urdf")
+    path = example_file("solo_description/robots/solo12.urdf")
     robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
     motion = file_motion(robot, name="solo12", look=look)
     assert robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)

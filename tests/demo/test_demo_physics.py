@@ -4,7 +4,6 @@ import dataclasses
 import json
 from typing import Any
 
-import jax
 import mujoco
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from osik_jax.demo._figures import figures
 from osik_jax.demo._physics import measure_physics
 from osik_jax.demo._report import table
 from osik_jax.physics import Servo
+from osik_jax.viewer import mujoco_poses
 
 DT = 0.005
 
@@ -27,16 +27,6 @@ def lift(tmp_path_factory):
     motion, folder = demo.single_support(), tmp_path_factory.mktemp("physics")
     summary, _, runs = run_demo(motion, folder, schemes=("weighted",), dt=DT, physics=True, animation=False)
     return motion, folder, summary, runs[0]
-
-
-def poses(motion, q):
-    """MuJoCo's data of the robot's own model along a motion."""
-    data = mujoco.MjData(motion.robot.mj_model)
-    for qpos in np.asarray(jax.vmap(motion.robot.mujoco_qpos)(q)):
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(motion.robot.mj_model, data)
-        mujoco.mj_comPos(motion.robot.mj_model, data)
-        yield data
 
 
 def judged(motion, run, **changes) -> dict[str, Any]:
@@ -57,7 +47,8 @@ def test_single_support_reaches_its_numbers(lift):
     turns = Rotation.from_quat(q[:, [4, 5, 6, 3]]) * Rotation.from_quat(plan[:, [4, 5, 6, 3]]).inv()
     tilt = np.degrees(turns.magnitude())
     time = DT * np.arange(len(q))
-    soles = np.array([[data.site(foot).xpos.copy() for foot in ("l_sole", "r_sole")] for data in poses(motion, q)])
+    along = mujoco_poses(motion.robot, q)
+    soles = np.array([[data.site(foot).xpos.copy() for foot in ("l_sole", "r_sole")] for data in along])
     moved = np.linalg.norm((soles - soles[:1])[..., :2], axis=-1)
     lifted = (time > motion.stances[1].lifted[0]) & (time < motion.stances[1].lifted[1])
     assert height.max() <= 0.01 and tilt.max() <= 3.0
@@ -83,7 +74,7 @@ def test_forces_are_those_of_the_motion(lift):
     in_the_air = slice(600, 1000)
     np.testing.assert_array_equal(forces[in_the_air, 4:], 0.0)
     assert (np.linalg.norm(forces[..., :2], axis=-1) <= 0.9 * forces[..., 2] * (1.0 + 1e-6) + 1e-9).all()
-    com = np.array([data.subtree_com[1].copy() for data in poses(motion, run.recording.q)])
+    com = np.array([data.subtree_com[1].copy() for data in mujoco_poses(motion.robot, run.recording.q)])
     np.testing.assert_allclose(run.recording.com, com, atol=1e-5)  # the sim's joints are geared, not one
     pressure = (forces[..., 2:] * points[..., :2]).sum(1)[in_the_air] / total[in_the_air, None]
     np.testing.assert_allclose(pressure.mean(0), com[in_the_air, :2].mean(0), atol=2e-3)
@@ -113,7 +104,7 @@ def test_sensed_joints_are_held_against_their_limits(lift):
     """Against the ranges of MuJoCo's model, hinge by hinge."""
     motion, _, summary, run = lift
     model = motion.robot.mj_model
-    qpos = np.array([data.qpos.copy() for data in poses(motion, run.recording.q)])
+    qpos = np.array([data.qpos.copy() for data in mujoco_poses(motion.robot, run.recording.q)])
     hinges = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     angle, (lower, upper) = qpos[:, model.jnt_qposadr[hinges]], model.jnt_range[hinges].T
     beyond = np.degrees(np.maximum(np.maximum(lower - angle, angle - upper), 0.0))

@@ -169,10 +169,10 @@ print("done")
 
 
 @pytest.mark.slow
-@pytest.mark.variants(release=["hqp", "nullspace"])
-@pytest.mark.parametrize("solver", ["nullspace", "hqp"])
-def test_kernels_wait_for_no_workers(solver):
-    """Two batches side by side on two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever."""
+@pytest.mark.variants(release=["hqp", "nullspace", "qp"])
+@pytest.mark.parametrize("solver", ["nullspace", "hqp", "qp"])
+def test_batches_side_by_side_wait_for_no_workers(solver):
+    """Two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever, as QPs by 16 lanes can."""
     assert in_a_process(f"SOLVER = {solver!r}\n{SIDE_BY_SIDE}").stdout == "done\n"
 
 
@@ -264,9 +264,3 @@ def test_searches_on_few_workers_have_no_call_that_is_split():
     few = in_a_process(WHOLE).stdout.split()
     assert few == ["True", "False"] * 2 if splits(jaxlib_version()) else ["True", "True"] * 2
     assert in_a_process(WHOLE, PJRT_NPROC="8").stdout.split() == ["True", "True"] * 2
-
-
-@pytest.mark.release
-def test_batches_of_qps_side_by_side_come_to_an_end():
-    """Two cores, nothing configured, plain JAX: in blocks of 16 lanes they can wait for ever (jaxlib 0.10.2)."""
-    assert in_a_process(f"SOLVER = 'qp'\n{SIDE_BY_SIDE}").stdout == "done\n"

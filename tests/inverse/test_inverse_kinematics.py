@@ -1,5 +1,6 @@
 """Inverse kinematics: what is found is checked by MuJoCo, counted in closed form, differentiated by differences."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -7,6 +8,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco_states import mujoco_at
+from refusals import refuses
 
 import osik_jax as osik
 
@@ -29,34 +32,22 @@ range="-90 90"/><geom size=".05"/><body name="thumb" pos=".1 0 0"><joint name="c
 
 
 @pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
-
-
-@pytest.fixture(scope="module")
 def planar():
     return osik.Robot.from_mjcf(PLANAR)
 
 
 def mujoco_pose(robot, q, frame):
     """The pose of a body or site, by MuJoCo's own kinematics in double precision."""
-    model = robot.mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(np.asarray(q, float)))
-    mujoco.mj_kinematics(model, data)
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame)
+    data = mujoco_at(robot, np.asarray(q, float))
+    site = mujoco.mj_name2id(robot.mj_model, mujoco.mjtObj.mjOBJ_SITE, frame)
     of = data.site(frame) if site >= 0 else data.body(frame)
     return of.xpos.copy(), of.xmat.reshape(3, 3).copy()
 
 
 def mujoco_jacobian(robot, q, site):
     """Rows [linear; angular] in world axes, by MuJoCo."""
-    model = robot.mj_model
-    data, jacobian = mujoco.MjData(model), np.zeros((6, model.nv))
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(np.asarray(q, float)))
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], data.site(site).id)
+    data, jacobian = mujoco_at(robot, q), np.zeros((6, robot.mj_model.nv))
+    mujoco.mj_jacSite(robot.mj_model, data, jacobian[:3], jacobian[3:], data.site(site).id)
     return jacobian
 
 
@@ -121,8 +112,7 @@ def test_what_cannot_be_reached_is_never_found(arm, rng):
     assert (missed >= np.asarray(found.beyond_reach)).all()
     assert_within_limits(arm, found.q)
     assert "out of reach" in found.explain(3)
-    with pytest.raises(ValueError, match="there are 16 targets"):
-        found.explain()
+    refuses(ValueError, "there are 16 targets", found.explain)
 
 
 def test_says_which_limit_stops_it(planar):
@@ -317,36 +307,30 @@ def test_configurations_keep_clear_of_an_obstacle(arm):
 
 
 class TestMistakes:
-    def test_names_and_kinds(self, arm):
-        pose = np.eye(4)
-        with pytest.raises(KeyError, match="no frame 'hnad'; did you mean 'hand'"):
-            osik.inverse_kinematics(arm, {"hnad": pose})
-        with pytest.raises(TypeError, match="dict from names of frames"):
-            osik.inverse_kinematics(arm, [pose])  # pyright: ignore
-        with pytest.raises(ValueError, match="nothing to reach"):
-            osik.inverse_kinematics(arm, {})
-        with pytest.raises(TypeError, match="which is no pose"):
-            osik.inverse_kinematics(arm, {"hand": "there"})
-        with pytest.raises(ValueError, match="no task says where"):
-            osik.inverse_kinematics(arm, {"posture": osik.PostureTask(arm, weight=1.0)})
-        with pytest.raises(KeyError, match="no task 'foot'"):
-            osik.inverse_kinematics(arm, {"hand": osik.FrameTask(arm, "hand")}, targets={"foot": pose[None]})
-        with pytest.raises(ValueError, match="targets go with tasks"):
-            osik.inverse_kinematics(arm, {"hand": pose}, targets={"hand": pose[None]})
+    @pytest.fixture
+    def find(self, arm):
+        return partial(osik.inverse_kinematics, arm)
 
-    def test_numbers(self, arm):
+    def test_names_and_kinds(self, arm, find):
+        pose = np.eye(4)
+        refuses(KeyError, "no frame 'hnad'; did you mean 'hand'", find, {"hnad": pose})
+        refuses(TypeError, "dict from names of frames", find, [pose])
+        refuses(ValueError, "nothing to reach", find, {})
+        refuses(TypeError, "which is no pose", find, {"hand": "there"})
+        refuses(ValueError, "no task says where", find, {"posture": osik.PostureTask(arm, weight=1.0)})
+        hand = osik.FrameTask(arm, "hand")
+        refuses(KeyError, "no task 'foot'", find, {"hand": hand}, targets={"foot": pose[None]})
+        refuses(ValueError, "targets go with tasks", find, {"hand": pose}, targets={"hand": pose[None]})
+
+    def test_numbers(self, find):
         position, rotation = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1))
         rotation[1] *= 1.1
-        with pytest.raises(ValueError, match=r"targets\['hand'\]: rotations that are none.*\[1\]"):
-            osik.inverse_kinematics(arm, {"hand": (position, rotation)})
-        with pytest.raises(ValueError, match="numbers of targets differ: hand: 3, link4: 2"):
-            osik.inverse_kinematics(arm, {"hand": position, "link4": position[:2]})
+        message = r"targets\['hand'\]: rotations that are none.*\[1\]"
+        refuses(ValueError, message, find, {"hand": (position, rotation)})
+        message = "numbers of targets differ: hand: 3, link4: 2"
+        refuses(ValueError, message, find, {"hand": position, "link4": position[:2]})
         for wrong in (0.0, -1.0, np.nan, 1e-15):
-            with pytest.raises(ValueError, match="a tolerance is"):
-                osik.inverse_kinematics(arm, {"hand": np.eye(4)}, position_tolerance=wrong)
-        with pytest.raises(ValueError, match="seeds is 0"):
-            osik.inverse_kinematics(arm, {"hand": np.eye(4)}, seeds=0)
-        with pytest.raises(ValueError, match="have to be finite"):
-            osik.inverse_kinematics(arm, {"hand": np.full((2, 3), np.nan)})
-        with pytest.raises(TypeError, match="all=True counts"):
-            jax.jit(lambda p: osik.inverse_kinematics(arm, {"hand": p}, all=True).q)(jnp.zeros(3))
+            refuses(ValueError, "a tolerance is", find, {"hand": np.eye(4)}, position_tolerance=wrong)
+        refuses(ValueError, "seeds is 0", find, {"hand": np.eye(4)}, seeds=0)
+        refuses(ValueError, "have to be finite", find, {"hand": np.full((2, 3), np.nan)})
+        refuses(TypeError, "all=True counts", jax.jit(lambda p: find({"hand": p}, all=True).q), jnp.zeros(3))

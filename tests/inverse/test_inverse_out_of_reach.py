@@ -28,11 +28,6 @@ CART = """<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
 <equality><joint joint1="coupled" joint2="bend" polycoef="0.1 0.5 0 0 0"/></equality></mujoco>"""
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
-
-
 RADIAN = 0.1
 """What a radian counts as [m], with the default tolerances."""
 

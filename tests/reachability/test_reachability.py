@@ -1,9 +1,10 @@
 """Maps of what a frame gets to: an arm whose reach is a closed form, MuJoCo's kinematics, jobs that go on."""
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco_states import mujoco_at
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import cli, reachability
@@ -102,15 +103,13 @@ def test_configurations_are_where_the_map_says():
     and as manipulable as it says."""
     arm = osik.load_robot("arm7")
     found = reachability.reachability_map(arm, "hand", grid=60, orientations=4, seeds=4, progress=False)
-    data, some = mujoco.MjData(arm.mj_model), found.reached.any(-1)
+    some = found.reached.any(-1)
     assert some.sum() > 8 and found.share[some].mean() > 0.3 and 40 <= some.size <= 60
     jacobian = np.zeros((6, arm.nv))
     for place in np.argwhere(some):
         at = tuple(place)
         q = found.q[at]
-        data.qpos[:] = np.asarray(arm.mujoco_qpos(jnp.asarray(q)))
-        mujoco.mj_kinematics(arm.mj_model, data)
-        mujoco.mj_comPos(arm.mj_model, data)
+        data = mujoco_at(arm, q)
         site = data.site("hand")
         mujoco.mj_jacSite(arm.mj_model, data, jacobian[:3], jacobian[3:], site.id)
         np.testing.assert_allclose(found.manipulability[at], np.sqrt(np.linalg.det(jacobian @ jacobian.T)), atol=1e-9)
@@ -197,8 +196,7 @@ def test_a_map_that_was_stopped_goes_on_and_is_the_same(planar, planar_map, tmp_
     for name in ("reached", "manipulability", "q", "beyond_reach"):
         np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
     np.testing.assert_array_equal(whole.reached, planar_map.reached)
-    with pytest.raises(ValueError, match=r"another job in it.*\[1\]"):
-        mapped(planar, out=tmp_path, orientations=about_z(TURNS + 0.1))
+    refuses(ValueError, r"another job in it.*\[1\]", mapped, planar, out=tmp_path, orientations=about_z(TURNS + 0.1))
 
 
 def test_a_file_keeps_it(planar_map, tmp_path):
@@ -240,8 +238,7 @@ def test_the_picture_shows_the_slice(planar_map, tmp_path):
     np.testing.assert_allclose(place.lines[0].get_xdata()[[0, -1]], [0.0, UPPER + FORE + HAND], atol=1e-12)
     figure.savefig(tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
-    with pytest.raises(ValueError, match="at is 'here'; it is a point"):
-        planar_map.figure(at="here")
+    refuses(ValueError, "at is 'here'; it is a point", planar_map.figure, at="here")
 
 
 def test_grids_go_around_what_is_reached(planar):
@@ -252,26 +249,17 @@ def test_grids_go_around_what_is_reached(planar):
 
 
 def test_mistakes(planar, tmp_path):
-    with pytest.raises(KeyError, match="no frame 'tp'; did you mean 'tip'"):
-        reachability.reachability_map(planar, "tp")
+    refuses(KeyError, "no frame 'tp'; did you mean 'tip'", reachability.reachability_map, planar, "tp")
     with pytest.raises(ValueError, match="'free' is not carried by hinges and slides alone"):
         reachability.reachability_map(planar, "free")
-    with pytest.raises(TypeError, match=r"grid is \[1\.0\]; it is \(x, y, z\)"):
-        mapped(planar, grid=[1.0])
-    with pytest.raises(ValueError, match="y of the grid is .* increasing"):
-        mapped(planar, grid=(AXIS, AXIS[::-1], [0.0]))
-    with pytest.raises(ValueError, match="positions is 0; it is an integer, at least 1"):
-        mapped(planar, grid=0)
-    with pytest.raises(ValueError, match="orientations is 0"):
-        mapped(planar, orientations=0)
-    with pytest.raises(ValueError, match=r"orientations have shape \(5,\)"):
-        mapped(planar, orientations=TURNS)
-    with pytest.raises(ValueError, match="rotations that are none"):
-        mapped(planar, orientations=2.0 * about_z(TURNS))
-    with pytest.raises(ValueError, match="seeds is 0"):
-        mapped(planar, seeds=0)
-    with pytest.raises(ValueError, match="a tolerance is 0"):
-        mapped(planar, position_tolerance=0, out=tmp_path / "none")
+    refuses(TypeError, r"grid is \[1\.0\]; it is \(x, y, z\)", mapped, planar, grid=[1.0])
+    refuses(ValueError, "y of the grid is .* increasing", mapped, planar, grid=(AXIS, AXIS[::-1], [0.0]))
+    refuses(ValueError, "positions is 0; it is an integer, at least 1", mapped, planar, grid=0)
+    refuses(ValueError, "orientations is 0", mapped, planar, orientations=0)
+    refuses(ValueError, r"orientations have shape \(5,\)", mapped, planar, orientations=TURNS)
+    refuses(ValueError, "rotations that are none", mapped, planar, orientations=2.0 * about_z(TURNS))
+    refuses(ValueError, "seeds is 0", mapped, planar, seeds=0)
+    refuses(ValueError, "a tolerance is 0", mapped, planar, position_tolerance=0, out=tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

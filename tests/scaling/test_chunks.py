@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.core import Tracer
+from refusals import refuses
 from small_files import files_of_at_most
 
 from osik_jax import scaling
@@ -136,8 +137,7 @@ def test_a_damaged_manifest_is_written_anew(done, damage):
     else:
         edited = json.dumps(json.loads(good) | {"chunk": 2})
         path.write_text({"half of it": good[: len(good) // 2], "empty": "", "edited": edited, "a list": "[]"}[damage])
-        with pytest.raises(ValueError, match=r"manifest\.json is damaged .*call run_in_chunks again"):
-            len(scaling.load(done))
+        refuses(ValueError, r"manifest\.json is damaged .*call run_in_chunks again", scaling.load, done)
     function = Counted()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -162,8 +162,7 @@ def test_chunks_of_another_job_are_refused_and_kept(done, tmp_path_factory):
     shutil.copy(done / "00000002.npz", other)
     with pytest.raises(ValueError, match=r"00000002\.npz has results of another job"):
         scaling.load(other)[8:12]
-    with pytest.raises(ValueError, match=r"00000002\.npz has results of another job"):
-        run(other, function, shared=(4.0,))
+    refuses(ValueError, r"00000002\.npz has results of another job", run, other, function, shared=(4.0,))
     assert (other / "00000002.npz").read_bytes() == before["00000002.npz"]
 
 
@@ -177,11 +176,9 @@ def test_an_earlier_format_is_refused(done):
         np.savez(path, **arrays)
     (done / "manifest.json").write_text(json.dumps(manifest | {"format": 1}))
     for call in (lambda: run(done, program, shared=(3.0,)), lambda: scaling.load(done)):
-        with pytest.raises(ValueError, match=r"has format 1, .* reads and writes 2: name another folder.* np\.load"):
-            call()
+        refuses(ValueError, r"has format 1, .* reads and writes 2: name another folder.* np\.load", call)
     (done / "manifest.json").unlink()
-    with pytest.raises(ValueError, match=r"00000000\.npz has results of another job"):
-        run(done, program, shared=(3.0,))
+    refuses(ValueError, r"00000000\.npz has results of another job", run, done, program, shared=(3.0,))
 
 
 def test_plain_numpy_reads_a_chunk(done):
@@ -329,9 +326,9 @@ def test_chunks_have_the_same_types_and_shapes(tmp_path, changed, message):
         return changed(y) if x[0] == 8 else {"y": y}
 
     for out in (None, tmp_path):
-        with pytest.raises(ValueError, match=r"results of chunk 2 are not like those of chunk 0: " + message):
-            run(out, function)
-    assert len(scaling.load(tmp_path).missing) == 3
+        refuses(ValueError, r"results of chunk 2 are not like those of chunk 0: " + message, run, out, function)
+    assert scaling.load(tmp_path).missing == (2, 3, 4)
+    refuses(ValueError, "chunk 2 of .* is missing, with 2 more of 5", scaling.load(tmp_path).__getitem__, slice(None))
 
 
 @pytest.mark.parametrize(("changed", "message"), CHANGES, ids=["shape", "type", "name"])
@@ -360,8 +357,7 @@ def test_a_job_of_numpy_that_is_done(tmp_path):
     ],
 )
 def test_results_that_would_not_come_back(tmp_path, function, message):
-    with pytest.raises(ValueError, match=message):
-        run(tmp_path, function)
+    refuses(ValueError, message, run, tmp_path, function)
     assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
 
 
@@ -401,12 +397,10 @@ def test_progress_as_a_function(tmp_path):
         if done == 12:
             raise RuntimeError("enough")
 
-    with pytest.raises(RuntimeError, match="enough"):
-        run(tmp_path, program, shared=(3.0,), progress=tell)
+    refuses(RuntimeError, "enough", run, tmp_path, program, shared=(3.0,), progress=tell)
     assert_right(run(tmp_path, program, shared=(3.0,), progress=tell))
     assert told == [(4, 20), (8, 20), (12, 20), (16, 20), (20, 20)] and leftovers(tmp_path) == []
     told.clear()
     run(None, program, shared=(3.0,), progress=lambda *now: told.append(now))
     assert told == [(4, 20), (8, 20), (12, 20), (16, 20), (20, 20)]
-    with pytest.raises(TypeError, match="progress is 'bar'; it is True, False, or a function"):
-        run(tmp_path, program, progress="bar")
+    refuses(TypeError, "progress is 'bar'; it is True, False, or a function", run, tmp_path, program, progress="bar")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.core import Tracer
 from other_processes import finish, free_port, start
+from refusals import refuses
 
 from osik_jax import scaling
 
@@ -126,80 +125,8 @@ def test_two_hosts_write_their_own_lanes(tmp_path):
     np.testing.assert_array_equal(saved[7:17]["n"], x[7:17, 0] > 0.5)
 
 
-KILLED = """
-import os, signal, sys
-import jax, numpy as np
-from osik_jax.scaling import run_in_chunks
-def batch(start, stop):
-    if start == 40:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return {"x": np.arange(start, stop, dtype=float)}
-square = jax.jit(jax.vmap(lambda lane, a: {"y": a * lane["x"] ** 2}, (0, None)))
-run_in_chunks(square, batch, count=64, chunk=8, shared=(3.0,), out=sys.argv[1])
-"""
-
-
-def square(lane, a):
-    return {"y": a * lane["x"] ** 2}
-
-
-@pytest.fixture
-def counted():
-    """The function of the job that is killed, and the chunks that it ran."""
-    ran: list[int] = []
-    program = jax.jit(jax.vmap(square, (0, None)))
-
-    def function(batch, a):
-        if not isinstance(batch["x"], Tracer):
-            ran.append(int(batch["x"][0]))
-        return program(batch, a)
-
-    return function, ran
-
-
 def numbers(start: int, stop: int) -> dict[str, Any]:
     return {"x": np.arange(start, stop, dtype=float)}
-
-
-@pytest.mark.slow
-def test_killed_and_continued(tmp_path, counted):
-    function, ran = counted
-    killed = start(KILLED, tmp_path)
-    killed.communicate(timeout=120)
-    assert killed.returncode == -signal.SIGKILL
-    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.npz")}
-    assert list(sorted(before)) == [f"{k:08d}.npz" for k in range(4)]  # chunk 4 was on its way
-    with pytest.raises(ValueError, match="chunk 4 of .* is missing, with 3 more of 8"):
-        scaling.load(tmp_path)[:]
-    np.testing.assert_array_equal(scaling.load(tmp_path)[3:30]["y"], 3.0 * np.arange(3.0, 30.0) ** 2)
-
-    out = scaling.run_in_chunks(function, numbers, count=64, chunk=8, shared=(3.0,), out=tmp_path, progress=False)
-    assert ran == [32, 40, 48, 56]
-    np.testing.assert_array_equal(out[:]["y"], 3.0 * np.arange(64.0) ** 2)
-    assert all((tmp_path / name).stat().st_mtime_ns == then for name, then in before.items())
-
-    ran.clear()
-    scaling.run_in_chunks(function, numbers, count=64, chunk=8, shared=(3.0,), out=tmp_path, progress=False)
-    assert ran == [] and not list(tmp_path.glob(".*"))
-
-
-def test_a_half_written_file_does_not_count(tmp_path, counted, monkeypatch):
-    function, _ = counted
-    job: dict[str, Any] = dict(chunk=8, shared=(3.0,), out=tmp_path, progress=False)
-    real = np.savez
-
-    def full_disk(file, *args, **arrays):
-        file.write(b"half of it")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(np, "savez", full_disk)
-    with pytest.raises(OSError, match="no space"):
-        scaling.run_in_chunks(function, numbers(0, 20), **job)
-    monkeypatch.setattr(np, "savez", real)
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
-    np.testing.assert_array_equal(
-        scaling.run_in_chunks(function, numbers(0, 20), **job)[:]["y"], 3.0 * np.arange(20.0) ** 2
-    )
 
 
 @pytest.mark.parametrize(
@@ -217,13 +144,17 @@ def test_a_half_written_file_does_not_count(tmp_path, counted, monkeypatch):
         (dict(label="cube"), "differs: label was , is cube$"),
     ],
 )
-def test_another_job_is_refused(tmp_path, counted, changes, message):
-    function, ran = counted
+def test_another_job_is_refused(tmp_path, changes, message):
+    ran = []
+
+    def function(batch, a):
+        ran.append(batch)
+        return {"y": a * batch["x"] ** 2}
+
     job: dict[str, Any] = dict(batch=numbers(0, 20), chunk=8, shared=(3.0,), out=tmp_path, progress=False)
     scaling.run_in_chunks(function, **job)
     ran.clear()
-    with pytest.raises(ValueError, match=message):
-        scaling.run_in_chunks(function, **job | changes)
+    refuses(ValueError, message, scaling.run_in_chunks, function, **job | changes)
     assert ran == []
 
 
@@ -254,25 +185,14 @@ def test_slices_and_structures(tmp_path):
     again, by_name = scaling.load(tmp_path, like=like), scaling.load(tmp_path)
     np.testing.assert_array_equal(again[3:9][1]["both"], by_name[3:9]["[1].both"])
     np.testing.assert_array_equal(by_name.read(["[0]"], slice(20, 23))["[0]"], x[20:, 0])
-    with pytest.raises(KeyError, match=r"no array 'both'; arrays: \[0\], \[1\]\.both"):
-        by_name.read(["both"])
+    refuses(KeyError, r"no array 'both'; arrays: \[0\], \[1\]\.both", by_name.read, ["both"])
     one: Any = 3
     with pytest.raises(TypeError, match=r"use \[3 : 3 \+ 1\]"):
         by_name[one]
     with pytest.raises(ValueError, match="step"):
         by_name[::-1]
-    with pytest.raises(ValueError, match=r"like has the arrays a; saved are \[0\], \[1\]\.both"):
-        scaling.load(tmp_path, like={"a": 0})
-    with pytest.raises(FileNotFoundError, match="no manifest"):
-        scaling.load(tmp_path / "elsewhere")
-
-
-def test_in_memory_with_a_bar(capsys):
-    x = jnp.linspace(0.0, 1.0, 10)
-    got = scaling.run_in_chunks(scaling.sharded(lambda x: {"y": x + 1.0}), x, chunk=4)
-    assert isinstance(got["y"], np.ndarray)
-    np.testing.assert_array_equal(got["y"], np.asarray(x) + 1.0)
-    assert "10 of 10 lanes" in capsys.readouterr().err
+    refuses(ValueError, r"like has the arrays a; saved are \[0\], \[1\]\.both", scaling.load, tmp_path, like={"a": 0})
+    refuses(FileNotFoundError, "no manifest", scaling.load, tmp_path / "elsewhere")
 
 
 @pytest.mark.parametrize(
@@ -290,27 +210,21 @@ def test_in_memory_with_a_bar(capsys):
 )
 def test_mistakes_in_jobs(changes, message):
     job: dict[str, Any] = dict(function=lambda batch: batch, batch=numbers(0, 8), chunk=4, progress=False)
-    with pytest.raises(ValueError, match=message):
-        scaling.run_in_chunks(**job | changes)
+    refuses(ValueError, message, scaling.run_in_chunks, **job | changes)
 
 
 def test_mistakes_in_sharded():
     add = scaling.sharded(lambda x, y: x + y, (0, None))
-    with pytest.raises(ValueError, match="in_axes has 2 parts, for 1 arguments"):
-        add(jnp.ones(3))
-    with pytest.raises(ValueError, match="axis 0 for an array of shape \\(\\)"):
-        add(1.0, jnp.ones(3))
-    with pytest.raises(ValueError, match="found: 0"):
-        add(jnp.ones(0), 1.0)
+    refuses(ValueError, "in_axes has 2 parts, for 1 arguments", add, jnp.ones(3))
+    refuses(ValueError, "axis 0 for an array of shape \\(\\)", add, 1.0, jnp.ones(3))
+    refuses(ValueError, "found: 0", add, jnp.ones(0), 1.0)
     with pytest.raises(ValueError, match="found: 2, 3"):
         scaling.sharded(lambda x, y: x + y)(jnp.ones(3), jnp.ones(2))
     with pytest.raises(ValueError, match="in_axes splits no argument"):
         scaling.sharded(lambda x: x, None)(jnp.ones(3))
     number: Any = 3
-    with pytest.raises(TypeError, match="mesh is 3"):
-        scaling.sharded(lambda x: x, mesh=number)
-    with pytest.raises(TypeError, match="3 is no function"):
-        scaling.sharded(number)
+    refuses(TypeError, "mesh is 3", scaling.sharded, lambda x: x, mesh=number)
+    refuses(TypeError, "3 is no function", scaling.sharded, number)
 
 
 def test_other_axes_and_precisions():

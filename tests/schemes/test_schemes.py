@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
-from pathlib import Path
 
 import daqp
 import jax
 import jax.numpy as jnp
 import mink
-import mujoco
 import numpy as np
 import pytest
-import scipy.optimize
+from example_files import example_file
+from hierarchy_families import Hierarchies, Rows
+from lexicographic import certificate
+from mujoco_states import mujoco_at
 from task_checks import kinematics_at, moved_by
 
 import osik_jax as osik
@@ -44,12 +44,6 @@ class Numbers:
     box: tuple[np.ndarray, np.ndarray]
 
 
-def g1_path() -> Path:
-    files = importlib.metadata.files("example-robot-data") or []
-    (found,) = [file for file in files if str(file).endswith(G1)]
-    return Path(str(found.locate()))
-
-
 def at_home(robot, frame):
     kinematics = kinematics_at(robot, robot.q0)
     return tuple(map(np.asarray, kinematics.frame_pose(robot, frame)))
@@ -78,7 +72,7 @@ def nao():
 
 @pytest.fixture(scope="module")
 def g1():
-    robot = osik.Robot.from_urdf(g1_path(), floating_base=True)
+    robot = osik.Robot.from_urdf(example_file(G1), floating_base=True)
     feet = ("left_ankle_roll_link", "right_ankle_roll_link")
     bounds = {"axes": "xy", "lower": [0.02, -0.01], "upper": [0.05, 0.01]}
     return whole_body(robot, feet, "left_wrist_yaw_link", bounds, 1.5)
@@ -327,15 +321,6 @@ class TestNullSpace:
             np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-9)
             np.testing.assert_allclose(ours.slack["position"][k], 0.0, rtol=0, atol=1e-10)
 
-    def test_added_levels_leave_the_first_alone(self, arm, rng):
-        q = configurations(arm, rng)
-        first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
-        alone, together = (solve_lanes(case, q, undamped()) for case in (first, arm))
-        for k in range(LANES):
-            J = numbers(arm, q[k], ["position"]).jacobian
-            np.testing.assert_allclose(J @ together.velocity[k], J @ alone.velocity[k], rtol=0, atol=1e-10)
-            assert np.abs(together.velocity[k] - alone.velocity[k]).max() > 1e-2
-
     def test_the_potential_leads_away_from_limits_and_keeps_the_task(self, arm):
         robot = arm.robot
         q0 = robot.configuration({"joint1": 2.6, "joint3": -2.6, "joint5": 2.6})
@@ -363,34 +348,11 @@ class TestNullSpace:
         assert ours.box_violation.max() > 0.1
 
 
-def lexicographic_residual(case, q, v, active=1e-9):
-    """How far v is from the lexicographic optimum: 0 proves it, for the problem of each level is convex.
-
-    Level by level, the gradient of half the squared distance must be a combination of the normals of what must not be
-    touched: the box, and the rows above (as equalities where they are equalities or missed, else as inequalities),
-    with multipliers of the right sign. The smallest norm comes last.
-    """
-    n = len(v)
+def lexicographic_residual(case, q, v):
+    """How far v is from the lexicographic optimum: 0 proves it, for the problem of each level is convex."""
+    stack = [Rows(A[None], low[None], high[None], np.ones((1, len(A)))) for A, low, high in levels(case, q)]
     low, high = numbers(case, q).box
-    hard = [(np.eye(n), low, high)]
-    worst = 0.0
-    for A, lower, upper in [*levels(case, q), (np.eye(n), np.zeros(n), np.zeros(n))]:
-        slack = gap(A @ v, lower, upper)
-        gradient = A.T @ slack
-        rows, lows, highs = (np.concatenate(parts) for parts in zip(*hard, strict=True))
-        value = rows @ v
-        at_low, at_high = value - lows <= active, highs - value <= active
-        both = at_low & at_high
-        directions = np.concatenate(
-            [rows[at_low], -rows[at_high & ~both], -rows[both]]
-        )  # gradient = directions' y, y >= 0
-        rest = (
-            scipy.optimize.nnls(directions.T, gradient, maxiter=10000)[1] if len(directions) else np.abs(gradient).max()
-        )
-        worst = max(worst, rest / max(1.0, np.abs(A).max() * np.abs(slack).max()))
-        missed = np.abs(slack) > active
-        hard.append((A, np.where(missed, A @ v, lower), np.where(missed, A @ v, upper)))
-    return worst
+    return certificate(Hierarchies(stack, low[None], high[None]), 0, v).max()
 
 
 class TestHierarchicalQP:
@@ -413,16 +375,6 @@ class TestHierarchicalQP:
             bounded += np.sum((v == low) | (v == high))
         assert ours.box_violation.max() == 0.0
         assert bounded > 5
-
-    def test_a_contradicting_level_does_not_hurt_those_above(self, arm, rng):
-        """The first level misses as much as if it were alone."""
-        q = configurations(arm, rng)
-        first = dataclasses.replace(arm, tasks={"position": arm.tasks["position"]})
-        alone = solve_lanes(first, q, osik.WeightedQP(damping=1e-12, curvature_damping=0.0))
-        together = solve_lanes(arm, q, osik.HierarchicalQP(curvature_damping=0.0))
-        np.testing.assert_allclose(together.slack["position"], alone.slack["position"], rtol=0, atol=1e-9)
-        assert np.abs(together.slack["pose"]).max() > 0.1
-        assert np.abs(together.velocity - alone.velocity).max() > 1e-2
 
     def test_equals_the_null_space_where_no_bound_is_active(self, arm, rng):
         """Both are eq. 7, though the second level contradicts the first."""
@@ -505,13 +457,5 @@ class TestCentreOfMass:
 
 
 def mujoco_path(robot, qs, sites):
-    model = robot.mj_model
-    data = mujoco.MjData(model)
-    com, places = [], []
-    for q in qs:
-        data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        com.append(data.subtree_com[0].copy())
-        places.append([data.site(site).xpos.copy() for site in sites])
-    return np.array(com), np.array(places)
+    data = [mujoco_at(robot, q) for q in qs]
+    return np.array([d.subtree_com[0] for d in data]), np.array([[d.site(s).xpos for s in sites] for d in data])

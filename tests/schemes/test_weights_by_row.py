@@ -9,6 +9,7 @@ import numpy as np
 import pink
 import pinocchio as pin
 import pytest
+from refusals import refuses
 from task_checks import rows_of_each, square
 
 import osik_jax as osik
@@ -25,11 +26,6 @@ FLOATING = """
   </body>
 </worldbody></mujoco>
 """
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +89,7 @@ class TestAgainstPeers:
             "posture": osik.PostureTask(loop, target=np.zeros(4), weight=0.25, gain=0.1 / DT),
         }
         assert_answers(loop, q, ours, expected)
-        with pytest.raises(ValueError, match=r"expected a scalar, or \(2,\)"):
-            osik.EqualityConstraintTask(loop, weight=[1.0] * 4)
+        refuses(ValueError, r"expected a scalar, or \(2,\)", osik.EqualityConstraintTask, loop, weight=[1.0] * 4)
 
     def test_pink(self, arm, rng):
         model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
@@ -169,8 +164,7 @@ class TestRows:
                 return osik.task_rows(q[:2], jnp.eye(2, robot.nv), gain=self.gain, weight=self.weight)
 
         np.testing.assert_array_equal(Level(weight=[1.0, 2.0]).weight, [1.0, 2.0])
-        with pytest.raises(ValueError, match="a scalar or a vector"):
-            Level(weight=np.ones((2, 2)))
+        refuses(ValueError, "a scalar or a vector", Level, weight=np.ones((2, 2)))
 
     @pytest.mark.slow
     def test_a_gradient_by_joint_against_differences(self, arm, rng):
@@ -201,5 +195,4 @@ class TestRows:
     ],
 )
 def test_mistakes_are_told(arm, make, error, message):
-    with pytest.raises(error, match=message):
-        make(arm)
+    refuses(error, message, make, arm)

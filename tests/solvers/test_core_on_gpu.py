@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import test_saturation
 from null_space_families import FAMILIES, check_derivatives_of_saturation, saturated
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
+from saturation_families import FAMILIES as SATURATED
+from saturation_families import N, as_levels, drawn, family, solve_full
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
@@ -189,34 +190,34 @@ def test_saturation_lane_by_lane_as_the_plain_method(name, precision):
     np.testing.assert_array_equal(found.active, expected.active)
 
 
-@pytest.mark.parametrize("number", range(len(test_saturation.FAMILIES)), ids=test_saturation.FAMILIES)
+@pytest.mark.parametrize("number", range(len(SATURATED)), ids=SATURATED)
 def test_saturation_decides_as_the_plain_method(number):
     """And as a loop over the problems."""
-    p = test_saturation.family(test_saturation.FAMILIES[number], np.random.default_rng(100 + number))
-    found, expected = (test_saturation.solve_full(p, backend=backend) for backend in ("core", "jax"))
+    p = family(SATURATED[number], np.random.default_rng(100 + number))
+    found, expected = (solve_full(p, backend=backend) for backend in ("core", "jax"))
     assert (found.status == Status.SOLVED).all()
     assert ((found.x >= p.lower) & (found.x <= p.upper)).all()
     size = 1.0 + np.abs(expected.x).max(1)
     assert (np.abs(found.x - expected.x).max(1) < 1e-8 * size).all()
     np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
     for lane in (0, 99, 199):
-        alone = test_saturation.solve_full(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="core")
+        alone = solve_full(jax.tree.map(lambda a, i=lane: a[i : i + 1], p), backend="core")
         np.testing.assert_allclose(alone.x[0], found.x[lane], rtol=0, atol=1e-12 * size[lane])
 
 
 def test_saturation_leaves_nothing_to_the_search(rng):
     """Of random problems the kernel answers all."""
-    p = test_saturation.drawn(rng, 5000)
+    p = drawn(rng, 5000)
 
     def padded(p):
         zero = jnp.zeros(())
-        damping = [Damping(zero, zero, zero, jnp.zeros(test_saturation.N))] * len(p.levels)
-        levels = [level.scaled() for level in test_saturation.as_levels(p.levels)]
+        damping = [Damping(zero, zero, zero, jnp.zeros(N))] * len(p.levels)
+        levels = [level.scaled() for level in as_levels(p.levels)]
         return pad_levels(levels, p.lower, p.upper, p.secondary, damping, 1e-10)
 
     found = jax.jit(lambda p: null_space_kernel.solve(jax.vmap(padded)(p), 120))(p)
     assert found.done.all()
-    assert (jnp.abs(found.x - test_saturation.solve_full(p, backend="jax").x) < 1e-8).all()
+    assert (jnp.abs(found.x - solve_full(p, backend="jax").x) < 1e-8).all()
 
 
 def test_recorded_saturated_problems_whatever_rounding_does():
@@ -230,10 +231,10 @@ def test_derivatives_of_saturation(rng):
 
 
 def test_a_bad_lane_of_saturation_disturbs_no_other():
-    p = jax.tree.map(np.copy, test_saturation.family("tight", np.random.default_rng(1)))
-    good = test_saturation.solve_full(p, backend="core")
+    p = jax.tree.map(np.copy, family("tight", np.random.default_rng(1)))
+    good = solve_full(p, backend="core")
     p.levels[1][0][3, 0, 0] = np.nan
-    bad = test_saturation.solve_full(p, backend="core")
+    bad = solve_full(p, backend="core")
     others = np.arange(len(p.lower)) != 3
     assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
     np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])

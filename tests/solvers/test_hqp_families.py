@@ -1,4 +1,4 @@
-"""Hundreds of hard hierarchies a family: optimality certificates, level norms by quadprog, and steps that must fail."""
+"""Hundreds of hard hierarchies a family: optimality certificates, level norms by quadprog, and bad numbers."""
 
 import jax
 import numpy as np
@@ -6,6 +6,7 @@ import pytest
 from hierarchy_families import (
     SMALL,
     Hierarchies,
+    Rows,
     inequality_levels,
     many_levels,
     rescaled,
@@ -14,13 +15,27 @@ from hierarchy_families import (
     weighted,
 )
 from lexicographic import certificate, norms, reference
-from stretched_hierarchies import stretched
+from recorded import recorded_hierarchies
 
 from osik_jax.solvers import Level, Status, solve_hqp
 
 COUNT = 300
+
+
+def stretched(rng: np.random.Generator, count: int) -> Hierarchies:
+    """The recorded robot's Jacobians near singularity, and targets far out of reach, other than the recorded ones."""
+    r = recorded_hierarchies(unit_rows=False)
+    lanes = rng.choice(np.flatnonzero(r.kind >= 2), count)
+    levels = []
+    for k, (A, low, high) in enumerate(r.levels):
+        A, low, high = A[lanes], low[lanes], high[lanes]
+        far = 10.0 ** rng.uniform(-4, 0, (count, 1)) * rng.normal(size=low.shape) * (k < 3)
+        levels.append(Rows(A, low + far, high + far, np.ones_like(low)))
+    return Hierarchies(levels, r.lower[lanes], r.upper[lanes])
+
+
 UNREACHED = ("scaled_inside", "weighted", "scaled_within_reach")
-"""Families whose rows differ so much in weight that quadprog with slacks, and a step's cost, lose the small ones."""
+"""Families whose rows differ so much in weight that quadprog with slacks loses the small ones."""
 RESIDUAL = {"stretched": 1e-8}
 """Near singularity the certificate's own multipliers lose digits: quadprog's answer gets the same residual."""
 FAMILIES = SMALL | {"many_levels": many_levels, "stretched": stretched}
@@ -79,59 +94,10 @@ def test_level_norms_and_answer_by_quadprog(family, answers):
     assert compared >= COUNT / 5 * 0.9
 
 
-def costs(p: Hierarchies, x: np.ndarray) -> np.ndarray:
-    """Weighted squared distances of each level, in units of the level's longest row; x (count, steps, n)."""
-    out = []
-    for r in p.levels:
-        value = np.einsum("bmn,bsn->bsm", r.A, x)
-        w = value - np.clip(value, r.lower[:, None], r.upper[:, None])
-        longest = np.max(r.weight * np.sum(r.A**2, -1), -1, initial=0.0)
-        out.append(np.sum(r.weight[:, None] * w**2, -1) / np.where(longest > 0.0, longest, 1.0)[:, None])
-    return np.stack(out, -1)
-
-
-def guided_steps(p: Hierarchies, x: np.ndarray, rng) -> np.ndarray:
-    """Down each level's slope, as it is and inside the null space of what the levels above hold, and at random."""
-    count, n = x.shape
-    P = np.broadcast_to(np.eye(n), (count, n, n))
-    directions = [rng.normal(size=(count, n)) for _ in range(10)]
-    for r in p.levels:
-        value = np.einsum("bmn,bn->bm", r.A, x)
-        w = value - np.clip(value, r.lower, r.upper)
-        slope = np.einsum("bmn,bm->bn", r.A, r.weight * w)
-        directions += [-slope, -np.einsum("bij,bj->bi", P, slope)]
-        fixed = (r.lower == r.upper) | (np.abs(w) > 1e-9 * np.linalg.norm(r.A, axis=-1))
-        rows = np.where((fixed & (r.weight > 0.0))[..., None], r.A, 0.0) @ P
-        length = np.linalg.norm(rows, axis=-1, keepdims=True)
-        rows = np.where(length > 1e-9 * np.linalg.norm(r.A, axis=-1, keepdims=True), rows, 0.0)
-        unit = rows / np.where(length > 0.0, length, 1.0)
-        P = P - np.linalg.pinv(unit, rcond=1e-9) @ unit @ P if rows.shape[1] else P
-    d = np.stack(directions, 1)
-    length = np.linalg.norm(d, axis=-1, keepdims=True)
-    d = d / np.where(length > 0.0, length, 1.0)
-    return np.concatenate([d * 10.0**k for k in (-4, -3, -2, -1)], 1)
-
-
-def improvable(p: Hierarchies, x: np.ndarray, rng):
-    """Lanes where a step improves a level and leaves those above as they are, to rounding."""
-    y = np.clip(x[:, None] + guided_steps(p, x, rng), p.lower[:, None], p.upper[:, None])
-    here = costs(p, x[:, None])
-    change = costs(p, y) - here
-    hurt_above = np.cumsum(change > 1e-14 * np.sqrt(here), -1) > 0  # |w| has absolute errors of 1e-15
-    return ((change < -1e-11 * (1.0 + here)) & ~hurt_above).any((1, 2))
-
-
-@pytest.mark.parametrize("family", COMPARED)
-def test_no_feasible_step_improves_a_level_without_hurting_a_higher_one(family, answers, rng):
-    p, _, x = answers(family)
-    assert not improvable(p, x, rng).any()
-
-
-def test_certificate_and_steps_notice_answers_that_are_off(answers, rng):
+def test_the_certificate_notices_answers_that_are_off(answers, rng):
     p, _, x = answers("conflicting")
     off = np.clip(x + 1e-4 * rng.normal(size=x.shape), p.lower, p.upper)
     assert np.mean([certificate(p, i, off[i]).max() > 1e-6 for i in range(COUNT)]) > 0.95
-    assert np.mean(improvable(p, off, rng)) > 0.95
 
 
 @pytest.mark.parametrize("family", [scaled_between, scaled_within_reach])

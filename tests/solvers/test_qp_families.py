@@ -20,6 +20,7 @@ from problem_families import (
 )
 from scipy.optimize import lsq_linear
 
+from osik_jax import raise_if_failed
 from osik_jax.solvers import Status, solve_least_squares_qp, solve_qp
 
 COUNT = 1000
@@ -86,6 +87,8 @@ def test_contradictions_get_the_least_violating_answer(family, rng):
     p = family(rng, COUNT)
     s, x = solved(p)
     assert (np.asarray(s.status) == Status.INFEASIBLE).all()
+    with pytest.raises(RuntimeError, match=f"INFEASIBLE in {COUNT} of {COUNT} lanes"):
+        raise_if_failed(s)
     values = np.einsum("bpn,bn->bp", p.C, x)
     distance = np.linalg.norm(values - np.clip(values, p.row_lower, p.row_upper), axis=1)
     for i in range(0, COUNT, 20):
@@ -113,7 +116,7 @@ def test_rates_of_the_least_violating_answer_by_differences(family, rng):
     assert smooth.sum() > 80
 
     _, rate = jax.jit(lambda s: jax.jvp(moved, (s,), (jnp.ones_like(s),)))(jnp.zeros(()))
-    assert (np.abs(np.asarray(rate) - near).max(1) / size)[smooth].max() < 1e-5
+    assert (np.abs(np.asarray(rate) - near).max(1) / size)[smooth].max() < 1e-5 and np.isfinite(rate).all()
 
 
 def least_squares_residual(p, x):
@@ -194,12 +197,16 @@ def test_a_bad_number_harms_its_lane_alone(name, bad, healthy):
     assert (~(x < low) & ~(x > high))[possible].all()  # nothing to say of a NaN bound
 
 
-@pytest.mark.parametrize("argument", range(5), ids=["A", "b", "weight", "lower", "upper"])
-def test_a_bad_number_in_factored_form(argument):
+@pytest.mark.parametrize(
+    ("argument", "bad"),
+    [*((k, np.nan) for k in range(5)), (0, np.inf)],
+    ids=["A", "b", "weight", "lower", "upper", "inf"],
+)
+def test_a_bad_number_in_factored_form(argument, bad):
     p = whole_body(np.random.default_rng(6), COUNT)
     good = batched_least_squares(*p[:5])
     data = [a.copy() for a in p[:5]]
-    data[argument][3].flat[11] = np.nan
+    data[argument][3].flat[11] = bad
     s = batched_least_squares(*data)
     assert s.status[3] == Status.NUMERICAL_ERROR
     x = np.asarray(s.x)

@@ -67,24 +67,6 @@ def by_bounded_least_squares(data, i):
     return lsq_linear(matrix, right, box, method="bvls", tol=1e-15, max_iter=1000).x[:N]
 
 
-def test_rows_that_give_way_are_solved(rng):
-    data = problems(rng, soft=True)
-    s = batched(*data)
-    np.testing.assert_array_equal(s.status, np.full(LANES, Status.SOLVED))
-    for i in range(LANES):
-        expected = by_bounded_least_squares(data, i)
-        np.testing.assert_allclose(cost(data, i, np.asarray(s.x[i])), cost(data, i, expected), rtol=1e-9)
-
-
-def test_hard_rows_that_can_hold_do(rng):
-    data = problems(rng, soft=False)
-    s = batched(*data)
-    np.testing.assert_array_equal(s.status, np.full(LANES, Status.SOLVED))
-    assert np.abs(s.slack).max() < 1e-10 and s.kkt_residual.max() < 1e-9
-    alone = [one(*(a[i] for a in data)) for i in range(4)]
-    np.testing.assert_allclose([a.x for a in alone], s.x[:4], atol=1e-7)
-
-
 def test_rows_that_give_way_beside_weights_over_eight_decades():
     data = wide_problems(soft=True)
     s = batched(*data)

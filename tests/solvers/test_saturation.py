@@ -13,24 +13,13 @@ import scipy.optimize
 from core_checks import needs_core
 from hierarchy_families import degenerate
 from optimality import outside_cone
+from saturation_families import FAMILIES, LANES, ROWS, N, as_levels, drawn, family, solve_full
 from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, solve_nullspace
 from osik_jax.solvers.null_space import NullSpaceSolution
 from osik_jax.solvers.null_space._scaled_motion import ScaledMotion, solve_scaled_motion
-
-N, ROWS, LANES = 10, (3, 2, 3), 200
-FAMILIES = ("easy", "tight", "small targets", "box beside zero", "pinned", "conflicting", "near-dependent", "ties")
-
-
-class Problems(NamedTuple):
-    """A batch: levels as (matrix, wanted) pairs, a box, and a secondary motion."""
-
-    levels: list
-    lower: np.ndarray
-    upper: np.ndarray
-    secondary: np.ndarray
 
 
 class Answers(NamedTuple):
@@ -40,57 +29,10 @@ class Answers(NamedTuple):
     full: NullSpaceSolution
 
 
-def drawn(rng, count=LANES, spread=1.5, box=1.0, infinite=0.15):
-    levels = [(rng.normal(size=(count, m, N)), spread * rng.normal(size=(count, m))) for m in ROWS]
-    shape = (count, N)
-    lower = np.where(rng.random(shape) < infinite, -np.inf, -rng.exponential(box, shape))
-    upper = np.where(rng.random(shape) < infinite, np.inf, rng.exponential(box, shape))
-    return Problems(levels, lower, upper, rng.normal(size=shape))
-
-
-def family(name, rng):
-    p = drawn(
-        rng, spread={"tight": 5.0, "small targets": 0.3}.get(name, 1.5), infinite=0.0 if name == "tight" else 0.15
-    )
-    if name in ("box beside zero", "pinned"):
-        move = 0.5 * rng.normal(size=p.lower.shape)
-        p = p._replace(lower=p.lower + move, upper=p.upper + move)
-    if name == "pinned":
-        pin, place = rng.random(p.lower.shape) < 0.25, rng.normal(size=p.lower.shape)
-        p = p._replace(lower=np.where(pin, place, p.lower), upper=np.where(pin, place, p.upper))
-    if name == "conflicting":
-        p.levels[1][0][:] = p.levels[0][0][:, :2]
-        p.levels[2][0][:, 0] = p.levels[0][0].sum(1)
-    if name == "near-dependent":
-        p.levels[0][0][:, 2] = p.levels[0][0][:, 0] + 1e-5 * p.levels[0][0][:, 2]
-    if name == "ties":
-        levels = [
-            (rng.integers(-1, 2, A.shape).astype(float), rng.integers(-3, 4, b.shape).astype(float))
-            for A, b in p.levels
-        ]
-        p = Problems(levels, -np.ones_like(p.lower), np.ones_like(p.upper), np.round(p.secondary))
-    return p
-
-
-def as_levels(pairs):
-    return [Level(matrix, wanted, wanted) for matrix, wanted in pairs]
-
-
-@jax.jit
-@jax.vmap
-def solve_all(p):
-    partial = [solve_nullspace(as_levels(p.levels[: k + 1]), p.lower, p.upper) for k in range(len(p.levels))]
-    return Answers(partial, solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary))
-
-
-@partial(jax.jit, static_argnames="backend")
-def solve_full(p, *, backend="auto"):
-    """Everything, by one backend."""
-
-    def one(p):
-        return solve_nullspace(as_levels(p.levels), p.lower, p.upper, secondary=p.secondary, backend=backend)
-
-    return jax.vmap(one)(p)
+def first_levels(p, count):
+    """The problem of the first levels alone: rows of the others are 0, so that all have one shape."""
+    levels = [pair if k < count else tuple(np.zeros_like(a) for a in pair) for k, pair in enumerate(p.levels)]
+    return p._replace(levels=levels, secondary=np.zeros_like(p.secondary))
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +41,8 @@ def solved():
     out = {}
     for k, name in enumerate(FAMILIES):
         p = family(name, np.random.default_rng(100 + k))
-        out[name] = p, jax.tree.map(np.asarray, solve_all(p))
+        partial = [solve_full(first_levels(p, count)) for count in range(1, len(ROWS) + 1)]
+        out[name] = p, jax.tree.map(np.asarray, Answers(partial, solve_full(p)))
     return out
 
 
@@ -172,6 +115,7 @@ class TestProperties:
 
     @every_family
     def test_the_first_level_is_exact_where_a_linear_program_finds_it_feasible(self, solved, name):
+        """Where the box holds 0, it keeps its direction too: A x = s b."""
         p, answers = solved[name]
         first = answers.partial[0]
         exact = 0
@@ -181,17 +125,11 @@ class TestProperties:
             feasible = scipy.optimize.linprog(np.zeros(N), A_eq=A, b_eq=b, bounds=bounds).status == 0
             error = np.abs(A @ first.x[i] - b).max()
             assert (error < 1e-9 * size(first.x[i])) == feasible
+            if name in ("easy", "tight", "small targets", "near-dependent"):
+                off = A @ first.x[i] - first.scales[i, 0] * b
+                assert np.abs(off).max() < 1e-9 * size(first.x[i])
             exact += feasible
         assert exact > (0 if name == "near-dependent" else 10)
-
-    @pytest.mark.parametrize("name", ["easy", "tight", "small targets", "near-dependent"])
-    def test_the_first_level_keeps_its_direction(self, solved, name):
-        """The box holds 0: A x = s b."""
-        p, answers = solved[name]
-        A, b = p.levels[0]
-        first = answers.partial[0]
-        off = np.abs(np.einsum("imn,in->im", A, first.x) - first.scales * b).max(1)
-        assert all(off[i] < 1e-9 * size(first.x[i]) for i in range(LANES))
 
     @every_family
     def test_lower_levels_do_not_disturb_higher_ones(self, solved, name):
@@ -236,27 +174,6 @@ class TestProperties:
                     assert move.status == 0
                     assert move.x[joint] == pytest.approx(x[joint], abs=1e-6)
 
-    @needs_core
-    @pytest.mark.variants(release=["easy", "tight"])
-    @pytest.mark.parametrize("name", FAMILIES)
-    def test_the_kernel_and_the_plain_method_decide_alike(self, solved, name):
-        """The same answer in every lane. Joints that one of them holds at a bound are there in the other, held or not.
-
-        Where a level asks for rounding alone, as it may where joints tie, it has any scale.
-        """
-        p = solved[name][0]
-        found, expected = (jax.tree.map(np.asarray, solve_full(p, backend=backend)) for backend in ("auto", "jax"))
-        np.testing.assert_array_equal(found.status, Status.SOLVED)
-        np.testing.assert_array_equal(expected.status, Status.SOLVED)
-        largest = 1.0 + np.abs(expected.x).max(1)
-        assert (np.abs(found.x - expected.x).max(1) < 1e-8 * largest).all()
-        near = np.abs(found.scales - expected.scales) < 1e-9
-        assert near.all() or (name == "ties" and near.mean() > 0.99)
-        np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-9)
-        for mine, other in ((found, expected), (expected, found)):
-            bound = np.where(mine.active > 0, p.upper, p.lower)
-            assert (np.abs(other.x - bound) < 1e-8 * largest[:, None])[mine.active != 0].all()
-
     def test_is_the_projection_where_nothing_saturates(self, solved):
         """With bounds that are far, and with bounds that are near but not reached."""
         p = solved["easy"][0]
@@ -272,29 +189,29 @@ class TestProperties:
             np.testing.assert_array_equal(answers.scales, 1.0)
             np.testing.assert_array_equal(answers.active, 0)
 
-    def test_permuting_the_joints_permutes_the_answer(self, solved, rng):
-        p, answers = solved["tight"]
-        order = rng.permutation(N)
-        mixed = Problems(
-            [(A[..., order], b) for A, b in p.levels], p.lower[:, order], p.upper[:, order], p.secondary[:, order]
-        )
-        np.testing.assert_allclose(solve_full(mixed).x, answers.full.x[:, order], rtol=0, atol=1e-9)
+
+BY_HAND = {
+    "one joint saturates and another takes over": ([2, 0], [-0.5, -3, -1], [0.5, 3, 1], [0.5, 1.5, 0], [1, 0, 0], 1),
+    "two joints pull at what is out of reach": ([3, 1], [-1, -1, -1], [1, 1, 1], [1, 1, 2 / 3], [1, 1, 0], 2 / 3),
+    "pinned joints leave the others to do the work": ([1, 1], [0.3, -5, 0], [0.3, 5, 0], [0.3, 0.7, 0], [2, 0, 2], 1),
+    "a joint outside its range comes back": ([0, 0], [0.4, -1, -1], [1, 1, 1], [0.4, -0.4, 0], [-1, 0, 0], 1),
+}
+
+
+@jax.jit
+def two_rows(wanted, lower, upper):
+    return solve_nullspace([Level([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]], wanted)], lower, upper)
 
 
 class TestByHand:
-    def test_one_joint_saturates_and_another_takes_over(self):
-        answer = solve_nullspace([Level([[1.0, 1.0]], [2.0])], jnp.array([-0.5, -3.0]), jnp.array([0.5, 3.0]))
-        np.testing.assert_allclose(answer.x, [0.5, 1.5], rtol=0, atol=1e-15)
-        assert answer.active.tolist() == [1, 0]
-        assert answer.scales.tolist() == [1.0]
-
-    def test_a_task_out_of_reach_is_scaled(self):
-        """(3, 1) with three joints of one metre a second: two pull in x, one in y."""
-        rows = jnp.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        answer = solve_nullspace([Level(rows, [3.0, 1.0])], -jnp.ones(3), jnp.ones(3))
-        np.testing.assert_allclose(answer.x, [1.0, 1.0, 2.0 / 3.0], rtol=0, atol=1e-15)
-        assert float(answer.scales[0]) == pytest.approx(2.0 / 3.0, abs=1e-15)
-        np.testing.assert_allclose(answer.slacks[0], [-1.0, -1.0 / 3.0], rtol=0, atol=1e-15)
+    @pytest.mark.parametrize("name", BY_HAND)
+    def test_two_rows_of_three_joints(self, name):
+        wanted, lower, upper, x, active, scale = (np.asarray(a, float) for a in BY_HAND[name])
+        answer = two_rows(wanted, lower, upper)
+        np.testing.assert_allclose(answer.x, x, rtol=0, atol=1e-15)
+        np.testing.assert_array_equal(answer.active, active)
+        assert float(answer.scales[0]) == pytest.approx(scale, abs=1e-15)
+        np.testing.assert_allclose(answer.slacks[0], [x[0] + x[1] - wanted[0], x[2] - wanted[1]], rtol=0, atol=1e-15)
 
     @pytest.mark.variants(release=["3e-08-False"])
     @pytest.mark.parametrize("entry, moves", [(3e-8, False), (3e-6, True)])
@@ -304,37 +221,6 @@ class TestByHand:
         bound = jnp.ones(3, jnp.float32)
         answer = solve_nullspace([Level(A, wanted)], -bound, bound)
         np.testing.assert_array_equal(answer.x, [1.0, 1.0, float(moves)])
-
-    @pytest.mark.slow
-    def test_saturated_joints_are_released_for_a_larger_scale(self):
-        """A search that only saturates, the most critical joint first, ends at a scale of 0.75 here."""
-        rows, wanted = np.array([[0.0, 1.0, -2.0, -2.0], [-2.0, 1.0, 0.0, 1.0]]), np.array([4.0, 2.0])
-        lower, upper = np.full(4, -0.5), np.array([0.5, 1.5, 0.5, 0.5])
-        answer = solve_nullspace([Level(rows, wanted)], jnp.asarray(lower), jnp.asarray(upper))
-        d = np.linalg.pinv(rows) @ wanted
-        best = scipy.optimize.linprog(
-            np.r_[np.zeros(4), -1.0],
-            A_eq=np.hstack([rows, -(rows @ d)[:, None]]),
-            b_eq=np.zeros(2),
-            bounds=[*zip(lower, upper, strict=True), (0.0, 1.0)],
-        )
-        assert best.x[-1] == pytest.approx(0.875, abs=1e-12)
-        assert float(answer.scales[0]) == pytest.approx(0.875, abs=1e-14)
-        np.testing.assert_allclose(rows @ np.asarray(answer.x), 0.875 * wanted, rtol=0, atol=1e-14)
-
-    def test_what_pins_a_joint_leaves_the_others_to_do_the_work(self):
-        """A pinned joint moves as its bounds say, and does not scale the level that would need it elsewhere."""
-        rows = jnp.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        low, high = jnp.array([0.3, -5.0, 0.0]), jnp.array([0.3, 5.0, 0.0])
-        answer = solve_nullspace([Level(rows, [1.0, 1.0])], low, high)
-        np.testing.assert_allclose(answer.x, [0.3, 0.7, 0.0], rtol=0, atol=1e-15)
-        assert answer.active.tolist() == [2, 0, 2]
-        assert answer.scales.tolist() == [1.0]
-
-    def test_a_joint_outside_its_range_comes_back_and_the_task_goes_on(self):
-        """Joint 0 has to move at 0.4 at least."""
-        answer = solve_nullspace([Level([[1.0, 1.0]], [0.0])], jnp.array([0.4, -1.0]), jnp.array([1.0, 1.0]))
-        np.testing.assert_allclose(answer.x, [0.4, -0.4], rtol=0, atol=1e-15)
 
     @pytest.mark.variants(slow=["auto"], release=["jax"])
     @pytest.mark.parametrize("backend", ["jax", "auto"])
@@ -373,13 +259,6 @@ class TestByHand:
         level = [Level([[1.0, 1.0]], [-4.0])]
         for bound in (dict(lower=np.array([-1.0, -9.0])), dict(upper=np.array([1.0, -3.0]))):
             np.testing.assert_allclose(solve_nullspace(level, **bound).x, [-1.0, -3.0], rtol=0, atol=1e-14)
-
-    @pytest.mark.slow
-    def test_the_secondary_motion_goes_as_far_as_bounds_and_levels_allow(self):
-        answer = solve_nullspace(
-            [Level([[1.0, 1.0, 1.0]], [0.0])], -jnp.ones(3), jnp.ones(3), secondary=jnp.array([3.0, 1.0, -1.0])
-        )
-        np.testing.assert_allclose(answer.x, [1.0, 0.0, -1.0], rtol=0, atol=1e-15)
 
 
 class TestSearch:
@@ -424,15 +303,6 @@ class TestSearch:
 
 
 class TestBatchesAndFailures:
-    @pytest.mark.slow
-    def test_vmap_equals_a_loop(self, solved):
-        p, answers = solved["pinned"]
-        one = jax.jit(lambda q: solve_nullspace(as_levels(q.levels), q.lower, q.upper, secondary=q.secondary))
-        for i in range(10):
-            alone = one(jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), p))
-            for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(answers.full), strict=True):
-                np.testing.assert_allclose(a, b[i], rtol=0, atol=1e-12)
-
     def test_a_bad_lane_stays_in_its_lane(self, solved):
         """NaN and infinity in matrix, target and secondary motion; a NaN bound; bounds that cross."""
         p, answers = solved["tight"]
@@ -493,140 +363,49 @@ class TestBatchesAndFailures:
             solve_nullspace(level, order=wrong)
         with pytest.raises(ValueError, match="bounds need order='forward'"):
             solve_nullspace(level, -np.ones(3), np.ones(3), order="reverse")
+        with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, reverse, saturated"):
+            osik.NullSpace(method=cast(Any, "sideways"))
         with pytest.raises(ValueError, match=r"upper has shape \(2,\); the levels ask for \(3,\)"):
             solve_nullspace(level, -np.ones(3), np.ones(2))
 
 
-@pytest.mark.slow
-class TestDerivatives:
-    """300 random cases, most of them saturated and scaled: two levels and a secondary motion."""
+@pytest.mark.release
+def test_derivatives_are_finite_where_there_is_none(rng):
+    """Zero targets, rows of zeros, everything pinned, weights of 0, dependent levels, edges, failed lanes."""
+    p = drawn(rng, 8)
+    p = p._replace(levels=p.levels[1:])
+    weights = [rng.uniform(0.5, 2.0, (8, m)) for m in ROWS[1:]]
+    p.levels[0][1][0] = 0.0
+    p.levels[0][0][1] = 0.0
+    p.lower[2] = p.upper[2] = 0.0
+    weights[0][3] = 0.0
+    p.levels[1][0][4, :2] = p.levels[0][0][4]
+    p.lower[5] = 0.0
+    p.lower[6], p.upper[6] = 1.0, -1.0
+    p.levels[1][0][7, 0, 0] = np.nan
 
-    MIX = np.random.default_rng(8).normal(size=N)
-
-    @classmethod
-    def cost(cls, data):
-        p, weights, damping = data
+    def cost(p, weights, damping):
         levels = [Level(A, b, b, w) for (A, b), w in zip(p.levels, weights, strict=True)]
         answer = solve_nullspace(levels, p.lower, p.upper, secondary=p.secondary, damping=damping)
-        value = jnp.sum(jnp.sin(cls.MIX * answer.x)) + jnp.sum(answer.scales)
-        return value, (answer.active, answer.scales < 1.0)
+        return jnp.sum(jnp.sin(answer.x)) + jnp.sum(answer.scales)
 
-    @pytest.fixture(scope="class")
-    @staticmethod
-    def data():
-        rng = np.random.default_rng(7)
-        p = drawn(rng, 300)
-        move = 0.3 * rng.normal(size=p.lower.shape)
-        pin = rng.random(p.lower.shape) < 0.1
-        low, high = p.lower + move, p.upper + move
-        p = p._replace(levels=p.levels[1:], lower=np.where(pin, move, low), upper=np.where(pin, move, high))
-        damping = np.where(rng.random(300) < 0.5, 0.0, 1e-2)
-        data = p, [rng.uniform(0.5, 2.0, (300, m)) for m in ROWS[1:]], damping
-        along = jax.tree.map(lambda a: np.where(np.isfinite(a), rng.normal(size=a.shape), 0.0), data)
-        along = along[0]._replace(upper=np.where(pin, along[0].lower, along[0].upper)), along[1], damping * along[2]
-        return data, along
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def gradient(cls):
-        return jax.jit(jax.vmap(jax.grad(cls.cost, has_aux=True)))
-
-    @pytest.mark.release
-    def test_in_both_modes_they_are_central_differences(self, data, gradient):
-        """In matrices, targets, weights, bounds, secondary motion and damping; to fourth order."""
-        data, along = data
-
-        @jax.jit
-        @jax.vmap
-        def forward(data, along):
-            return jax.jvp(self.cost, (data,), (along,), has_aux=True)
-
-        def at(t):
-            moved = jax.tree.map(lambda a, b: np.where(np.isfinite(a), a + t * b, a), data, along)
-            return jax.tree.map(np.asarray, forward(moved, along))
-
-        h = 1e-5
-        points = {k: at(k * h) for k in (-2, -1, 0, 1, 2)}
-        _, ahead, (active, scaled) = points[0]
-        smooth = np.ones(300, bool)
-        for _, _, (its_active, its_scaled) in points.values():
-            smooth &= (its_active == active).all(1) & (its_scaled == scaled).all(1)
-        expected = sum(c * points[k][0] for k, c in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))) / (12.0 * h)
-        rates = jax.tree.map(np.asarray, gradient(data)[0])
-        back = sum(
-            np.sum((g * v).reshape(300, -1), 1)
-            for g, v in zip(jax.tree.leaves(rates), jax.tree.leaves(along), strict=True)
-        )
-        assert smooth.sum() > 290
-        assert scaled.any(1).sum() > 100
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
-        size = 1.0 + np.abs(expected)
-        assert np.max((np.abs(ahead - expected) / size)[smooth]) < 1e-6
-        assert np.max(np.abs(ahead - back) / size) < 1e-8
-
-    @pytest.mark.release
-    def test_they_are_finite_where_there_is_none(self, data, gradient):
-        """Zero targets, rows of zeros, everything pinned, weights of 0, dependent levels, edges, failed lanes."""
-        p, weights, damping = jax.tree.map(np.copy, data[0])
-        p.levels[0][1][0] = 0.0
-        p.levels[0][0][1] = 0.0
-        p.lower[2] = p.upper[2] = 0.0
-        weights[0][3] = 0.0
-        p.levels[1][0][4, :2] = p.levels[0][0][4]
-        p.lower[5] = 0.0
-        p.lower[6], p.upper[6] = 1.0, -1.0
-        p.levels[1][0][7, 0, 0] = np.nan
-        rates = gradient((p, weights, damping))[0]
-        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
-        but_the_box = rates[0]._replace(lower=(), upper=()), *rates[1:]  # the answer of a failed lane is 0, clipped
-        assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in jax.tree.leaves(but_the_box))
+    rates = jax.jit(jax.vmap(jax.grad(cost, (0, 1, 2))))(p, weights, np.repeat([0.0, 1e-2], 4))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
+    but_the_box = rates[0]._replace(lower=(), upper=()), *rates[1:]  # the answer of a failed lane is 0, clipped
+    assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in jax.tree.leaves(but_the_box))
 
 
-class TestScheme:
-    """Through ``osik_jax.solve``: both options of ``NullSpace``."""
-
-    @pytest.fixture(scope="class")
-    @staticmethod
-    def arm():
-        return osik.load_robot("arm7")
-
-    @pytest.fixture(scope="class")
-    @staticmethod
-    def tasks(arm):
-        p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
-        height = osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1)
-        far = p + jnp.array([0.3, 0.0, 0.0]), R
-        return {"height": height, "hand": osik.FrameTask(arm, "hand", rows="position", target=far, priority=2)}
-
-    def answer(self, arm, tasks, scheme, speed):
-        limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": speed})
-        return osik.solve(arm, arm.q0, tasks, scheme=scheme, limits=limits)
-
-    @pytest.mark.release
-    def test_saturation_keeps_limits_and_priorities(self, arm, tasks):
-        plain, hard = (osik.NullSpace(method=method, curvature_damping=0.0) for method in ("classical", "saturated"))
-        loose, tight, far = (self.answer(arm, tasks, s, v) for s, v in ((plain, 0.1), (hard, 0.1), (hard, 1e6)))
-        assert float(loose.box_violation) > 0.05
-        assert float(tight.box_violation) == 0.0
-        assert int(tight.status) == Status.SOLVED
-        assert float(tight.kkt_residual) < 1e-6
-        np.testing.assert_allclose(tight.slack["height"], 0.0, rtol=0, atol=1e-6)
-        np.testing.assert_allclose(loose.slack["hand"], 0.0, rtol=0, atol=1e-6)
-        assert abs(tight.slack["hand"][0]) > 0.1  # along x, where the target is; but straight on
-        np.testing.assert_allclose(tight.slack["hand"][1:], 0.0, rtol=0, atol=1e-6)
-        np.testing.assert_allclose(far.velocity, loose.velocity, rtol=0, atol=1e-8)
-
-    def test_the_reverse_order_is_the_forward_one_where_all_can_be_had(self, arm, tasks):
-        forward, reverse = (
-            self.answer(arm, tasks, osik.NullSpace(damping=0.0, curvature_damping=0.0, method=method), 0.1)
-            for method in ("classical", "reverse")
-        )
-        assert float(jnp.abs(forward.velocity).max()) > 0.1
-        np.testing.assert_allclose(forward.velocity, reverse.velocity, rtol=0, atol=1e-9)
-
-    def test_mistakes(self):
-        with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, reverse, saturated"):
-            osik.NullSpace(method=cast(Any, "sideways"))
+def test_the_reverse_order_is_the_forward_one_where_all_can_be_had(arm):
+    p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
+    tasks = {
+        "height": osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1),
+        "hand": osik.FrameTask(arm, "hand", rows="position", target=(p.at[0].add(0.3), R), priority=2),
+    }
+    limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": 0.1})
+    schemes = [osik.NullSpace(damping=0.0, curvature_damping=0.0, method=m) for m in ("classical", "reverse")]
+    forward, reverse = (osik.solve(arm, arm.q0, tasks, scheme=s, limits=limits).velocity for s in schemes)
+    assert float(jnp.abs(forward).max()) > 0.1
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-9)
 
 
 @partial(jax.jit, static_argnames="backend")

@@ -112,3 +112,23 @@ def assert_exact(checked: Checked, *, most: float, forward: float = 1e-6, dualit
     assert len(off) == 0, f"{len(off)} cases are off by up to {checked.forward_error[off].max():.1e}: {off[:10]}"
     apart = np.flatnonzero(~(checked.duality_error <= np.maximum(duality, 10.0 * checked.rounding)))
     assert len(apart) == 0, f"the modes differ by {checked.duality_error[apart].max():.1e} in cases {apart[:10]}"
+
+
+def assert_hessian(loss: Callable[[Any], Any], x: Any, condition: Callable[[Any], Any]) -> None:
+    """Forward over reverse against central differences of the gradient; symmetric.
+
+    Args:
+        loss: from x (n,) to a pair: a number, and the active set, which has to be the same at all points.
+        x: the point.
+        condition: of an active set; has to hold at x.
+    """
+    hessian = np.asarray(jax.jit(jax.hessian(lambda x: loss(x)[0]))(x))
+    gradient = jax.jit(jax.vmap(jax.grad(loss, has_aux=True)))
+    h = 1e-4 * np.eye(len(x))
+    slopes, active = gradient(np.concatenate([x + h, x - h, x + 2 * h, x - 2 * h]))
+    assert all((a == a[0]).all() for a in map(np.asarray, jax.tree.leaves(active)))
+    assert condition(jax.tree.map(lambda a: np.asarray(a)[0], active))
+    one, back, two, far = np.split(np.asarray(slopes), 4)
+    expected = (8.0 * (one - back) - (two - far)) / 12e-4
+    assert np.abs(hessian - expected).max() < 1e-6 * np.abs(expected).max()
+    assert np.abs(hessian - hessian.T).max() < 1e-9 * np.abs(hessian).max()

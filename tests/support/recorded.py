@@ -78,55 +78,33 @@ def recorded_saturated(copies: int) -> Problem:
         return _saturated([z[name] for name in z.files], copies)
 
 
-def recorded_far_saturated(copies: int) -> tuple[Problem, np.ndarray]:
-    """Eight more whose targets and boxes were changed at random, and the largest scale of their third level.
-
-    Searches that let the joint enter whose saturation costs most, beside joints that nearly depend on each other, went
-    round in four of them and ended at smaller scales in the others. The scales are those of a linear program (HiGHS).
-    """
-    return _with_scales("saturated_nao_far.npz", copies)
+SCALED = {"far": "saturated_nao_far.npz", "single": "saturated_nao_single.npz", "signs": "saturated_nao_signs.npz"}
 
 
-def recorded_single_saturated(copies: int) -> tuple[Problem, np.ndarray]:
-    """Eight first steps of NAO towards targets that had jumped, kinematics in single precision, and the same scales.
+def recorded_scales(kind: str, copies: int) -> tuple[Problem, np.ndarray]:
+    """Eight more of these steps, and the largest scale of their third level by a linear program (HiGHS).
 
-    Their rows have the rounding of sums in single precision, so that joints depend on each other to 1e-8 to 1e-5. A
+    far: targets and boxes changed at random. Searches that let the joint enter whose saturation costs most went round
+    in four of them, beside joints that nearly depend on each other, and ended at smaller scales in the others.
+    single: rows with the rounding of sums in single precision, so that joints depend on each other to 1e-8 to 1e-5. A
     search that decides by a tolerance which of them do leaves them unsolved: five with any of 1e-9, 1e-6 and 1e-4.
+    signs: rows know a finger by rounding alone. In attempts that let the motion be missed in part, multipliers are 1e13
+    times that of the finger, whose sign their rounding turns: unsolved if the search ends with it.
     """
-    return _with_scales("saturated_nao_single.npz", copies)
-
-
-def recorded_turned_signs(copies: int) -> tuple[Problem, np.ndarray]:
-    """Eight more of these steps, and the same scales; rows know a finger by rounding alone.
-
-    In attempts that let the motion be missed in part, multipliers are 1e13 times that of the finger, whose sign their
-    rounding turns: unsolved if the search ends with it.
-    """
-    return _with_scales("saturated_nao_signs.npz", copies)
-
-
-def _with_scales(file: str, copies: int) -> tuple[Problem, np.ndarray]:
-    with np.load(DATA / file) as z:
+    with np.load(DATA / SCALED[kind]) as z:
         problem = _saturated([z[name] for name in z.files if name != "largest_scales"], copies)
         return problem, np.repeat(z["largest_scales"], copies)
 
 
-def check_single_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
-    """All are solved, in their box, with the scale of the linear program to what the kernel asks of an answer."""
+def check_scales(found: SaturatedResult, problem: Problem, largest: np.ndarray, kind: str) -> None:
+    """All are solved, in their box, with the scale of the linear program; the first far one may stop, for its cost."""
     assert np.asarray(found.done).all()
     assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
-    np.testing.assert_allclose(np.asarray(found.scales)[:, 2], largest, rtol=0, atol=SATURATION_LOSS)
-
-
-def check_far_saturated(found: SaturatedResult, problem: Problem, largest: np.ndarray) -> None:
-    """All are solved, in their box, with the scale of the linear program; the first may stop before, for its cost."""
-    assert np.asarray(found.done).all()
-    assert ((found.x >= problem.lower) & (found.x <= problem.upper)).all()
-    scales = np.asarray(found.scales)[:, 2]
-    is_first = np.arange(len(scales)) < len(scales) // 8
-    np.testing.assert_allclose(scales[~is_first], largest[~is_first], rtol=0, atol=1e-9)
-    assert (scales[is_first] <= largest[is_first] + 1e-9).all()
-    assert (np.asarray(found.active_joints.ending)[is_first & (scales < largest - 1e-9), 2] == PART).all()
+    scales, atol = np.asarray(found.scales)[:, 2], 1e-9 if kind == "far" else SATURATION_LOSS
+    is_first = np.arange(len(scales)) < (len(scales) // 8 if kind == "far" else 0)
+    stopped = is_first & (scales < largest - atol)
+    np.testing.assert_allclose(scales[~stopped], largest[~stopped], rtol=0, atol=atol)
+    assert (np.asarray(found.active_joints.ending)[stopped, 2] == PART).all()
 
 
 def _saturated(arrays: list[np.ndarray], copies: int) -> Problem:

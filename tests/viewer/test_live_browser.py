@@ -12,6 +12,7 @@ import pytest
 from made_up_map import WHOLE, made_up_map
 from motion_files import dancer, write_bvh
 from playwright.sync_api import Page, sync_playwright
+from scipy.spatial.transform import Rotation
 from waiting import until
 
 import osik_jax as osik
@@ -82,14 +83,7 @@ def pixel(view: LiveView | ReachView, point: np.ndarray) -> tuple[float, float]:
     """Where the first visitor sees a point of the world."""
     clients = view._server.get_clients()
     camera = clients[min(clients)].camera
-    w, x, y, z = camera.wxyz
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat(np.asarray(camera.wxyz)[[1, 2, 3, 0]]).as_matrix()
     right, down, deep = turn.T @ (point - camera.position)
     scale = 0.5 * camera.image_height / np.tan(0.5 * camera.fov) / deep
     return 0.5 * camera.image_width + scale * right, 0.5 * camera.image_height + scale * down

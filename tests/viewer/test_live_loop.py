@@ -11,9 +11,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
+from mujoco_states import mujoco_at
+from refusals import refuses
 from waiting import until as until_within
 
 import osik_jax as osik
@@ -39,10 +40,7 @@ def tasks(**changes: Any) -> dict[str, osik.Task]:
 
 def hand(q: np.ndarray) -> np.ndarray:
     """Where MuJoCo has the hand [m]."""
-    data = mujoco.MjData(ROBOT.mj_model)
-    data.qpos[:] = np.asarray(ROBOT.mujoco_qpos(jnp.asarray(q)))
-    mujoco.mj_kinematics(ROBOT.mj_model, data)
-    return data.site("hand").xpos.copy()
+    return mujoco_at(ROBOT, q).site("hand").xpos.copy()
 
 
 @pytest.fixture(scope="module")
@@ -205,12 +203,9 @@ def test_pause_push_and_reset(loop: ControlLoop) -> None:
 
 
 def test_wrong_targets_raise_where_they_are_given(loop: ControlLoop) -> None:
-    with pytest.raises(KeyError, match="hand"):
-        loop.aim("hnad", HOME)
-    with pytest.raises(ValueError, match="finite"):
-        loop.aim("hand", (np.full(3, np.nan), HOME[1]))
-    with pytest.raises(ValueError, match="dt is 0"):
-        ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), dt=0.0)
+    refuses(KeyError, "hand", loop.aim, "hnad", HOME)
+    refuses(ValueError, "finite", loop.aim, "hand", (np.full(3, np.nan), HOME[1]))
+    refuses(ValueError, "dt is 0", ControlLoop, ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), dt=0.0)
     with pytest.raises(ValueError, match="q0 has shape"):
         ControlLoop(ROBOT, Controller(tasks(), osik.WeightedQP(), LIMITS), q0=jnp.zeros(3))
 

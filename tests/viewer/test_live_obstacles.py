@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
-import jax
+import equinox as eqx
 import mujoco
 import numpy as np
 import pytest
@@ -148,13 +148,7 @@ def test_adding_moving_and_removing_compiles_nothing(desk: Desk) -> None:
 def test_obstacles_are_kept_by_sessions_and_lines_of_python(desk: Desk) -> None:
     now = desk.session
     again = session_from_json(now.to_json())
-    for one, other in zip(now.limits, again.limits, strict=True):
-        (leaves, tree), (others, same) = jax.tree.flatten(one), jax.tree.flatten(other)
-        assert tree == same and all(np.array_equal(a, b) for a, b in zip(leaves, others, strict=True))
+    assert eqx.tree_equal(now.limits, again.limits)
     names: dict[str, Any] = {}
     exec(now.to_python().split("solution =")[0], names)
-    for one, other in zip(now.active_limits, names["limits"], strict=True):
-        (leaves, tree), (others, same) = jax.tree.flatten(one), jax.tree.flatten(other)
-        assert tree == same
-        for a, b in zip(leaves, others, strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-14)
+    assert eqx.tree_equal(list(now.active_limits), list(names["limits"]), rtol=0.0, atol=1e-14)

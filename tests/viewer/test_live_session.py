@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, cast
 
-import jax
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -66,11 +66,7 @@ def test_a_session_comes_back_from_its_file_to_the_last_bit(tmp_path: Path) -> N
     saved.save(tmp_path / "session.json")
     loaded = load_session(tmp_path / "session.json")
     assert loaded.off == {"waist"} and loaded.limits_off == {1} and loaded.dt == 0.004
-    for name in ("tasks", "scheme", "limits", "q"):
-        first, second = (jax.tree.flatten(getattr(one, name)) for one in (saved, loaded))
-        assert first[1] == second[1]
-        for x, y in zip(first[0], second[0], strict=True):
-            np.testing.assert_array_equal(x, y)
+    assert eqx.tree_equal(*((one.tasks, one.scheme, one.limits, one.q) for one in (saved, loaded)))
     assert list(loaded.tasks) == list(saved.tasks)
 
 

@@ -1,14 +1,14 @@
 """What pictures of URDFs show: mesh files against Coal, triangles against brute force, cameras against projections."""
 
-import importlib.metadata
 import struct
-from pathlib import Path
 
 import coal
 import mujoco
 import numpy as np
 import pytest
+from example_files import example_file
 from PIL import Image
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import viewer
@@ -68,11 +68,6 @@ ARM = """<robot name="arm"><link name="base"><visual><geometry><mesh filename="{
 <axis xyz="0 1 0"/></joint></robot>"""
 
 
-def robot_file(ending):
-    (found,) = (f for f in importlib.metadata.files("example-robot-data") or [] if str(f).endswith(ending))
-    return Path(str(found.locate()))
-
-
 def written(path, text):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -106,7 +101,7 @@ def test_collada_by_hand(tmp_path):
     ],
 )
 def test_collada_lies_where_coal_has_it(ending):
-    path = robot_file(ending)
+    path = example_file(ending)
     points = np.concatenate([part.vertices for part in read_collada(path)])
     expected = np.asarray(coal.MeshLoader().load(str(path), np.ones(3)).vertices())
     span = np.ptp(expected, axis=0).max()
@@ -115,14 +110,11 @@ def test_collada_lies_where_coal_has_it(ending):
 
 
 def test_broken_meshes_are_refused(tmp_path):
-    with pytest.raises(ValueError, match="broken XML"):
-        read_mesh(written(tmp_path / "a.dae", "<COLLADA"))
-    with pytest.raises(ValueError, match="no triangles"):
-        read_mesh(written(tmp_path / "b.dae", "<COLLADA/>"))
+    refuses(ValueError, "broken XML", read_mesh, written(tmp_path / "a.dae", "<COLLADA"))
+    refuses(ValueError, "no triangles", read_mesh, written(tmp_path / "b.dae", "<COLLADA/>"))
     with pytest.raises(ValueError, match="broken COLLADA"):
         read_mesh(written(tmp_path / "c.dae", COLLADA.replace('source="#p"', 'source="#gone"')))
-    with pytest.raises(ValueError, match=r"one of \.dae"):
-        read_mesh(written(tmp_path / "d.ply", "ply"))
+    refuses(ValueError, r"one of \.dae", read_mesh, written(tmp_path / "d.ply", "ply"))
 
 
 def test_stl_and_obj_hold_the_same_box(tmp_path):
@@ -181,7 +173,7 @@ def from_joints(robot, look):
 
 def test_the_icubs_meshes_are_turned():
     """All of them say that y is up, and mean it: left as they are, its joints are 6 cm away from them."""
-    path = robot_file("robots/icub.urdf")
+    path = example_file("robots/icub.urdf")
     robot = osik.Robot.from_urdf(path, floating_base=True)
     away = from_joints(robot, viewer.read_look(path))
     assert len(away) > 30 and away.mean() < 0.02
@@ -221,7 +213,7 @@ def test_triangles_cover_what_they_cover():
 
 
 def test_drawn_triangles_look_like_cast_rays():
-    path = robot_file("hyq_description/robots/hyq_no_sensors.urdf")
+    path = example_file("hyq_description/robots/hyq_no_sensors.urdf")
     robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
     shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, robot.q0))
     size, floor = (180, 140), float(lowest_points(shape, data).min())
