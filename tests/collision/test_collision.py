@@ -10,6 +10,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from collision_pairs import coal_hull, named, pair_set
+from model_files import mjcf
+from refusals import refuses
 from task_checks import kinematics_at
 
 import osik_jax as osik
@@ -44,27 +47,7 @@ def _zoo():
       {body("a", 0)}{body("b", 1)}</worldbody></mujoco>"""
 
 
-ARM = """
-<mujoco>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 0.1"/>
-    <body name="upper" pos="0 0 0.4"><joint name="yaw" axis="0 0 1" range="-170 170"/>
-      <geom name="upper" type="capsule" size="0.04" fromto="0 0 0 0.3 0 0" mass="1"/>
-      <body name="middle" pos="0.3 0 0"><joint name="elbow" axis="0 1 0" range="-150 150"/>
-        <geom name="middle" type="capsule" size="0.04" fromto="0.06 0 0 0.25 0 0" mass="1"/>
-        <body name="fixed" pos="0.1 0 0">
-          <geom name="bump" type="box" size="0.03 0.05 0.03" pos="0 0.03 0" mass="0.1"/>
-        </body>
-        <body name="hand" pos="0.3 0 0"><joint name="wrist" axis="0 1 0" range="-150 150"/>
-          <geom name="hand" type="sphere" size="0.06" pos="0.1 0 0" mass="1"/>
-          <geom name="seen" type="box" size="0.02 0.02 0.02" contype="0" conaffinity="0" mass="0.1"/>
-          <site name="tip" pos="0.16 0 0"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+ARM = mjcf("arm_with_shapes")
 
 
 @pytest.fixture(scope="module")
@@ -157,10 +140,7 @@ def _coal_shape(model, geom):
         return coal.Capsule(size[0], 2.0 * size[1])
     if kind == mujoco.mjtGeom.mjGEOM_BOX:
         return coal.Box(2.0 * size)
-    points = coal.StdVec_Vec3s()
-    for vertex in model.mesh_vert:
-        points.append(vertex.astype(float))
-    return coal.Convex.convexHull(points, True, "")
+    return coal_hull(model.mesh_vert)
 
 
 def _columns(limit, first, second):
@@ -356,15 +336,10 @@ def test_everything_is_finite_where_centres_coincide():
         assert distances[pair] == pytest.approx(-0.2)
 
 
-def _named(limit):
-    return {frozenset(pair) for pair in limit.pairs}
-
-
 def test_default_pairs_are_those_that_mujoco_lets_collide(arm):
     """Neighbours, fused links and geoms without masks are left out; the arm's base meets the floor."""
     limit = osik.CollisionAvoidanceLimit(arm, q0_distance=-np.inf)
-    expected = [("upper", "hand"), ("floor", "upper"), ("floor", "middle"), ("floor", "bump"), ("floor", "hand")]
-    assert _named(limit) == {frozenset(pair) for pair in expected}
+    assert named(limit) == pair_set("upper hand", "floor upper", "floor middle", "floor bump", "floor hand")
     model = osik.Robot.from_mjcf(ARM.replace("0 0 0.4", "0 0 0.11")).mj_model  # low enough to hit the floor
     data = mujoco.MjData(model)
     rng, seen = np.random.default_rng(4), set()
@@ -372,68 +347,46 @@ def test_default_pairs_are_those_that_mujoco_lets_collide(arm):
         data.qpos[:] = rng.uniform(-3.0, 3.0, 3)
         mujoco.mj_forward(model, data)
         seen |= {frozenset(model.geom(int(g)).name for g in contact.geom) for contact in data.contact}
-    assert seen == _named(limit) - {frozenset(("floor", "upper"))}  # which never reaches it
+    assert seen == named(limit) - pair_set("floor upper")  # which never reaches it
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
+    ("given", "pair"),
     [
-        (dict(pairs=[("hand", "upper")]), [("upper", "hand")]),
-        (dict(pairs=[("seen", "u*r")]), [("upper", "seen")]),
-        (dict(pairs=[("world", "fixed")]), [("floor", "bump")]),
-        (dict(exclude=["floor"]), [("upper", "hand")]),
-        (dict(exclude=[("world", "m*"), "upper"]), [("floor", "hand")]),
+        (dict(pairs=[("hand", "upper")]), "upper hand"),
+        (dict(pairs=[("seen", "u*r")]), "upper seen"),
+        (dict(pairs=[("world", "fixed")]), "floor bump"),
+        (dict(exclude=["floor"]), "upper hand"),
+        (dict(exclude=[("world", "m*"), "upper"]), "floor hand"),
     ],
     ids=["bodies", "unseen", "fused", "one", "globs"],
 )
-def test_pairs_by_name(arm, given, expected):
-    limit = osik.CollisionAvoidanceLimit(arm, q0_distance=-np.inf, **given)
-    assert _named(limit) == {frozenset(pair) for pair in expected}
+def test_pairs_by_name(arm, given, pair):
+    assert named(osik.CollisionAvoidanceLimit(arm, q0_distance=-np.inf, **given)) == pair_set(pair)
 
 
 def test_locked_joints_and_excludes_of_the_model_make_no_pairs():
-    text = ARM.replace("</mujoco>", '<contact><exclude body1="world" body2="hand"/></contact></mujoco>')
+    excludes = '<exclude body1="world" body2="hand"/><exclude body1="upper" body2="hand"/>'
+    text = ARM.replace("</mujoco>", f"<contact>{excludes}</contact></mujoco>")
     limit = osik.CollisionAvoidanceLimit(osik.Robot.from_mjcf(text), q0_distance=-np.inf)
-    assert frozenset(("floor", "hand")) not in _named(limit)
+    assert named(limit) == pair_set("floor upper", "floor middle", "floor bump")
     locked = osik.Robot.from_mjcf(ARM, locked_joints=("elbow",))
     with_lock = osik.CollisionAvoidanceLimit(locked, q0_distance=-np.inf)
-    assert frozenset(("upper", "hand")) not in _named(with_lock)
-    assert frozenset(("floor", "middle")) in _named(with_lock)
+    assert named(with_lock) & pair_set("upper hand", "floor middle") == pair_set("floor middle")
 
 
-def test_pairs_that_are_too_near_at_q0_are_left_out(arm):
-    """The hand is stretched out 0.34 m above the floor and 0.3 m from the upper arm, all else is 0.36 m up."""
-    limit = osik.CollisionAvoidanceLimit(arm, q0_distance=0.35)
-    assert _named(limit) == {frozenset(pair) for pair in (("floor", "upper"), ("floor", "middle"), ("floor", "bump"))}
-
-
-def test_mistakes_are_named(arm, avoidance):
-    with pytest.raises(KeyError, match="did you mean 'hand'"):
-        osik.CollisionAvoidanceLimit(arm, pairs=[("hant", "floor")])
-    with pytest.raises(ValueError, match="no pair of shapes is left"):
-        osik.CollisionAvoidanceLimit(arm, pairs=[("middle", "fixed")])
-    with pytest.raises(ValueError, match="all 5 pairs are nearer than 9"):
-        osik.CollisionAvoidanceLimit(arm, q0_distance=9.0)
-    with pytest.raises(ValueError, match="detection_distance"):
-        osik.CollisionAvoidanceLimit(arm, detection_distance=0.0)
-    with pytest.raises(ValueError, match="max_pairs"):
-        osik.CollisionAvoidanceLimit(arm, max_pairs=0)
-    with pytest.raises(ValueError, match="so is a geom"):
-        osik.CollisionAvoidanceLimit(arm, shapes={"hand": CollisionShape.sphere(0.1)})
+def test_mistakes_arenamed(arm, avoidance):
+    refuses(ValueError, "all 5 pairs are nearer than 9", osik.CollisionAvoidanceLimit, arm, q0_distance=9.0)
+    refuses(ValueError, "detection_distance", osik.CollisionAvoidanceLimit, arm, detection_distance=0.0)
+    refuses(ValueError, "max_pairs", osik.CollisionAvoidanceLimit, arm, max_pairs=0)
+    refuses(ValueError, "so is a geom", osik.CollisionAvoidanceLimit, arm, shapes={"hand": CollisionShape.sphere(0.1)})
     with pytest.raises(KeyError, match="no frame 'hant'"):
         osik.CollisionAvoidanceLimit(arm, shapes={"x": CollisionShape.sphere(0.1, frame="hant")})
-    with pytest.raises(KeyError, match="ball"):
-        avoidance.moved("bal", position=np.zeros(3))
-    with pytest.raises(ValueError, match="position has shape"):
-        avoidance.moved("ball", position=np.zeros(2))
-    with pytest.raises(TypeError, match="it has: minimum_distance"):
-        avoidance.replace(max_pairs=3)
-    with pytest.raises(ValueError, match="positive"):
-        CollisionShape.sphere(0.0)
-    with pytest.raises(ValueError, match="no convex hull"):
-        CollisionShape.convex(np.eye(3))
-    with pytest.raises(ValueError, match="rotation is not one"):
-        CollisionShape.box((1.0, 1.0, 1.0), rotation=-np.eye(3))
+    refuses(KeyError, "ball", avoidance.moved, "bal", position=np.zeros(3))
+    refuses(ValueError, "position has shape", avoidance.moved, "ball", position=np.zeros(2))
+    refuses(TypeError, "it has: minimum_distance", avoidance.replace, max_pairs=3)
+    refuses(ValueError, "positive", CollisionShape.sphere, 0.0)
+    refuses(ValueError, "no convex hull", CollisionShape.convex, np.eye(3))
 
 
 def test_shapes_on_links_are_geoms(arm):
@@ -548,8 +501,7 @@ def test_masks_are_those_of_mujoco(floor, ball):
     if data.ncon:
         assert osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf).pairs == (("floor", "ball"),)
     else:
-        with pytest.raises(ValueError, match="no pair of shapes is left"):
-            osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)
+        refuses(ValueError, "no pair of shapes is left", osik.CollisionAvoidanceLimit, robot, q0_distance=-np.inf)
 
 
 def test_added_shapes_are_filtered_like_geoms(arm):
@@ -562,15 +514,8 @@ def test_added_shapes_are_filtered_like_geoms(arm):
     limit = osik.CollisionAvoidanceLimit(
         arm, shapes=shapes, pairs=[(name, "*") for name in shapes], q0_distance=-np.inf
     )
-    expected = [("guard", "hand"), ("guard", "glove"), ("guard", "lid"), ("guard", "floor"), ("guard", "seen")]
-    expected += [("glove", "upper"), ("glove", "floor"), ("lid", "upper")]
-    assert _named(limit) == {frozenset(pair) for pair in expected}
-
-
-def test_excludes_of_the_model_between_moving_bodies():
-    text = ARM.replace("</mujoco>", '<contact><exclude body1="upper" body2="hand"/></contact></mujoco>')
-    limit = osik.CollisionAvoidanceLimit(osik.Robot.from_mjcf(text), q0_distance=-np.inf)
-    assert _named(limit) == {frozenset(("floor", name)) for name in ("upper", "middle", "bump", "hand")}
+    on_the_arm = pair_set("guard hand", "guard glove", "guard lid", "guard floor", "guard seen")
+    assert named(limit) == on_the_arm | pair_set("glove upper", "glove floor", "lid upper")
 
 
 def test_a_name_with_the_signs_of_a_glob_is_a_name_first(arm):
@@ -596,7 +541,7 @@ class TestTooNearAtHome:
             limit = osik.CollisionAvoidanceLimit(
                 arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], minimum_distance=self.MINIMUM
             )
-        assert {frozenset(pair) for pair in limit.pairs} == {frozenset({"hand", "ball"}), frozenset({"floor", "hand"})}
+        assert named(limit) == pair_set("hand ball", "floor hand")
         assert limit.left_out == ()
         tasks = {"posture": osik.PostureTask(arm, weight=1.0)}
         path = osik.rollout(arm, arm.q0, tasks, limits=(limit,), dt=0.01, steps=60)
@@ -623,21 +568,20 @@ class TestTooNearAtHome:
         assert ("hand", "ball") in limit.left_out and ("hand", "ball") not in limit.pairs
         assert asked.left_out == (("hand", "ball"),)
 
-    def test_a_pair_that_cannot_be_kept_apart_is_named(self, arm):
+    def test_a_pair_that_cannot_be_kept_apart_isnamed(self, arm):
         with pytest.raises(ValueError, match=r"\('middle', 'fixed'\).*on one body"):
             osik.CollisionAvoidanceLimit(arm, pairs=[("middle", "fixed"), ("floor", "hand")])
         with pytest.raises(ValueError, match=r"\('upp\*', 'middle'\).*neighbouring"):
             osik.CollisionAvoidanceLimit(arm, pairs=[("upp*", "middle"), ("floor", "hand")])
-        with pytest.raises(TypeError, match="pairs of names"):
-            osik.CollisionAvoidanceLimit(arm, pairs=["hand"])  # pyright: ignore[reportArgumentType]
 
 
 def test_pairs_nearer_than_the_minimum_at_q0_are_left_out_unless_said_otherwise(arm):
+    """The hand is stretched out 0.34 m above the floor and 0.3 m from the upper arm, all else is 0.36 m up."""
     with pytest.warns(osik.OsikWarning, match="nearer than 0.35 m"):
         limit = osik.CollisionAvoidanceLimit(arm, minimum_distance=0.35, detection_distance=0.5)
+    assert named(limit) == pair_set("floor upper", "floor middle", "floor bump")
     assert limit.pairs == osik.CollisionAvoidanceLimit(arm, q0_distance=0.35).pairs
-    with pytest.raises(ValueError, match="more than minimum_distance"):
-        limit.replace(minimum_distance=0.6)
+    refuses(ValueError, "more than minimum_distance", limit.replace, minimum_distance=0.6)
 
 
 PALM = """

@@ -1,7 +1,6 @@
 """Self-collision of URDFs: which pairs are kept by default and by name, and distances against MuJoCo C and coal."""
 
 import functools
-import importlib.metadata
 import os
 import warnings
 from pathlib import Path
@@ -12,6 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.spatial
+import urdfs
+from collision_pairs import coal_hull, named, pair_set
+from example_files import example_file
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.collision._geometry import MOST_VERTICES, convex_hull
@@ -25,28 +28,22 @@ def with_emitters(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(jax, "jit", functools.partial(jax.jit, compiler_options={EMITTERS: True}))
 
 
-INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
-
-
 def link(name, *shapes):
     """A link with collision shapes: (name, position, geometry)."""
     collisions = "".join(
         f'<collision name="{called}"><origin xyz="{place}"/><geometry>{geometry}</geometry></collision>'
         for called, place, geometry in shapes
     )
-    return f'<link name="{name}">{INERTIAL}{collisions}</link>'
+    return urdfs.link(name, urdfs.INERTIAL + collisions)
 
 
 def joint(name, parent, child, place="0 0 .2", kind="revolute", axis="0 1 0"):
     limit = "" if kind == "fixed" else '<limit lower="-3" upper="3" velocity="1" effort="1"/>'
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{place}"/><axis xyz="{axis}"/>{limit}</joint>'
-    )
+    return urdfs.joint(name, parent, child, limit, kind, origin=f'xyz="{place}"', axis=axis)
 
 
 def robot(*parts, **options):
-    return osik.Robot.from_urdf(f"<robot name='r'>{''.join(parts)}</robot>", floating_base=False, **options)
+    return osik.Robot.from_urdf(urdfs.urdf(*parts), floating_base=False, **options)
 
 
 def rod(name, radius=0.02, length=0.12):
@@ -65,36 +62,26 @@ PEDESTAL = (
 TOOL = (link("tool", ("tip", "0 0 .1", '<box size=".03 .03 .1"/>')), joint("weld", "d", "tool", kind="fixed"))
 
 
-def named(limit):
-    return {frozenset(pair) for pair in limit.pairs}
-
-
 def distances(limit, model, q):
     return np.asarray(jax.jit(lambda m, q: limit.distances(m, osik.forward_kinematics(m, q)))(model, q))
 
 
-def expected(*pairs):
-    return {frozenset(pair.split()) for pair in pairs}
+BASE = ("plate", "a_rod")
+FUSED = [f"{one} {other}" for one in BASE for other in ("c_rod", "c_ball", "d_rod", "tip")]
 
 
-def test_default_pairs_are_those_two_joints_apart_or_more():
-    assert named(osik.CollisionAvoidanceLimit(robot(*CHAIN))) == expected(
-        "a_rod c_rod", "a_rod c_ball", "a_rod d_rod", "b_rod d_rod"
-    )
-
-
-def test_links_fused_by_fixed_joints_are_one_link():
-    """The base's pedestal is no pair with the first link that moves; the tool is none with the link before its own."""
-    limit = osik.CollisionAvoidanceLimit(robot(*PEDESTAL, *CHAIN, *TOOL))
-    base = ("plate", "a_rod")
-    assert named(limit) == expected(
-        *(f"{one} {other}" for one in base for other in ("c_rod", "c_ball", "d_rod", "tip")), "b_rod d_rod", "b_rod tip"
-    )
-
-
-def test_a_locked_joint_fuses_the_base_with_what_it_carries():
-    limit = osik.CollisionAvoidanceLimit(robot(*CHAIN, locked_joints=["j1"]))
-    assert named(limit) == expected("a_rod d_rod", "b_rod d_rod")
+@pytest.mark.parametrize(
+    ("parts", "options", "pairs"),
+    [
+        (CHAIN, {}, ["a_rod c_rod", "a_rod c_ball", "a_rod d_rod", "b_rod d_rod"]),
+        ((*PEDESTAL, *CHAIN, *TOOL), {}, [*FUSED, "b_rod d_rod", "b_rod tip"]),
+        (CHAIN, dict(locked_joints=["j1"]), ["a_rod d_rod", "b_rod d_rod"]),
+    ],
+    ids=["a chain", "fixed joints", "a locked joint"],
+)
+def test_default_pairs_are_those_two_joints_apart_or_more(parts, options, pairs):
+    """Links that no joint moves apart are one: the base and its pedestal, the last link and its tool."""
+    assert named(osik.CollisionAvoidanceLimit(robot(*parts, **options))) == pair_set(*pairs)
 
 
 def test_a_floor_in_the_world_is_no_neighbour_of_the_first_link():
@@ -106,7 +93,7 @@ def test_a_floor_in_the_world_is_no_neighbour_of_the_first_link():
           <body name="second" pos="0 0 .3"><joint axis="0 1 0"/><geom name="two" size=".05"/></body></body></body>
       <body name="post" pos="1 0 0"><geom name="pole" size=".05"/></body></worldbody></mujoco>"""
     limit = osik.CollisionAvoidanceLimit(osik.Robot.from_mjcf(text))
-    assert named(limit) == expected("floor one", "floor two", "pole one", "pole two", "foot two", "edge two")
+    assert named(limit) == pair_set("floor one", "floor two", "pole one", "pole two", "foot two", "edge two")
 
 
 @pytest.mark.variants(slow=["fused by glob"], release=["glob of links"])
@@ -127,7 +114,7 @@ def test_pairs_by_names_of_links_shapes_and_globs(pairs, kept):
     with warnings.catch_warnings():
         warnings.simplefilter("error", osik.OsikWarning)
         limit = osik.CollisionAvoidanceLimit(robot(*CHAIN, *TOOL), pairs=pairs)
-    assert named(limit) == expected(*kept)
+    assert named(limit) == pair_set(*kept)
 
 
 def test_what_the_model_excludes_is_kept_where_it_is_asked_for_by_name():
@@ -136,11 +123,9 @@ def test_what_the_model_excludes_is_kept_where_it_is_asked_for_by_name():
         <body name="c" pos="0 0 .3"><joint axis="0 1 0"/><geom name="gc" size=".05"/></body></body></body>
       </worldbody><contact><exclude body1="a" body2="c"/></contact></mujoco>"""
     model = osik.Robot.from_mjcf(text)
-    with pytest.raises(ValueError, match="no pair of shapes is left"):
-        osik.CollisionAvoidanceLimit(model)
-    with pytest.raises(ValueError, match="no pair of shapes is left"):
-        osik.CollisionAvoidanceLimit(model, pairs=[("a*", "c")])
-    assert named(osik.CollisionAvoidanceLimit(model, pairs=[("a", "c")])) == expected("ga gc")
+    refuses(ValueError, "no pair of shapes is left", osik.CollisionAvoidanceLimit, model)
+    refuses(ValueError, "no pair of shapes is left", osik.CollisionAvoidanceLimit, model, pairs=[("a*", "c")])
+    assert named(osik.CollisionAvoidanceLimit(model, pairs=[("a", "c")])) == pair_set("ga gc")
 
 
 def test_contacts_at_home_are_left_out_with_one_warning():
@@ -151,40 +136,23 @@ def test_contacts_at_home_are_left_out_with_one_warning():
         warnings.simplefilter("always")
         limit = osik.CollisionAvoidanceLimit(folded)
     (message,) = [str(w.message) for w in seen if issubclass(w.category, osik.OsikWarning)]
-    assert {frozenset(pair) for pair in limit.left_out} == expected("b_rod d_rod")
+    assert {frozenset(pair) for pair in limit.left_out} == pair_set("b_rod d_rod")
     assert "b_rod (of b)-d_rod (of d) (-0." in message and "a_rod" not in message
-    assert named(limit) == expected("a_rod c_rod", "a_rod c_ball", "a_rod d_rod")
+    assert named(limit) == pair_set("a_rod c_rod", "a_rod c_ball", "a_rod d_rod")
     with warnings.catch_warnings():
         warnings.simplefilter("error", osik.OsikWarning)
         kept = osik.CollisionAvoidanceLimit(folded, pairs=[("b", "d")])
-    assert named(kept) == expected("b_rod d_rod")
+    assert named(kept) == pair_set("b_rod d_rod")
 
 
 def test_an_obstacle_meets_the_links_of_a_urdf():
     table = {"table": osik.CollisionShape.box((0.5, 0.5, 0.02), (0.6, 0.0, -0.1))}
     chain = robot(*CHAIN)
     limit = osik.CollisionAvoidanceLimit(chain, shapes=table, pairs=[("table", "d")])
-    assert named(limit) == expected("table d_rod")
-    assert {pair for pair in named(osik.CollisionAvoidanceLimit(chain, shapes=table)) if "table" in pair} == expected(
+    assert named(limit) == pair_set("table d_rod")
+    assert {pair for pair in named(osik.CollisionAvoidanceLimit(chain, shapes=table)) if "table" in pair} == pair_set(
         "table b_rod", "table c_rod", "table c_ball", "table d_rod"
     )
-
-
-@pytest.mark.release
-def test_distances_are_those_of_mujocos_own_reading():
-    """MuJoCo reads the same URDF; its cylinders are round, ours are prisms around them."""
-    text = f"<robot name='r'>{''.join(CHAIN)}</robot>"
-    theirs, ours = mujoco.MjModel.from_xml_string(text), robot(*CHAIN)
-    limit = osik.CollisionAvoidanceLimit(ours)
-    data, rng = mujoco.MjData(theirs), np.random.default_rng(1)
-    order = ["a_rod", "b_rod", "c_rod", "c_ball", "d_rod"]
-    for _ in range(5):
-        q = rng.uniform(-1.0, 1.0, 3)
-        data.qpos[:] = q
-        mujoco.mj_kinematics(theirs, data)
-        got = distances(limit, ours, q)
-        want = [mujoco.mj_geomDistance(theirs, data, *map(order.index, pair), 9.0, None) for pair in limit.pairs]
-        assert (got < np.array(want) + 1e-6).all() and np.abs(got - want).max() < 2 * 0.02 * 0.02
 
 
 def test_names_of_shapes_that_are_given_twice_stay_apart():
@@ -223,7 +191,7 @@ def meshed(tmp_path):
     def shape(stretch, place):
         return f'<collision><origin xyz="{place}" rpy="0.3 0.2 0.1"/>{mesh.format(stretch)}</collision>'
 
-    links = "".join(f'<link name="{n}">{INERTIAL}{shape(s, p)}</link>' for n, s, p in
+    links = "".join(f'<link name="{n}">{urdfs.INERTIAL}{shape(s, p)}</link>' for n, s, p in
                     (("a", 1, "0 0 0"), ("b", 2, "0 0 .1"), ("c", 1.5, ".02 0 .05")))  # fmt: skip
     path = tmp_path / "r.urdf"
     path.write_text(
@@ -254,11 +222,10 @@ def test_a_mesh_that_is_missing_is_told_and_left_out(meshed):
     late = osik.Robot.from_urdf(meshed, floating_base=False)
     with pytest.warns(osik.OsikWarning, match=r"1 collision meshes cannot be read.*of a\): no file 'gone.obj'"):
         limit = osik.CollisionAvoidanceLimit(late)
-    assert named(limit) == expected("geom2 d_rod")
+    assert named(limit) == pair_set("geom2 d_rod")
     meshed.write_text(text.replace("ball.obj", "gone.obj"))
     late = osik.Robot.from_urdf(meshed, floating_base=False)
-    with pytest.raises(ValueError, match=r"no collision mesh of the robot can be read.*gone.obj"):
-        osik.CollisionAvoidanceLimit(late)
+    refuses(ValueError, r"no collision mesh of the robot can be read.*gone.obj", osik.CollisionAvoidanceLimit, late)
 
 
 def test_a_large_hull_is_covered_by_a_smaller_one():
@@ -270,13 +237,6 @@ def test_a_large_hull_is_covered_by_a_smaller_one():
     theirs = (points @ directions.T).max(0)
     ours = (np.asarray(hull.vertices) @ directions.T).max(0) + float(hull.radius)
     assert (ours >= theirs).all() and (ours - theirs).max() < 0.004
-
-
-def coal_hull(points):
-    listed = coal.StdVec_Vec3s()
-    for point in points:
-        listed.append(point)
-    return coal.Convex.convexHull(listed, True, "")
 
 
 @pytest.mark.variants(release=["0.1", "0.16"])
@@ -302,12 +262,6 @@ def test_distances_of_large_hulls_are_those_of_coal(apart):
 # --- robots that people know ---
 
 
-def described(name: str) -> Path:
-    """A URDF of example-robot-data."""
-    (file,) = (f for f in importlib.metadata.files("example-robot-data") or [] if str(f).endswith(f"robots/{name}"))
-    return Path(str(file.locate()))
-
-
 ROBOTS = {
     "ur5": ("ur_description/urdf/ur5_robot.urdf", False, ("upper_arm_link", "wrist_3_link")),
     "panda": ("panda_description/urdf/panda.urdf", False, ("panda_link1", "panda_hand")),
@@ -323,7 +277,7 @@ ROBOTS = {
 def test_the_default_call_works_on_known_robots(name):
     """With shapes of all links that have some; distances at home are MuJoCo's, or up to 4 mm less."""
     path, floats, (one, other) = ROBOTS[name]
-    loaded = osik.Robot.from_urdf(described(path), floating_base=floats, collision_meshes=True)
+    loaded = osik.Robot.from_urdf(example_file(path), floating_base=floats, collision_meshes=True)
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         limit = osik.CollisionAvoidanceLimit(loaded)
@@ -338,5 +292,5 @@ def test_the_default_call_works_on_known_robots(name):
     links = {frozenset((model.body(model.geom_bodyid[index[a]]).name, model.body(model.geom_bodyid[index[b]]).name))
              for a, b in limit.pairs}  # fmt: skip
     assert frozenset((one, other)) in links
-    unread = osik.Robot.from_urdf(described(path), floating_base=floats)
+    unread = osik.Robot.from_urdf(example_file(path), floating_base=floats)
     assert len(unread.tree.geom_names) == len(loaded.tree.geom_names)

@@ -10,7 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 from core_checks import needs_core
-from test_kinematics import quick_jit, random_configurations, spread, toy_robot
+from model_files import mjcf
+from mujoco_states import full_velocities, mujoco_at
+from test_kinematics import quick_jit, random_configurations, toy_robot
 
 import osik_jax as osik
 from osik_jax.kinematics import forward_kinematics
@@ -21,42 +23,13 @@ from osik_jax.tasks._rows import rows_of
 pytestmark = needs_core
 ROUNDING = 1e-13
 """Of numbers near 1, which some dozen products and sums have made."""
-COUPLED = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <worldbody>
-    <body>
-      <joint name="lead" axis="0 0 1" pos="0.1 0 0" range="-1 1"/>
-      <geom size="0.1" mass="1"/>
-      <body pos="0.2 0.1 0" quat="0.9 0.1 0.2 0.3">
-        <joint name="first" axis="0 1 0" range="-2 2"/>
-        <geom size="0.1" mass="0.5"/>
-        <body pos="0.3 0 0.1">
-          <joint name="second" type="slide" axis="0 1 1" range="-3 3"/>
-          <geom size="0.1" mass="0.7"/>
-          <body name="end" pos="0.1 0.1 0.1">
-            <joint name="stiff" axis="1 0 0" range="-2 2"/>
-            <geom size="0.1" mass="0.2"/>
-            <site name="tip" pos="0.1 0.2 0.3" quat="0.5 0.5 -0.5 0.5"/>
-          </body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <equality>
-    <joint joint1="first" joint2="lead" polycoef="0.3 -0.5 0 0 0"/>
-    <joint joint1="second" joint2="lead" polycoef="-0.1 2 0 0 0"/>
-  </equality>
-</mujoco>
-"""
-"""Two joints that follow a third, one of them along a line, and one to be locked."""
 
 
 def make(name: str) -> osik.Robot:
     if name == "toy":
         return toy_robot()
     if name == "coupled":
-        return osik.Robot.from_mjcf(COUPLED, locked_joints={"stiff": 0.4})
+        return osik.Robot.from_mjcf(mjcf("coupled"), locked_joints={"stiff": 0.4})
     return osik.load_robot(name)
 
 
@@ -116,22 +89,19 @@ def test_beside_the_plain_method(robots, name):
 @pytest.mark.parametrize("name", NAMES)
 def test_beside_mujoco(robots, name):
     robot = robots[name]
-    data, to_mujoco = mujoco.MjData(robot.mj_model), spread(robot)
+    model, to_mujoco = robot.mj_model, full_velocities(robot)
     run = quick_jit(partial(everything, "core", None))
     for q in random_configurations(robot, 2, 2):
-        data.qpos[:] = robot.mujoco_qpos(jnp.asarray(q))
-        mujoco.mj_kinematics(robot.mj_model, data)
-        mujoco.mj_comPos(robot.mj_model, data)
+        data = mujoco_at(robot, q)
         _, moving, *_ = run(robot, jnp.asarray(q))
         for frame, position, rotation, jacobian in zip(robot.frame_names, *moving, strict=True):
-            body = mujoco.mj_name2id(robot.mj_model, mujoco.mjtObj.mjOBJ_BODY, frame)
-            if body < 0:
-                continue
-            linear, angular = np.zeros((2, 3, robot.mj_model.nv))
-            mujoco.mj_jacBody(robot.mj_model, data, linear, angular, body)
-            np.testing.assert_allclose(position, data.xpos[body], atol=ROUNDING)
-            np.testing.assert_allclose(rotation.ravel(), data.xmat[body], atol=ROUNDING)
-            np.testing.assert_allclose(jacobian, np.concatenate([linear, angular]) @ to_mujoco, atol=ROUNDING)
+            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame)
+            if body >= 0:
+                linear, angular = np.zeros((2, 3, model.nv))
+                mujoco.mj_jacBody(model, data, linear, angular, body)
+                np.testing.assert_allclose(position, data.xpos[body], atol=ROUNDING)
+                np.testing.assert_allclose(rotation.ravel(), data.xmat[body], atol=ROUNDING)
+                np.testing.assert_allclose(jacobian, np.concatenate([linear, angular]) @ to_mujoco, atol=ROUNDING)
 
 
 @pytest.mark.variants(release=["toy"])

@@ -2,65 +2,21 @@
 
 import copy
 import time
-from importlib.metadata import files
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import pinocchio
 import pytest
+from model_files import mjcf
 from mujoco import mjx
+from mujoco_states import full_velocities, mujoco_at
+from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.kinematics import _composition
-
-# All joint types, two joints on one body, anchors off the body's origin, references other than 0, branches, links fixed
-# to others, a second tree that hangs from the world, and every kind of frame.
-TOY = """
-<mujoco model="toy">
-  <compiler angle="radian" autolimits="true"/>
-  <default><geom type="box" size="0.05 0.03 0.02" mass="0.4"/></default>
-  <worldbody>
-    <body name="base" pos="0.1 -0.2 0.5" quat="0.9 0.1 -0.3 0.2">
-      <freejoint name="root"/>
-      <geom name="trunk" pos="0.02 0.01 -0.03" quat="0.7 0.1 0.2 0.5" mass="3"/>
-      <site name="imu" pos="-0.04 0.02 0.05" quat="0.5 -0.5 0.1 0.7"/>
-      <body name="upper" pos="0.1 0.2 0.05" quat="0.8 0 0.6 0">
-        <joint name="ball" type="ball" pos="0.02 -0.01 0.03"/>
-        <geom pos="0.1 0 0" mass="0.8"/>
-        <body name="bracket" pos="0.2 0.03 0" quat="0.6 0.8 0 0">
-          <geom pos="0 0.02 0"/>
-          <body name="cross" pos="0.05 0.02 0.01" quat="0.9 -0.2 0.3 0.1">
-            <joint name="first" axis="1 0.2 0" pos="0.01 0.02 -0.03" ref="0.4" range="-2 2"/>
-            <joint name="second" axis="0 1 0.5" pos="-0.02 0 0.01" ref="-0.7" range="-2 2"/>
-            <geom pos="0 0.1 0.02"/>
-            <body name="piston" pos="0.1 0 0.02" quat="0.3 0.4 0.1 -0.8">
-              <joint name="slide" type="slide" axis="0.3 0.1 1" pos="0.03 0 0" ref="0.15" range="-0.5 0.5"/>
-              <geom name="tip" pos="0 0 0.1" quat="0.2 0.9 0.1 0.1"/>
-              <site name="tool" pos="0.02 0.03 0.15" quat="0.1 0.2 0.3 0.9"/>
-            </body>
-          </body>
-        </body>
-      </body>
-      <body name="lower" pos="-0.1 0 -0.1">
-        <joint name="rail" type="slide" axis="0 1 0" range="-0.3 0.3"/>
-        <joint name="socket" type="ball" pos="0 0.02 0.01"/>
-        <geom pos="0 0 -0.1"/>
-      </body>
-    </body>
-    <body name="pillar" pos="1 0 0" quat="0.7 0 0 0.7">
-      <geom pos="0 0 0.1" mass="2"/>
-      <body name="crane" pos="0 0.1 0.4" quat="0.9 0.4 0 0">
-        <joint name="swing" axis="0 0 1" pos="0.05 0 0" range="-3 3"/>
-        <geom pos="0.2 0 0"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 
 NAMES = ("toy", "nao", "arm7")
 
@@ -71,7 +27,7 @@ def quick_jit(function):
 
 
 def toy_robot(**options) -> osik.Robot:
-    return osik.Robot.from_mjmodel(mujoco.MjModel.from_xml_string(TOY), root=("base", "crane"), **options)
+    return osik.Robot.from_mjmodel(mujoco.MjModel.from_xml_string(mjcf("toy")), root=("base", "crane"), **options)
 
 
 def make(name: str) -> osik.Robot:
@@ -134,33 +90,6 @@ def random_configurations(robot: osik.Robot, seed: int, count: int = 4) -> np.nd
     return np.array(out)
 
 
-def spread(robot: osik.Robot) -> np.ndarray:
-    """Matrix from v to MuJoCo's qvel, from the joints' names alone: followers move with their leaders."""
-    model = robot.mj_model
-    matrix = np.zeros((model.nv, robot.nv))
-    for j in range(model.njnt):
-        joint = model.joint(j)
-        if joint.name in robot.locked_joints:
-            continue
-        width = {0: 6, 1: 3, 2: 1, 3: 1}[int(joint.type[0])]
-        _, factor = robot.mimic_joints.get(joint.name, (None, 1.0))
-        rows = np.arange(width)
-        matrix[joint.dofadr[0] + rows, robot.joint_dof_index(joint.name) + rows] = factor
-    return matrix
-
-
-def mujoco_frame(model: mujoco.MjModel, data: mujoco.MjData, name: str):
-    """Body, position and rotation of a frame, asked of MuJoCo by name."""
-    body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
-    if body >= 0:
-        return body, data.xpos[body], data.xmat[body].reshape(3, 3)
-    site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
-    if site >= 0:
-        return int(model.site_bodyid[site]), data.site_xpos[site], data.site_xmat[site].reshape(3, 3)
-    geom = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, name)
-    return int(model.geom_bodyid[geom]), data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
-
-
 def moving_model(robot: osik.Robot) -> mujoco.MjModel:
     """The robot's model without the mass of what is fixed to the world: only what moves has a centre of mass here."""
     model = copy.deepcopy(robot.mj_model)
@@ -169,23 +98,28 @@ def moving_model(robot: osik.Robot) -> mujoco.MjModel:
     return model
 
 
+def mujoco_frame(model: mujoco.MjModel, data: mujoco.MjData, name: str):
+    """Body, position and rotation of a frame, asked of MuJoCo by name."""
+    for kind, of in (("BODY", "body"), ("SITE", "site"), ("GEOM", "geom")):
+        if mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind}"), name) >= 0:
+            own, place = getattr(model, of)(name), getattr(data, of)(name)
+            return own.id if of == "body" else int(own.bodyid[0]), place.xpos, place.xmat.reshape(3, 3)
+    raise KeyError(name)
+
+
 def mujoco_everything(robot: osik.Robot, subtree: str, q: np.ndarray) -> dict:
     """The same as ``everything``, by MuJoCo C."""
-    model, matrix = moving_model(robot), spread(robot)
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(jnp.asarray(q)))
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
+    model, matrix = moving_model(robot), full_velocities(robot)
+    data, root = mujoco_at(robot, q, model), model.body(subtree).id
     positions, rotations, jacobians = [], [], []
     for name in robot.frame_names:
         body, position, rotation = mujoco_frame(model, data, name)
-        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+        linear, angular = np.zeros((2, 3, model.nv))
         mujoco.mj_jac(model, data, linear, angular, position.reshape(3, 1), body)
         positions.append(position)
         rotations.append(rotation)
         jacobians.append(np.vstack([linear, angular]) @ matrix)
-    root = model.body(subtree).id
-    whole, part = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    whole, part = np.zeros((2, 3, model.nv))
     mujoco.mj_jacSubtreeCom(model, data, whole, 0)
     mujoco.mj_jacSubtreeCom(model, data, part, root)
     return {
@@ -261,40 +195,6 @@ def test_poses_and_jacobians_equal_mjx(robots, evaluators):
     np.testing.assert_allclose(ours["com"], com, atol=1e-9, rtol=0)
 
 
-@pytest.fixture(scope="module")
-def panda():
-    """The panda.urdf of example-robot-data, our robot, ten configurations, and our pose and Jacobian there."""
-    urdf = next(f for f in files("example-robot-data") or () if f.match("panda_description/urdf/panda.urdf"))
-    robot = osik.Robot.from_urdf(str(urdf.locate()), floating_base=False)
-    q = np.random.default_rng(13).uniform(robot.position_lower, robot.position_upper, (10, robot.nq))
-
-    @quick_jit
-    @jax.vmap
-    def tcp(q):
-        kin = osik.forward_kinematics(robot, q)
-        return *kin.frame_pose(robot, "panda_hand_tcp"), osik.frame_jacobian(robot, kin, "panda_hand_tcp")
-
-    assert robot.joint_names[:7] == tuple(f"panda_joint{i}" for i in range(1, 8))
-    return urdf, robot, q, tcp(q)
-
-
-def test_panda_from_urdf_equals_pinocchio(panda):
-    urdf, robot, q, (position, rotation, jacobian) = panda
-    model = pinocchio.buildModelFromUrdf(str(urdf.locate()))
-    data = model.createData()
-    frame = model.getFrameId("panda_hand_tcp")
-    arm = [model.joints[model.getJointId(name)].idx_v for name in robot.joint_names[:7]]
-    for k, row in enumerate(q):
-        full = pinocchio.neutral(model)
-        full[arm] = row[:7]
-        expected = pinocchio.computeFrameJacobian(
-            model, data, full, frame, pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        )
-        np.testing.assert_allclose(position[k], data.oMf[frame].translation, atol=1e-9, rtol=0)
-        np.testing.assert_allclose(rotation[k], data.oMf[frame].rotation, atol=1e-9, rtol=0)
-        np.testing.assert_allclose(jacobian[k, :, :7], expected[:, arm], atol=1e-9, rtol=0)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_jacobians_equal_central_differences_along_the_tangent(robots, evaluators, name):
     robot, step = robots[name], 1e-5
@@ -333,62 +233,6 @@ def test_derivatives_of_poses_equal_central_differences(robots, evaluators, name
             np.testing.assert_allclose(actual, np.moveaxis(expected, 0, -1), atol=1e-8, rtol=0)
 
 
-@pytest.mark.parametrize("name", ["toy", "nao"])
-def test_vmap_equals_a_loop(robots, evaluators, name):
-    robot = robots[name]
-    q = random_configurations(robot, seed=7)
-    one = quick_jit(everything(robot, SUBTREES[name]))
-    assert_trees_close(evaluators[name](robot, q), stacked([one(robot, row) for row in q]), 1e-12)
-
-
-def longer(robot: osik.Robot, factor: float) -> osik.Robot:
-    return eqx.tree_at(lambda r: (r.body_position, r.body_mass), robot, replace_fn=lambda leaf: leaf * factor)
-
-
-def test_vmap_over_robots_of_other_lengths_equals_a_loop(robots, evaluators):
-    robot = robots["nao"]
-    family = [longer(robot, factor) for factor in (1.0, 1.3)]
-    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *family)
-    q = random_configurations(robot, seed=8, count=2)
-    evaluate = everything(robot, SUBTREES["nao"])
-    together = quick_jit(jax.vmap(evaluate))(stack, q)
-    loop = [evaluators["nao"](member, row[None]) for member, row in zip(family, q, strict=True)]
-    loop = [jax.tree.map(lambda leaf: leaf[0], part) for part in loop]
-    assert_trees_close(together, stacked(loop), 1e-12)
-
-
-def test_longer_links_equal_mujoco_with_longer_links(robots, evaluators):
-    robot = robots["arm7"]
-    q = random_configurations(robot, seed=9, count=1)
-    edited = make("arm7")
-    edited.mj_model.body_pos *= 1.2
-    expected = mujoco_everything(edited, SUBTREES["arm7"], q[0])
-    moved = eqx.tree_at(lambda r: r.body_position, robot, robot.body_position * 1.2)
-    actual = jax.tree.map(lambda leaf: leaf[0], evaluators["arm7"](moved, q))
-    assert_trees_close(actual, expected, 1e-9)
-
-
-def test_a_follower_adds_its_column_to_its_leaders(robots, evaluators):
-    """NAO's hips: one motor turns both, so its column moves both feet, each as MuJoCo's own joint does."""
-    robot = robots["nao"]
-    q = random_configurations(robot, seed=10, count=1)
-    jacobians = evaluators["nao"](robot, q)["jacobians"][0]
-    model = robot.mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(q[0]))
-    assert data.joint("RHipYawPitch").qpos[0] == data.joint("LHipYawPitch").qpos[0] == q[0, 9]
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    column = robot.joint_dof_index("RHipYawPitch")
-    assert column == robot.joint_dof_index("LHipYawPitch") == 8
-    for foot, joint in (("l_ankle", "LHipYawPitch"), ("r_ankle", "RHipYawPitch")):
-        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jacBody(model, data, linear, angular, model.body(foot).id)
-        expected = np.concatenate([linear, angular])[:, model.joint(joint).dofadr[0]]
-        assert np.linalg.norm(expected[3:]) == pytest.approx(1.0)
-        np.testing.assert_allclose(jacobians[robot.frame_names.index(foot), :, column], expected, atol=1e-9)
-
-
 @pytest.mark.variants(slow=["locked1"])
 @pytest.mark.parametrize("locked", [("root", "ball", "second"), {"slide": 0.3, "slid*": 0.1}])
 def test_locked_joints_stay_where_they_are(locked):
@@ -405,40 +249,15 @@ def test_locked_joints_stay_where_they_are(locked):
         np.testing.assert_array_equal(full[at], value, err_msg=name)
 
 
-def test_one_frame_equals_its_row_among_several(robots):
-    robot = robots["nao"]
-    names = ("r_sole", "gaze", "r_sole")
-
-    @quick_jit
-    def both(q):
-        kin = osik.forward_kinematics(robot, q)
-        several = (*kin.frame_poses(robot, names), osik.frame_jacobian(robot, kin, names))
-        single = [(*kin.frame_pose(robot, name), osik.frame_jacobian(robot, kin, name)) for name in names]
-        return several, single
-
-    several, single = both(robot.q0)
-    assert_trees_close(several, tuple(np.stack(parts) for parts in zip(*single, strict=True)), 1e-15)
-
-
 def test_wrong_input_is_named(robots):
     robot = robots["nao"]
     kin = quick_jit(osik.forward_kinematics)(robot, robot.q0)
-    with pytest.raises(KeyError, match="no frame 'l_ankel'; did you mean 'l_ankle'"):
-        kin.frame_pose(robot, "l_ankel")
-    with pytest.raises(KeyError, match="no frame 'hand'"):
-        osik.frame_jacobian(robot, kin, "hand")
-    with pytest.raises(KeyError, match="no frame 'leg'"):
-        osik.center_of_mass(robot, kin, "leg")
-    with pytest.raises(ValueError, match=r"q has shape \(31,\), this robot's configurations have shape \(32,\)"):
-        osik.forward_kinematics(robot, robot.q0[:-1])
-    with pytest.raises(ValueError, match=r"q\[3:7\], the quaternion of joint 'floating_base', is zero"):
-        osik.forward_kinematics(robot, robot.q0.at[3:7].set(0.0))
-    with pytest.raises(ValueError, match=r"q is not finite at indices \[9\]"):
-        osik.forward_kinematics(robot, robot.q0.at[9].set(jnp.nan))
+    refuses(KeyError, "no frame 'l_ankel'; did you mean 'l_ankle'", kin.frame_pose, robot, "l_ankel")
+    refuses(KeyError, "no frame 'hand'", osik.frame_jacobian, robot, kin, "hand")
+    refuses(KeyError, "no frame 'leg'", osik.center_of_mass, robot, kin, "leg")
     feather = eqx.tree_at(lambda r: r.body_mass, robot, robot.body_mass.at[-1].set(0.0))
     for function in (osik.center_of_mass, osik.com_jacobian):
-        with pytest.raises(ValueError, match="the subtree of 'r_gripper' has no mass"):
-            function(feather, kin, "r_gripper")
+        refuses(ValueError, "the subtree of 'r_gripper' has no mass", function, feather, kin, "r_gripper")
 
 
 def microseconds(function, q) -> float:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivative_checks import assert_exact, check
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.solvers import Status
@@ -27,11 +28,6 @@ STEPS = 200
 @pytest.fixture(scope="module")
 def rail():
     return osik.Robot.from_mjcf(MJCF)
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
 
 
 class State(NamedTuple):
@@ -230,11 +226,6 @@ class TestDerivatives:
 
 class TestConstruction:
     def test_messages(self, arm):
-        with pytest.raises(ValueError, match=r"positive: joint2 \(0\.0\)"):
-            osik.AccelerationLimit(arm, {"*": 1.0, "joint2": 0.0})
-        with pytest.raises(KeyError, match="joint1"):
-            osik.AccelerationLimit(arm, {"elbow": 1.0})
-        with pytest.raises(ValueError, match=r"acceleration has shape \(\)"):
-            osik.AccelerationLimit(arm, 1.0)
+        refuses(ValueError, r"acceleration has shape \(\)", osik.AccelerationLimit, arm, 1.0)
         with pytest.raises(ValueError, match="lower > upper"):
             osik.AccelerationLimit(arm, {"*": 1.0}, lower={"joint1": 5.0}, upper={"joint1": 4.0})

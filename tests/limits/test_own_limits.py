@@ -7,31 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model_files import mjcf
 
 import osik_jax as osik
 from osik_jax import physics, reachability, tuning
 from osik_jax.viewer.live._session import Session
 
-ARM = """
-<mujoco>
-  <worldbody>
-    <body name="upper"><joint name="a" axis="0 1 0" range="-60 60"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-      <body name="lower" pos=".3 0 0"><joint name="b" axis="0 1 0" range="-90 45"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-        <site name="tip" pos=".3 0 0"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 SPEEDS = {"a": 1.0, "b": 2.0}
 DT = 0.01
 
 
 @pytest.fixture(scope="module")
 def arm():
-    return osik.Robot.from_mjcf(ARM, velocity_limits=SPEEDS, floating_base=False)
+    return osik.Robot.from_mjcf(mjcf("planar_arm"), velocity_limits=SPEEDS, floating_base=False)
 
 
 def added(arm) -> dict[str, osik.Limit]:

@@ -16,8 +16,6 @@ from task_checks import kinematics_at
 import osik_jax as osik
 
 NAO = json.loads((Path(__file__).parents[1] / "data" / "nao_reference.json").read_text(encoding="utf-8"))
-CONFIGURATIONS = range(len(NAO["configurations"]))
-
 # Franka Control Interface documentation: modified Denavit-Hartenberg figures (a, d, alpha), last row the flange.
 PANDA_DH = (
     (0.0, 0.333, 0.0),
@@ -32,11 +30,6 @@ PANDA_DH = (
 PANDA_LOWER = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)
 PANDA_UPPER = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)
 PANDA_SPEED = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
-
-
-@pytest.fixture(scope="module")
-def nao() -> osik.Robot:
-    return osik.load_robot("nao")
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +53,6 @@ def configuration(nao: osik.Robot, recorded: dict) -> jax.Array:
     return q.at[:7].set(jnp.asarray(recorded["base_position"] + recorded["base_quaternion"]))
 
 
-def test_unknown_robot_lists_the_robots():
-    with pytest.raises(KeyError, match=r"did you mean 'nao'\? robots: nao, arm7"):
-        osik.load_robot("nau")
-
-
 def test_nao_has_26_joints_25_motors_and_a_floating_base(nao):
     assert nao.mj_model.njnt == 1 + 26
     assert nao.mj_model.nu == 25
@@ -74,26 +62,18 @@ def test_nao_has_26_joints_25_motors_and_a_floating_base(nao):
     assert set(nao.joint_names) == set(NAO["joints"]) - {"RHipYawPitch"}
 
 
-@pytest.mark.parametrize("index", CONFIGURATIONS)
-def test_nao_frames_equal_the_independent_description(nao, nao_poses, index):
-    recorded = NAO["configurations"][index]
-    positions, rotations, _ = nao_poses(configuration(nao, recorded))
-    missing = set(recorded["frames"]) - set(nao.frame_names)
-    assert not missing
-    assert len(recorded["frames"]) == 63
-    for name, (x, y, z, *wxyz) in recorded["frames"].items():
-        at = nao.frame_names.index(name)
-        expected = Rotation.from_quat(wxyz, scalar_first=True)
-        angle = (Rotation.from_matrix(np.asarray(rotations[at])) * expected.inv()).magnitude()
-        assert np.linalg.norm(positions[at] - np.array([x, y, z])) < 1e-4, name
-        assert angle < 1e-4, name
-
-
-@pytest.mark.parametrize("index", CONFIGURATIONS)
-def test_nao_centre_of_mass_equals_the_independent_description(nao, nao_poses, index):
-    recorded = NAO["configurations"][index]
-    *_, com = nao_poses(configuration(nao, recorded))
-    np.testing.assert_allclose(com, recorded["com"], atol=1e-3, rtol=0)
+def test_nao_equals_the_independent_description(nao, nao_poses):
+    """All frames, and the centre of mass, in each recorded configuration."""
+    for recorded in NAO["configurations"]:
+        positions, rotations, com = nao_poses(configuration(nao, recorded))
+        assert len(recorded["frames"]) == 63
+        for name, (x, y, z, *wxyz) in recorded["frames"].items():
+            at = nao.frame_names.index(name)
+            expected = Rotation.from_quat(wxyz, scalar_first=True)
+            angle = (Rotation.from_matrix(np.asarray(rotations[at])) * expected.inv()).magnitude()
+            assert np.linalg.norm(positions[at] - np.array([x, y, z])) < 1e-4, name
+            assert angle < 1e-4, name
+        np.testing.assert_allclose(com, recorded["com"], atol=1e-3, rtol=0)
 
 
 def test_nao_limits_and_mass_equal_the_independent_description(nao):
@@ -158,23 +138,18 @@ def dh_product(q: np.ndarray) -> np.ndarray:
     for (a, d, alpha), angle in zip(PANDA_DH, [*q, 0.0], strict=True):
         ca, sa, cq, sq = np.cos(alpha), np.sin(alpha), np.cos(angle), np.sin(angle)
         pose = pose @ np.array(
-            [
-                [cq, -sq, 0.0, a],
-                [sq * ca, cq * ca, -sa, -d * sa],
-                [sq * sa, cq * sa, ca, d * ca],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
+            [[cq, -sq, 0.0, a], [sq * ca, cq * ca, -sa, -d * sa], [sq * sa, cq * sa, ca, d * ca], [0.0, 0.0, 0.0, 1.0]]
         )
     return pose
 
 
 @pytest.fixture(scope="module")
-def arm7_flange(arm7):
+def arm7_flange(arm):
     """Pose and Jacobian of the flange over a batch of configurations, jitted."""
 
     def flange(q):
-        kin = osik.forward_kinematics(arm7, q)
-        return *kin.frame_pose(arm7, "flange"), osik.frame_jacobian(arm7, kin, "flange")
+        kin = osik.forward_kinematics(arm, q)
+        return *kin.frame_pose(arm, "flange"), osik.frame_jacobian(arm, kin, "flange")
 
     return jax.jit(jax.vmap(flange))
 
@@ -191,25 +166,25 @@ def test_arm7_flange_equals_the_denavit_hartenberg_product(arm7_flange, arm7_q):
     np.testing.assert_allclose(rotation, expected[:, :3, :3], atol=1e-12, rtol=0)
 
 
-def test_arm7_limits_are_the_published_ones(arm7):
-    assert arm7.joint_names == tuple(f"joint{i}" for i in range(1, 8))
-    assert not arm7.floating_base
-    np.testing.assert_array_equal(arm7.position_lower, PANDA_LOWER)
-    np.testing.assert_array_equal(arm7.position_upper, PANDA_UPPER)
-    np.testing.assert_array_equal(arm7.velocity_limit, PANDA_SPEED)
+def test_arm7_limits_are_the_published_ones(arm):
+    assert arm.joint_names == tuple(f"joint{i}" for i in range(1, 8))
+    assert not arm.floating_base
+    np.testing.assert_array_equal(arm.position_lower, PANDA_LOWER)
+    np.testing.assert_array_equal(arm.position_upper, PANDA_UPPER)
+    np.testing.assert_array_equal(arm.velocity_limit, PANDA_SPEED)
 
 
-def test_arm7_masses_are_the_identified_ones(arm7):
+def test_arm7_masses_are_the_identified_ones(arm):
     """Masses of links 0 to 7 in the panda.urdf of example-robot-data, after Gaz et al. 2019."""
     identified = (0.629769, 4.970684, 0.646926, 3.228604, 3.587895, 1.225946, 1.666555, 0.735522)
-    np.testing.assert_allclose(arm7.mj_model.body_mass[1:], identified, rtol=1e-12)
+    np.testing.assert_allclose(arm.mj_model.body_mass[1:], identified, rtol=1e-12)
 
 
-def test_arm7_home_points_the_flange_down_and_the_hand_is_turned(arm7):
-    kin = kinematics_at(arm7, arm7.q0)
-    position, rotation = kin.frame_pose(arm7, "flange")
-    np.testing.assert_allclose(position, dh_product(np.asarray(arm7.q0))[:3, 3], atol=1e-12)
+def test_arm7_home_points_the_flange_down_and_the_hand_is_turned(arm):
+    kin = kinematics_at(arm, arm.q0)
+    position, rotation = kin.frame_pose(arm, "flange")
+    np.testing.assert_allclose(position, dh_product(np.asarray(arm.q0))[:3, 3], atol=1e-12)
     np.testing.assert_allclose(rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-12)
-    _, hand = kin.frame_pose(arm7, "hand")
+    _, hand = kin.frame_pose(arm, "hand")
     quarter = Rotation.from_euler("z", -np.pi / 4).as_matrix()
     np.testing.assert_allclose(hand, rotation @ quarter, atol=1e-12)

@@ -43,7 +43,7 @@ def stick_robot(left, right, *, yaw=True):
         <asset><mesh name="stick" vertex="-0.2 -0.02 -0.02 -0.2 0.02 -0.02 -0.2 -0.02 0.02 -0.2 0.02 0.02
           0.2 -0.02 -0.02 0.2 0.02 -0.02 0.2 -0.02 0.02 0.2 0.02 0.02"/></asset>
         <worldbody><body name="base" pos="0 0 0.85"><freejoint/>
-        <geom type="box" pos="0 0 0.2" size="0.06 0.1 0.2"/>{"".join(sides)}</body></worldbody></mujoco>""",
+        <geom type="box" pos="0 0 0.2" size="0.06 0.1 0.2"/>{"".join(sides)}</body></worldbody></mujoco>"""
     )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,8 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from example_files import example_file
+from mujoco_states import full_velocities, mujoco_at
 
 import osik_jax as osik
 
@@ -32,9 +33,7 @@ ARRAYS = ("position", "rotation", "jacobian", "com", "com_jacobian", "mass_matri
 
 
 def urdf_path(name: str) -> Path:
-    files = importlib.metadata.files("example-robot-data") or []
-    (found,) = [file for file in files if str(file).endswith(ROBOTS[name][0])]
-    return Path(str(found.locate()))
+    return example_file(ROBOTS[name][0])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +43,6 @@ class Description:
     links: tuple[str, ...]
     mass: dict[str, float]
     mimic: dict[str, tuple[str, float, float]]
-    root: str
 
     def resolve(self, joint: str) -> tuple[str, float, float]:
         """The joint that moves this one in the end: name, multiplier, offset."""
@@ -64,13 +62,8 @@ def describe(path: Path) -> Description:
             numbers = float(element.get("multiplier", "1")), float(element.get("offset", "0"))
             mimic[joint.get("name", "")] = (element.get("joint", ""), *numbers)
     mass = {link.get("name", ""): link.find("inertial/mass") for link in root.findall("link")}
-    children = {child.get("link") for child in root.findall("joint/child")}
-    return Description(
-        links=tuple(mass),
-        mass={name: 0.0 if element is None else float(element.get("value", "0")) for name, element in mass.items()},
-        mimic=mimic,
-        root=next(name for name in mass if name not in children),
-    )
+    masses = {name: 0.0 if at is None else float(at.get("value", "0")) for name, at in mass.items()}
+    return Description(tuple(mass), masses, mimic)
 
 
 def possible(path: Path) -> str:
@@ -212,18 +205,9 @@ def case(request: pytest.FixtureRequest) -> Case:
     oracle = pin.buildModelFromXML(possible(path), *base)
     q, v = random_configurations(robot, rng), rng.normal(size=(CONFIGURATIONS, robot.nv))
     rows = [pinocchio_evaluate(robot, oracle, description, row) for row in q]
-    return Case(
-        name=name,
-        path=path,
-        floating=floating,
-        description=description,
-        robot=robot,
-        oracle=oracle,
-        q=q,
-        v=v,
-        ours=evaluate(robot, description.links, q, v),
-        theirs={key: np.array([row[key] for row in rows]) for key in ARRAYS},
-    )
+    ours = evaluate(robot, description.links, q, v)
+    theirs = {key: np.array([row[key] for row in rows]) for key in ARRAYS}
+    return Case(name, path, floating, description, robot, oracle, q, v, ours, theirs)
 
 
 def test_names_and_sizes(case: Case):
@@ -291,43 +275,23 @@ def test_limits(case: Case):
 
 
 def test_poses_and_step_agree_with_mujoco(case: Case):
-    model = case.robot.mj_model
-    data = mujoco.MjData(model)
-    names = [model.joint(j).name for j in range(model.njnt)]
-    velocities = np.zeros((model.nv, case.robot.nv))
-    for name in names:
-        full = model.joint(name).dofadr[0]
-        if name == "floating_base":
-            velocities[full : full + 6, :6] = np.eye(6)
-        else:
-            leader, multiplier, _ = case.description.resolve(name)
-            velocities[full, case.robot.joint_dof_index(leader)] = multiplier
+    robot, model = case.robot, case.robot.mj_model
+    velocities = full_velocities(robot)
     links = [k for k, link in enumerate(case.description.links) if link != "world"]
     bodies = [model.body(case.description.links[k]).id for k in links]
     moving = np.where(model.body_weldid != 0, model.body_mass, 0.0)
-    for k in range(CONFIGURATIONS):
+    for k, q in enumerate(case.q):
         ours = {key: value[k] for key, value in case.ours.items()}
-        data.qpos[:] = ours["qpos"]
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
+        data = mujoco_at(robot, q)
+        np.testing.assert_allclose(ours["qpos"], data.qpos, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(ours["position"][links], data.xpos[bodies], rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(ours["rotation"][links], data.xmat[bodies].reshape(-1, 3, 3), rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(ours["com"], moving @ data.xipos / moving.sum(), rtol=0.0, atol=1e-9)
-        for link, body in zip(links, bodies, strict=True):
-            linear, angular = np.zeros((2, 3, model.nv))
-            mujoco.mj_jacBody(model, data, linear, angular, body)
-            expected = np.concatenate([linear, angular]) @ velocities
-            np.testing.assert_allclose(ours["jacobian"][link], expected, rtol=0.0, atol=1e-9)
         qpos = data.qpos.copy()
         mujoco.mj_integratePos(model, qpos, velocities @ case.v[k], 0.01)
-        np.testing.assert_allclose(ours["stepped"], normalised(case.robot, qpos), rtol=0.0, atol=1e-9)
-
-
-def normalised(robot: osik.Robot, qpos: np.ndarray) -> np.ndarray:
-    out = qpos.copy()
-    if robot.floating_base:
-        out[3:7] /= np.linalg.norm(out[3:7])
-    return out
+        if robot.floating_base:
+            qpos[3:7] /= np.linalg.norm(qpos[3:7])
+        np.testing.assert_allclose(ours["stepped"], qpos, rtol=0.0, atol=1e-9)
 
 
 def test_mj_model_alone_gives_the_same_robot(case: Case):

@@ -3,9 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
+from mujoco_states import mujoco_at
+from refusals import refuses
+from task_checks import kinematics_at, moved_by
 
 import osik_jax as osik
 from osik_jax.kinematics._forward import body_masses, kinematics_by, moving_center
@@ -17,11 +19,6 @@ from osik_jax.viewer.live._default import default_session
 
 CUBE = '<body name="cube" pos="1 0 .1"><freejoint name="cube_free"/><geom type="box" size=".1 .1 .1" mass="5"/></body>'
 FEET = ("l_sole", "r_sole")
-
-
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
 
 
 def with_cube(nao, *, first: bool):
@@ -46,15 +43,14 @@ def scene(nao, request):
 def own(scene):
     """Entries of q and of v that are the robot's, in its order alone."""
     cube_q, cube_v = scene.joint_qpos_index("cube_free"), scene.joint_dof_index("cube_free")
-    return np.delete(np.arange(scene.nq), range(cube_q, cube_q + 7)), np.delete(
-        np.arange(scene.nv), range(cube_v, cube_v + 6)
-    )
+    entries, dofs = np.arange(scene.nq), np.arange(scene.nv)
+    return np.delete(entries, range(cube_q, cube_q + 7)), np.delete(dofs, range(cube_v, cube_v + 6))
 
 
 def posed(nao, scene, seed=0):
     """The same random posture of the robot, alone and in the scene, where the cube is somewhere."""
     rng = np.random.default_rng(seed)
-    q = np.asarray(osik.integrate(nao, nao.q0, rng.normal(size=nao.nv) * 0.2, 1.0))
+    q = np.asarray(moved_by(nao, nao.q0, rng.normal(size=nao.nv) * 0.2))
     whole = np.asarray(scene.q0).copy()
     whole[own(scene)[0]] = q
     cube = scene.joint_qpos_index("cube_free")
@@ -69,19 +65,27 @@ def com_target(robot):
     return np.asarray(target)
 
 
+@jax.jit
+def of_masses(robot, q):
+    """The centre of mass, its Jacobian, the momentum matrix and the mass matrix."""
+    kinematics = osik.forward_kinematics(robot, q)
+    functions = osik.center_of_mass, osik.com_jacobian, osik.centroidal_momentum_matrix, osik.mass_matrix
+    return tuple(function(robot, kinematics) for function in functions)
+
+
 @pytest.mark.variants(release=["cube first"])
-def test_the_cube_has_no_part_in_the_centre_of_mass(nao, scene):
+def test_the_cube_has_no_part_in_the_robots_mass_and_momentum(nao, scene):
+    """It has in the mass matrix, which is of everything."""
     q, whole = posed(nao, scene)
-    alone, together = osik.forward_kinematics(nao, q), osik.forward_kinematics(scene, whole)
-    center = osik.center_of_mass(scene, together)
-    np.testing.assert_allclose(center, osik.center_of_mass(nao, alone), atol=1e-12)
-    jacobian = np.asarray(osik.com_jacobian(scene, together))
-    np.testing.assert_allclose(jacobian[:, own(scene)[1]], osik.com_jacobian(nao, alone), atol=1e-12)
-    assert not np.delete(jacobian, own(scene)[1], axis=1).any()
-    data = mujoco.MjData(scene.mj_model)
-    data.qpos[:] = np.asarray(scene.mujoco_qpos(whole))
-    mujoco.mj_kinematics(scene.mj_model, data)
-    mujoco.mj_comPos(scene.mj_model, data)
+    center, *matrices, mass = of_masses(scene, whole)
+    alone, *expected, _ = of_masses(nao, q)
+    np.testing.assert_allclose(center, alone, atol=1e-12)
+    for ours, theirs in zip(matrices, expected, strict=True):
+        np.testing.assert_allclose(ours[:, own(scene)[1]], theirs, atol=1e-12)
+        assert not np.delete(ours, own(scene)[1], axis=1).any()
+    cube = scene.joint_dof_index("cube_free")
+    np.testing.assert_allclose(np.diag(mass)[cube : cube + 3], 5.0, rtol=1e-12)
+    data = mujoco_at(scene, whole)
     np.testing.assert_allclose(center, data.subtree_com[scene.mj_model.body(nao.body_names[0]).id], atol=1e-9)
     np.testing.assert_allclose(robot_com(scene, next(mujoco_poses(scene, whole))), center, atol=1e-9)
     np.testing.assert_allclose(com_target(scene), com_target(nao), atol=1e-12)
@@ -91,7 +95,7 @@ def test_the_cube_has_no_part_in_the_centre_of_mass(nao, scene):
 @pytest.mark.variants(release=["cube first"])
 def test_kernels_leave_the_cube_out_too(nao, scene):
     _, whole = posed(nao, scene, seed=1)
-    plain = moving_center(scene, osik.forward_kinematics(scene, whole))
+    plain = of_masses(scene, whole)[:2]
     by_kernel = jax.jit(lambda q: moving_center(scene, kinematics_by("core", scene, q)))(whole)
     for got, want in zip(by_kernel, plain, strict=True):
         np.testing.assert_allclose(got, want, atol=1e-12)
@@ -102,18 +106,6 @@ def test_kernels_leave_the_cube_out_too(nao, scene):
     ]
     np.testing.assert_allclose(velocities[0], velocities[1], atol=1e-7)
     assert not np.delete(np.asarray(velocities[1]), own(scene)[1]).any()
-
-
-@pytest.mark.variants(release=["cube first"])
-def test_momentum_is_the_robots_and_the_mass_matrix_everything(nao, scene):
-    q, whole = posed(nao, scene, seed=2)
-    alone, together = osik.forward_kinematics(nao, q), osik.forward_kinematics(scene, whole)
-    momentum = np.asarray(osik.centroidal_momentum_matrix(scene, together))
-    np.testing.assert_allclose(momentum[:, own(scene)[1]], osik.centroidal_momentum_matrix(nao, alone), atol=1e-12)
-    assert not np.delete(momentum, own(scene)[1], axis=1).any()
-    cube = scene.joint_dof_index("cube_free")
-    matrix = np.asarray(osik.mass_matrix(scene, together))
-    np.testing.assert_allclose(np.diag(matrix)[cube : cube + 3], 5.0, rtol=1e-12)
 
 
 @pytest.mark.variants(release=["cube first"])
@@ -164,10 +156,7 @@ def two(left="", right="", free="<freejoint/>", extra="", end="", **options):
 
 
 def mujoco_center(robot, *bodies):
-    data = mujoco.MjData(robot.mj_model)
-    mujoco.mj_kinematics(robot.mj_model, data)
-    mujoco.mj_comPos(robot.mj_model, data)
-    ids = [robot.mj_model.body(name).id for name in bodies]
+    data, ids = mujoco_at(robot, robot.q0), [robot.mj_model.body(name).id for name in bodies]
     mass = robot.mj_model.body_subtreemass[ids]
     return mass @ data.subtree_com[ids] / mass.sum()
 
@@ -185,20 +174,11 @@ def mujoco_center(robot, *bodies):
         (dict(left=RANGE, root="ball"), ["ball"]),
         (dict(), ["left", "right", "ball"]),
     ],
-    ids=[
-        "limited left",
-        "limited right",
-        "driven",
-        "root: a site",
-        "root: a link",
-        "root: both",
-        "root: the ball",
-        "nothing says",
-    ],
+    ids=("limited left", "limited right", "driven", "a site", "a link", "both", "the ball", "nothing says"),
 )
 def test_the_robot_is_what_is_driven_or_limited_or_named(options, bodies):
     robot = two(**options)
-    center = osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))
+    center = osik.center_of_mass(robot, kinematics_at(robot, robot.q0))
     np.testing.assert_allclose(center, mujoco_center(robot, *bodies), atol=1e-12)
     again = osik.Robot.from_mjcf(robot.to_mjcf())
     np.testing.assert_allclose(com_target(again), center, atol=1e-12)
@@ -206,7 +186,7 @@ def test_the_robot_is_what_is_driven_or_limited_or_named(options, bodies):
 
 def test_several_candidates_are_asked_about():
     robot = two(left=RANGE, right=RANGE)
-    kinematics = osik.forward_kinematics(robot, robot.q0)
+    kinematics = kinematics_at(robot, robot.q0)
     asked = r"2 trees that may be the robot.*root=NAME.*trees: left, right"
     for use in (
         lambda: osik.ComTask(robot),
@@ -215,17 +195,14 @@ def test_several_candidates_are_asked_about():
         lambda: osik.centroidal_momentum_matrix(robot, kinematics),
         lambda: robot.tree.root,
     ):
-        with pytest.raises(ValueError, match=asked):
-            use()
+        refuses(ValueError, asked, use)
     one = osik.center_of_mass(robot, kinematics, "right")
     np.testing.assert_allclose(one, mujoco_center(robot, "right"), atol=1e-12)
     task = osik.FrameTask(robot, "left_tip", target=np.array([0.1, 1.0, 0.1]), rows="position")
     assert np.isfinite(osik.solve(robot, robot.q0, {"tip": task}).velocity).all()  # what needs no one robot works
     assert "kg" in repr(robot)
-    with pytest.raises(KeyError, match="no robot root 'lefft'; did you mean 'left'"):
-        two(left=RANGE, root="lefft")
-    with pytest.raises(ValueError, match="which free joint"):
-        osik.FloatingBaseVelocityLimit(robot, linear=1.0)
+    refuses(KeyError, "no robot root 'lefft'; did you mean 'left'", two, left=RANGE, root="lefft")
+    refuses(ValueError, "which free joint", osik.FloatingBaseVelocityLimit, robot, linear=1.0)
 
 
 def test_the_only_tree_with_joints_is_the_robot():
@@ -241,9 +218,8 @@ def test_an_arm_beside_a_loose_ball_is_bolted_down():
     np.testing.assert_allclose(com_target(robot), [0.2, 1.0, 0.0], atol=1e-12)  # the base does not count
 
 
-def test_a_scene_of_one_tree_compiles_as_before():
+def test_a_scene_of_one_tree_compiles_as_before(arm, nao):
     """The masses of one robot alone are its leaf itself, so programs are those of a robot without a scene."""
-    assert osik.load_robot("nao").tree.robots == osik.load_robot("arm7").tree.robots == ()
-    for name in ("nao", "arm7"):
-        robot = osik.load_robot(name)
+    for robot in (nao, arm):
+        assert robot.tree.robots == ()
         assert body_masses(robot) is robot.body_mass

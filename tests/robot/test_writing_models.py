@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from frames_beside_mujoco import assert_as_in_mujoco, poses, random_configurations
+from model_files import mjcf
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import Robot
 
-CONFIGURATIONS = 3
 
-
-def g1() -> Robot:
-    (path,) = (f for f in importlib.metadata.files("example-robot-data") or [] if f.name == "g1_29dof_rev_1_0.urdf")
-    return Robot.from_urdf(str(path.locate()), locked_joints={"waist_*": 0.1, "*_wrist_*": -0.2})
+def locked_g1() -> Robot:
+    return osik.load_robot("g1", locked_joints={"waist_*": 0.1, "*_wrist_*": -0.2})
 
 
 def locked_nao() -> Robot:
@@ -39,32 +36,7 @@ def scaled_nao() -> Robot:
     return eqx.tree_at(lambda r: (r.position_upper, r.velocity_limit, r.q0), robot, edited)
 
 
-ODD = """
-<mujoco model="odd">
-  <compiler angle="radian"/>
-  <asset><mesh name="wedge" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/><material name="red" rgba="1 0 0 1"/></asset>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 0.1"/><site name="mark" pos="1 2 3" euler="0.1 0.2 0.3"/>
-    <body name="table" pos="0 0 0.5" euler="0 0 0.3"><geom name="top" type="box" size="0.5 0.5 0.02"/>
-      <body name="a/1" pos="0.1 0.2 0.3" quat="1 0.2 0 0.1"><geom size="0.1" pos="0.1 0 0"/>
-        <joint name="x" axis="1 0 0" pos="0 0.1 0" range="-1 1" armature="0.1"/>
-        <joint name="y" axis="0 1 0.5" ref="0.3"/>
-        <joint name="z" type="slide" axis="0 1 1" ref="0.2" pos="0.1 0.1 0.1"/>
-        <joint name="w" axis="1 1 0" pos="0 0 1"/>
-        <body name="b" pos="0 0 0.4"><geom type="mesh" mesh="wedge" name="hull"/>
-          <joint name="s" type="slide" axis="1 0 0"/>
-          <joint name="ball" type="ball" pos="0 0 0.1"/><site name="b" pos="0 0 0.2"/>
-          <body name="fixed" pos="0.1 0 0" euler="1 0 0"><geom name="pin" type="capsule" size="0.1 0.2" material="red"/>
-            <body name="massless" pos="0 0.2 0"/></body>
-          <body name="c" pos="0 0 0.4"><joint name="m" axis="0 1 0" ref="0.1"/>
-            <geom size="0.1"/></body></body></body></body>
-    <body name="größe" pos="2 0 1" euler="0.1 0.2 0.3"><freejoint name="fly"/>
-      <geom size="0.2 0.1 0.1" type="ellipsoid"/></body>
-  </worldbody>
-  <custom><numeric name="velocity_limit/ball" data="4"/><numeric name="velocity_limit/x" data="2"/></custom>
-  <equality><joint joint1="m" joint2="x" polycoef="0.2 -0.5 0 0 0"/><connect body1="c" anchor="0 0 0"/></equality>
-</mujoco>
-"""
+ODD = mjcf("odd")
 
 
 def odd() -> Robot:
@@ -76,25 +48,9 @@ ROBOTS = {
     "odd": odd,
     "nao, scaled and edited": scaled_nao,
     "nao, locked": locked_nao,
-    "g1, locked": g1,
+    "g1, locked": locked_g1,
 }
 SLOW = ("g1, locked",)
-
-
-@jax.jit
-def poses(robot: Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    def at(q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        kinematics = osik.forward_kinematics(robot, q)
-        return *kinematics.frame_poses(robot, robot.frame_names), osik.center_of_mass(robot, kinematics)
-
-    return jax.vmap(at)(q)
-
-
-def random_configurations(robot: Robot) -> np.ndarray:
-    """Near home, quaternions turned too."""
-    rng = np.random.default_rng(11)
-    v = rng.uniform(-1.0, 1.0, (CONFIGURATIONS, robot.nv))
-    return np.asarray(jax.jit(jax.vmap(lambda v: osik.integrate(robot, robot.q0, v, 1.0)))(v))
 
 
 @pytest.fixture(
@@ -130,31 +86,7 @@ def test_frames_and_centre_of_mass_come_back(pair: tuple[Robot, Robot]):
     for a, b in zip(ours[:2], theirs[:2], strict=True):
         np.testing.assert_allclose(b[:, order], a, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(theirs[2], ours[2], rtol=0.0, atol=1e-12)
-
-
-def test_mujoco_reads_the_file_as_we_meant_it(pair: tuple[Robot, Robot]):
-    """Poses of bodies, sites and geoms by name, and the centre of mass."""
-    robot, again = pair
-    model, q = again.mj_model, random_configurations(robot)
-    data = mujoco.MjData(model)
-    position, rotation, com = map(np.asarray, poses(robot, jnp.asarray(q)))
-    kinds = {"body": data.body, "site": data.site, "geom": data.geom}
-    named = [(kind, getattr(model, kind)(k).name) for kind in kinds for k in range(getattr(model, f"n{kind}"))]
-    named = [(kind, name) for kind, name in named if not name.startswith("equality_end/")]
-    own = np.isin(model.body_rootid, [model.body(robot.tree.body_names[top]).id for top in robot.tree.tops])
-    moving = np.where((model.body_weldid != 0) & own, model.body_mass, 0.0)
-    assert own[1:].all() == (model.nbody != 5)  # of the odd scene, the ellipsoid that floats is not the robot
-    for k in range(CONFIGURATIONS):
-        data.qpos[:] = again.mujoco_qpos(jnp.asarray(q[k]))
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        for kind, name in named:
-            if name:
-                frame, element = robot.tree.frame(name), kinds[kind](name)
-                np.testing.assert_allclose(position[k, frame], element.xpos, rtol=0.0, atol=1e-12, err_msg=name)
-                expected = element.xmat.reshape(3, 3)
-                np.testing.assert_allclose(rotation[k, frame], expected, rtol=0.0, atol=1e-12, err_msg=name)
-        np.testing.assert_allclose(com[k], moving @ data.xipos / moving.sum(), rtol=0.0, atol=1e-12)
+    assert_as_in_mujoco(again, again.mj_model)
 
 
 def test_inertias_come_back():
@@ -196,8 +128,7 @@ def edited(name: str, joint: str, value: float) -> Robot:
     ],
 )
 def test_what_mjcf_cannot_say_is_refused(robot, message: str):
-    with pytest.raises(ValueError, match=message):
-        robot().to_mjcf()
+    refuses(ValueError, message, robot().to_mjcf)
 
 
 def test_moved_frames_are_written_and_moved_bodies_are_not_mistaken_for_frames():
@@ -209,8 +140,7 @@ def test_moved_frames_are_written_and_moved_bodies_are_not_mistaken_for_frames()
     np.testing.assert_allclose(theirs, ours, rtol=0.0, atol=1e-15)
     at = robot.tree.frame("link7")
     wrong = eqx.tree_at(lambda r: r.frame_position, robot, robot.frame_position.at[at].add(0.01))
-    with pytest.raises(ValueError, match=r"frame 'link7' is a body or geom of its own and not where that is"):
-        wrong.to_mjcf()
+    refuses(ValueError, r"frame 'link7' is a body or geom of its own and not where that is", wrong.to_mjcf)
 
 
 def test_a_locked_base_stands_where_it_was():

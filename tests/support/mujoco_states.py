@@ -25,9 +25,10 @@ def full_velocities(robot: osik.Robot) -> np.ndarray:
     """Return the matrix from v to MuJoCo's qvel, from the joints' names alone: followers move with their leaders."""
     model = robot.mj_model
     matrix = np.zeros((model.nv, robot.nv))
-    for joint in map(model.joint, range(model.njnt)):
-        if joint.name not in robot.locked_joints:
+    for joint, own_name in zip(map(model.joint, range(model.njnt)), robot.tree.joint_names, strict=True):
+        name = joint.name or own_name
+        if name not in robot.locked_joints:
             rows = np.arange({0: 6, 1: 3, 2: 1, 3: 1}[int(joint.type[0])])
-            _, factor = robot.mimic_joints.get(joint.name, (None, 1.0))
-            matrix[joint.dofadr[0] + rows, robot.joint_dof_index(joint.name) + rows] = factor
+            _, factor = robot.mimic_joints.get(name, (None, 1.0))
+            matrix[joint.dofadr[0] + rows, robot.joint_dof_index(name) + rows] = factor
     return matrix

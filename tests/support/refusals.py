@@ -9,7 +9,7 @@ import pytest
 
 
 def refuses(
-    error: type[Exception] | tuple[type[Exception], ...], message: str, call: Callable, *given: Any, **options: Any
+    error: type[Exception] | tuple[type[Exception], ...], message: str, call: Callable, /, *given: Any, **options: Any
 ) -> None:
     """Assert that a call raises an error whose text matches a regular expression."""
     with pytest.raises(error, match=message):

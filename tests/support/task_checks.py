@@ -5,8 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import mink
-import mujoco
 import numpy as np
+from mujoco_states import full_velocities
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -35,18 +35,6 @@ def square(scale=0.1):
     normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     vertices = scale * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
     return osik.SupportPolygon(jnp.asarray(normals), jnp.full(4, scale), jnp.asarray(vertices))
-
-
-def full_velocities(robot):
-    """Full MuJoCo velocities from v, built from names alone. (full nv, nv)."""
-    model, out = robot.mj_model, np.zeros((robot.mj_model.nv, robot.nv))
-    for joint in range(model.njnt):
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, joint)
-        _, multiplier = robot.mimic_joints.get(name, (name, 1.0))
-        width = 6 if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE else 1
-        start, own = model.jnt_dofadr[joint], robot.joint_dof_index(name)
-        out[start : start + width, own : own + width] = multiplier * np.eye(width)
-    return out
 
 
 def the_same_in_mink(robot, seed):

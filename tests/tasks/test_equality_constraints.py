@@ -5,44 +5,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model_files import mjcf
+from mujoco_states import full_velocities, mujoco_at
+from refusals import refuses
 from task_checks import alone, assert_every_number_counts, assert_finite_gradients, rows_of_each
 
 import osik_jax as osik
 
-MODEL = """
-<mujoco>
-  <option><flag contact="disable"/></option>
-  <default><geom size="0.03" mass="0.5"/></default>
-  <worldbody>
-    <site name="hook" pos="0.4 0.3 0.7" euler="10 20 30"/>
-    <body name="base" pos="0 0 0.5"><freejoint/><geom/>
-      <body name="a1" pos="0.2 0 0" euler="0 10 0"><joint name="a1" axis="0 1 0" ref="0.2"/><geom/>
-        <body name="a2" pos="0.2 0 0"><joint name="a2" type="ball"/><geom/>
-          <body name="plate" pos="0.1 0 0" euler="15 0 20">
-            <geom/><site name="pin" pos="0 0.05 0" euler="0 40 0"/>
-          </body>
-        </body>
-      </body>
-      <body name="b1" pos="-0.2 0 0"><joint name="b1" axis="0 1 1"/><geom/>
-        <body name="b2" pos="0 0 -0.2"><joint name="b2" axis="1 0 0" ref="-0.3"/><joint name="b3" axis="0 0 1"/><geom/>
-          <body name="b4" pos="0.1 0 0"><joint name="b4" axis="0 1 0"/><geom/><site name="eye" pos="0.02 0 0.1"/></body>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <equality>
-    <connect name="loop" body1="plate" body2="b2" anchor="0.1 0.02 -0.03"/>
-    <joint name="cam" joint1="b1" joint2="b2" polycoef="0.1 0.5 -0.3 0.2 0.05"/>
-    <weld name="glue" body1="b4" body2="plate" relpose="0.1 0.2 0.3 0.9 0.1 -0.2 0.3" anchor="0.01 0.02 0.03"
-          torquescale="0.7"/>
-    <joint name="mimic" joint1="b4" joint2="a1" polycoef="0.05 -1.5 0 0 0"/>
-    <connect name="tie" site1="pin" site2="eye"/>
-    <weld body1="a1" body2="world"/>
-    <weld name="hang" site1="pin" site2="hook" torquescale="1.3"/>
-    <weld name="off" body1="a1" body2="b1" active="false"/>
-  </equality>
-</mujoco>
-"""
+MODEL = mjcf("equalities")
 NAMES = ("loop", "cam", "glue", "tie", "equality5", "hang")
 LANES = 6
 
@@ -76,15 +46,8 @@ def _oracle(robot, q, kept):
     data.qpos[:] = robot.mujoco_qpos(q)
     data.eq_active[:] = 1
     mujoco.mj_forward(model, data)
-    full = np.zeros((model.nv, robot.nv))
-    for j in range(model.njnt):
-        name = model.joint(j).name
-        leader, ratio = robot.mimic_joints.get(name, (name, 1.0))
-        width = {0: 6, 1: 3}.get(int(model.jnt_type[j]), 1)
-        own = 0 if width == 6 else robot.joint_dof_index(leader)
-        full[model.jnt_dofadr[j] :][:width, own : own + width] = ratio * np.eye(width)
     residual, jacobian = _constraint(model, data, kept)
-    return residual, jacobian @ full
+    return residual, jacobian @ full_velocities(robot)
 
 
 class TestAgainstMuJoCo:
@@ -155,9 +118,7 @@ def test_sites_of_a_user_are_frames_whatever_their_names():
     assert set(osik.Robot.from_mjcf(again.to_mjcf()).frame_names) == set(robot.frame_names)
     assert again.to_mjcf().count("<site") == text.count("<site") == 6 + 2 * 6
     q = osik.integrate(robot, robot.q0, np.random.default_rng(3).uniform(-0.7, 0.7, robot.nv), 1.0)
-    data = mujoco.MjData(again.mj_model)
-    data.qpos[:] = np.asarray(again.mujoco_qpos(q))
-    mujoco.mj_kinematics(again.mj_model, data)
+    data = mujoco_at(again, q)
     kinematics = osik.forward_kinematics(robot, q)
     for name in ("equality_end/loop/1", "equality_end/x", "equality_end/pin"):
         np.testing.assert_allclose(kinematics.frame_pose(robot, name)[0], data.site(name).xpos, atol=1e-12)
@@ -168,25 +129,18 @@ def test_sites_of_a_user_are_frames_whatever_their_names():
 
 class TestMistakes:
     def test_names(self, robot):
-        with pytest.raises(KeyError, match="did you mean 'glue'"):
-            osik.EqualityConstraintTask(robot, constraints=("gleu",))
-        with pytest.raises(TypeError, match="not one string"):
-            osik.EqualityConstraintTask(robot, constraints="glue")
-        with pytest.raises(ValueError, match="'mimic' holds already"):
-            osik.EqualityConstraintTask(robot, constraints=("mimic",))
-        with pytest.raises(ValueError, match="no constraint to keep"):
-            osik.EqualityConstraintTask(robot, constraints=())
+        refuses(KeyError, "did you mean 'glue'", osik.EqualityConstraintTask, robot, constraints=("gleu",))
+        refuses(ValueError, "'mimic' holds already", osik.EqualityConstraintTask, robot, constraints=("mimic",))
+        refuses(ValueError, "no constraint to keep", osik.EqualityConstraintTask, robot, constraints=())
 
     def test_kinds(self):
-        with pytest.raises(ValueError, match="no active connect, weld or joint"):
-            osik.EqualityConstraintTask(osik.load_robot("arm7"))
+        refuses(ValueError, "no active connect, weld or joint", osik.EqualityConstraintTask, osik.load_robot("arm7"))
         tied = osik.Robot.from_mjcf(
             """<mujoco><worldbody><body><joint name="a"/><geom size="0.1"/><body><joint name="b"/><geom size="0.1"/>
             </body></body></worldbody><tendon><fixed name="t"><joint joint="a" coef="1"/><joint joint="b" coef="1"/>
             </fixed></tendon><equality><tendon name="rope" tendon1="t"/></equality></mujoco>"""
         )
-        with pytest.raises(ValueError, match="'rope' is of kind mjEQ_TENDON"):
-            osik.EqualityConstraintTask(tied, constraints=("rope",))
+        refuses(ValueError, "'rope' is of kind mjEQ_TENDON", osik.EqualityConstraintTask, tied, constraints=("rope",))
 
 
 @pytest.mark.release
@@ -194,20 +148,6 @@ def test_every_number_counts_and_gradients_are_finite(robot, configurations):
     task = {"task": osik.EqualityConstraintTask(robot, constraints=("loop", "cam", "glue"))}
     assert_every_number_counts(robot, task, configurations[0])
     assert_finite_gradients(rows_of_each, *alone(robot, task, configurations[0]))
-
-
-FOUR_BAR = """
-<mujoco>
-  <default><geom type="capsule" size="0.02" fromto="0 0 0 0.1 0 0"/></default>
-  <worldbody>
-    <body name="crank"><joint name="crank" axis="0 0 1"/><geom/>
-      <body name="rod" pos="0.2 0 0"><joint name="knee" axis="0 0 1"/><geom/><site name="end" pos="0.6 0 0"/></body>
-    </body>
-    <body name="rocker" pos="0.6 0 0"><joint name="rocker" axis="0 0 1"/><geom/><site name="top" pos="0.5 0 0"/></body>
-  </worldbody>
-  <equality><connect name="loop" site1="end" site2="top"/></equality>
-</mujoco>
-"""
 
 
 def _assembled(turn):
@@ -223,7 +163,7 @@ def _assembled(turn):
 
 @pytest.fixture(scope="module")
 def linkage():
-    return osik.Robot.from_mjcf(FOUR_BAR)
+    return osik.Robot.from_mjcf(mjcf("four_bar"))
 
 
 class TestFourBar:
@@ -284,12 +224,9 @@ class TestFourBar:
         start = jnp.asarray(_assembled(0.5))
         path = osik.rollout(linkage, start, tasks, scheme=scheme, dt=dt, steps=steps, limits=osik.no_limits)
         assert (np.asarray(path.solution.status) == osik.Status.SOLVED).all()
-        model = linkage.mj_model
-        data = mujoco.MjData(model)
         gaps, angles = [], []
         for q in np.asarray(path.q[::20]):
-            data.qpos[:] = q
-            mujoco.mj_kinematics(model, data)
+            data = mujoco_at(linkage, q)
             gaps.append(np.linalg.norm(data.site("end").xpos - data.site("top").xpos))
             angles.append(np.angle(np.exp(1j * (q - _assembled(q[0])))))
         np.testing.assert_allclose(path.q[-1][0], 0.5 + 2.0 * np.pi, atol=1e-6)

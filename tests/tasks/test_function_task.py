@@ -1,6 +1,7 @@
 """Tasks from functions: against tasks written by hand, central differences and numbers worked out by hand."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -8,36 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from model_files import mjcf
+from refusals import refuses
 from task_checks import assert_every_number_counts, assert_jacobians, at_each, moved_by, rows_of_each
 
 import osik_jax as osik
 from osik_jax.kinematics._rates import kinematics_rates
-
-ROBOT = """
-<mujoco><worldbody>
-  <body name="trunk"><freejoint name="base"/><geom size="0.1"/>
-    <body name="left" pos="0 0.2 0"><joint name="ball" type="ball"/><geom size="0.05"/>
-      <body name="left hand" pos="0.3 0 0"><joint name="left wrist" axis="0 1 0"/><geom size="0.05"/></body>
-    </body>
-    <body name="right" pos="0 -0.2 0"><joint name="shoulder" axis="0 1 0"/><geom size="0.05"/>
-      <body name="right hand" pos="0.3 0 0"><joint name="right wrist" axis="0 0 1"/><geom size="0.05"/>
-        <site name="tip" pos="0.1 0 0.02"/></body>
-    </body>
-  </body>
-</worldbody></mujoco>
-"""
-JOINTS = """
-<mujoco><worldbody>
-  <body pos="0 0 1"><geom size="0.1"/>
-    <joint name="x" type="slide" axis="1 0 0"/><joint name="turn" axis="0 1 1" pos="0.1 0 0"/>
-    <joint name="y" type="slide" axis="0 1 0"/><joint name="roll" axis="1 0 1" pos="0 0.2 0.1"/>
-    <body pos="0.3 0 0.1"><geom size="0.1"/>
-      <joint name="s" type="slide" axis="1 2 0"/><joint name="ball" type="ball" pos="0.1 0.2 0"/>
-      <body pos="0.2 0 0"><joint name="last" axis="0 0 1"/><geom size="0.1"/></body>
-    </body>
-  </body>
-</worldbody><equality><joint joint1="last" joint2="turn" polycoef="0.1 2 0 0 0"/></equality></mujoco>
-"""
 
 
 def place_of_tip(robot, kinematics, q):
@@ -81,7 +58,7 @@ class Learned(eqx.Module):
 
 @pytest.fixture(scope="module")
 def robot():
-    return osik.Robot.from_mjcf(ROBOT)
+    return osik.Robot.from_mjcf(mjcf("two_arms"))
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +92,7 @@ def found(robot, tasks, configurations):
 
 def test_how_kinematics_change_is_what_differentiating_them_gives():
     """A body with four joints, one with a slide and a ball joint, a follower: every field, along every entry of v."""
-    robot = osik.Robot.from_mjcf(JOINTS)
+    robot = osik.Robot.from_mjcf(mjcf("joints_of_one_body"))
     assert robot.nv == 8
     q = osik.integrate(robot, robot.q0, jnp.cos(jnp.arange(8.0)))
 
@@ -166,13 +143,6 @@ class TestRows:
         )
         half = 0.5 * np.sum(np.asarray(left - right) ** 2)
         np.testing.assert_allclose(rows["apart"].error, [half + 0.1, 2.0 * half + 0.1], rtol=1e-13)
-
-    def test_vmap_equals_a_loop(self, robot, tasks, found, configurations):
-        for i, q in enumerate(configurations):
-            for ours, expected in zip(
-                jax.tree.leaves(found[0]), jax.tree.leaves(rows_of_each(robot, tasks, q)), strict=True
-            ):
-                np.testing.assert_allclose(ours[i], expected, atol=1e-12)
 
 
 class TestCompilation:
@@ -229,9 +199,8 @@ class TestCompilation:
 
 
 class TestClosedLoop:
-    def test_hands_come_to_a_distance(self):
+    def test_hands_come_to_a_distance(self, arm):
         """Their squared distance decays to 0.2 m squared like any task's error, as fast as the gain says."""
-        arm = osik.load_robot("arm7")
         home, _ = jax.jit(osik.forward_kinematics)(arm, arm.q0).frame_pose(arm, "hand")
 
         class FromPoint(eqx.Module):
@@ -241,15 +210,8 @@ class TestClosedLoop:
                 return jnp.sum((kinematics.frame_pose(robot, "hand")[0] - self.point) ** 2)
 
         distance = osik.FunctionTask(arm, FromPoint(home + jnp.array([0.1, 0.0, 0.05])), target=0.2**2, gain=5.0)
-        run = osik.rollout(
-            arm,
-            arm.q0,
-            {"distance": distance},
-            scheme=osik.NullSpace(damping=1e-6),
-            dt=0.01,
-            steps=100,
-            limits=osik.no_limits,
-        )
+        options: Any = dict(scheme=osik.NullSpace(damping=1e-6), limits=osik.no_limits)
+        run = osik.rollout(arm, arm.q0, {"distance": distance}, dt=0.01, steps=100, **options)
         error = np.asarray(run.solution.error["distance"])[:, 0]
         np.testing.assert_allclose(error[0], 0.1**2 + 0.05**2 - 0.2**2, rtol=1e-12)
         assert abs(error[-1]) < 0.01 * abs(error[0])
@@ -279,27 +241,20 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "error", "message"),
         [
-            (dict(function=3.0), TypeError, "function is a float"),
-            (dict(function=lambda r, k, q: jnp.eye(2)), ValueError, r"\(m,\)"),
             (dict(function=lambda r, k, q: q[:0]), ValueError, r"\(m,\)"),
             (dict(function=lambda r, k, q: (q, q)), ValueError, r"\(m,\)"),
             (dict(function=quaternion, target=[1.0, 2.0]), ValueError, r"target has shape \(2,\), expected \(4,\)"),
             (dict(function=quaternion, target=1.0, lower=0.0), TypeError, "not both"),
-            (dict(function=quaternion, lower=1.0, upper=0.0), ValueError, "lower > upper"),
-            (dict(function=quaternion, weight=-1.0), ValueError, "weight is"),
         ],
     )
     def test_at_construction(self, robot, options, error, message):
-        with pytest.raises(error, match=message):
-            osik.FunctionTask(robot, **options)
+        refuses(error, message, osik.FunctionTask, robot, **options)
 
     def test_replace(self, tasks):
-        with pytest.raises(TypeError, match="no 'function' to replace; it has: weight, gain"):
-            tasks["tip"].replace(function=quaternion)
+        refuses(TypeError, "no 'function' to replace; it has: weight, gain", tasks["tip"].replace, function=quaternion)
         with pytest.raises(TypeError, match="structure differs"):
             tasks["apart"].replace(function=Apart(jnp.ones(2), 0.1, 3, "left hand"))
-        with pytest.raises(TypeError, match="structure differs"):
-            tasks["apart"].replace(function=quaternion)
+        refuses(TypeError, "structure differs", tasks["apart"].replace, function=quaternion)
         with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
             tasks["apart"].replace(function=Apart(jnp.ones(3), 0.1, 2, "left hand"))
         assert tasks["apart"].replaceable == ("weight", "gain", "target", "target_velocity", "function")

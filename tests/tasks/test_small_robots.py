@@ -4,28 +4,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model_files import mjcf
 
 import osik_jax as osik
 from osik_jax.robot._size import robot_size
 
-ARM = """
-<mujoco>
-  <worldbody>
-    <body pos="0 0 2"><joint name="a" axis="0 0 1"/><geom size=".01"/>
-      <body pos="0 0 .3"><joint name="b" axis="0 1 0"/><geom size=".01"/>
-        <body pos=".4 0 0"><joint name="c" axis="0 1 0"/><geom size=".01"/><site name="tip" pos=".3 0 0"/></body>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
 Q = np.array([[1.1, -0.9, 1.7], [-0.8, 0.6, -1.5]])
 
 
 @pytest.fixture(scope="module")
 def arm():
     """Reach 1 m, on a stand of 2 m, which no joint moves."""
-    return osik.Robot.from_mjcf(ARM, floating_base=False)
+    return osik.Robot.from_mjcf(mjcf("arm_on_a_stand"), floating_base=False)
 
 
 class TestSize:

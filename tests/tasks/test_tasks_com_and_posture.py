@@ -1,26 +1,17 @@
 """ComTask and PostureTask against mink and numbers worked out by hand."""
 
-import jax
+from functools import partial
+
 import jax.numpy as jnp
 import mink
 import numpy as np
 import pytest
-from task_checks import (
-    anywhere,
-    kinematics_at,
-    rows_of_each,
-    square,
-    the_same_in_mink,
-)
+from refusals import refuses
+from task_checks import alone, anywhere, assert_finite_gradients, kinematics_at, rows_of_each, square, the_same_in_mink
 
 import osik_jax as osik
 
 SEED = 7
-
-
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
 
 
 @pytest.fixture
@@ -71,45 +62,27 @@ class TestInequalities:
         np.testing.assert_array_equal(rows["joints"].upper, np.full(2, np.inf))
 
 
-class TestGradients:
-    def test_finite_for_inequalities_with_infinite_bounds(self, nao):
-        tasks = {
-            "com": osik.ComTask(nao, upper=[0.1, np.inf, np.inf], gain=osik.AdaptiveGain(5.0, 1.0, 2.0)),
-            "polygon": osik.ComTask(nao, polygon=square(), gain=0.0),
-            "joints": osik.PostureTask(nao, lower=-np.inf, upper=np.inf, gain=osik.AdaptiveGain(5.0, 5.0, 0.0)),
-        }
-
-        def total(tasks, q):
-            rows = rows_of_each(nao, tasks, q)
-            bounds = [b for r in rows.values() for b in (r.lower, r.upper)]
-            return sum(jnp.sum(jnp.where(jnp.isfinite(b), b, 0.0)) for b in bounds)
-
-        for leaf in jax.tree.leaves(jax.jit(jax.grad(total, argnums=(0, 1)))(tasks, nao.q0)):
-            assert np.isfinite(leaf).all()
+def test_gradients_are_finite_with_infinite_bounds(nao):
+    tasks = {
+        "com": osik.ComTask(nao, upper=[0.1, np.inf, np.inf], gain=osik.AdaptiveGain(5.0, 1.0, 2.0)),
+        "polygon": osik.ComTask(nao, polygon=square(), gain=0.0),
+        "joints": osik.PostureTask(nao, lower=-np.inf, upper=np.inf, gain=osik.AdaptiveGain(5.0, 5.0, 0.0)),
+    }
+    assert_finite_gradients(partial(rows_of_each, nao), *alone(tasks, nao.q0))
 
 
 class TestMistakes:
     @pytest.mark.parametrize(
         ("options", "error", "message"),
         [
-            (dict(target=np.zeros(3), lower=0.0), TypeError, "not both"),
-            (dict(axes="xw"), ValueError, "x, y and z"),
             (dict(axes="xx"), ValueError, "at most once"),
             (dict(axes="xy", target=[1.0, 2.0, 3.0, 4.0]), ValueError, "target has shape"),
             (dict(polygon=np.zeros((4, 2))), TypeError, "SupportPolygon"),
-            (dict(polygon=square(), axes="z"), TypeError, "takes no"),
-            (dict(lower=1.0, upper=0.0), ValueError, "lower > upper"),
         ],
     )
     def test_com_task(self, nao, options, error, message):
-        with pytest.raises(error, match=message):
-            osik.ComTask(nao, **options)
+        refuses(error, message, osik.ComTask, nao, **options)
 
     def test_posture_task(self, nao):
         base = nao.tree.joint_names[0]
-        with pytest.raises(ValueError, match=f"leave out {base}"):
-            osik.PostureTask(nao, joints=(base,), lower=0.0)
-        with pytest.raises(TypeError, match="not both"):
-            osik.PostureTask(nao, target=nao.q0, lower=0.0)
-        with pytest.raises(ValueError, match=r"target has shape \(4,\)"):
-            osik.PostureTask(nao, target=np.zeros(4), weight=1.0)
+        refuses(ValueError, f"leave out {base}", osik.PostureTask, nao, joints=(base,), lower=0.0)

@@ -10,42 +10,20 @@ import numpy as np
 import pink
 import pinocchio as pin
 import pytest
+from model_files import mjcf
+from refusals import refuses
 from scipy.spatial.transform import Rotation
-from task_checks import (
-    assert_every_number_counts,
-    assert_jacobians,
-    at_each,
-    moved_by,
-    rows_of_each,
-)
+from task_checks import assert_every_number_counts, assert_jacobians, at_each, moved_by, rows_of_each
 
 import osik_jax as osik
 
 DT = 0.01
 NO_MAPPING: Any = ["elbow"]
-ROBOT = """
-<mujoco><worldbody>
-  <body name="trunk"><freejoint name="base"/><geom size="0.1"/>
-    <body name="upper" pos="0 0 0.3"><joint name="shoulder" type="ball"/><geom size="0.05"/>
-      <body name="lower" pos="0.3 0 0"><joint name="elbow" axis="0 1 0"/><geom size="0.05"/>
-        <body name="hand" pos="0.2 0 0"><joint name="slide" type="slide" axis="1 0 0"/><geom size="0.05"/>
-          <body name="finger" pos="0.1 0 0"><joint name="grip" axis="0 0 1"/><geom size="0.02"/></body>
-        </body>
-      </body>
-    </body>
-  </body>
-</worldbody></mujoco>
-"""
 
 
 @pytest.fixture(scope="module")
 def robot():
-    return osik.Robot.from_mjcf(ROBOT)
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
+    return osik.Robot.from_mjcf(mjcf("one_arm"))
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +98,7 @@ class TestRows:
         assert replaceable["low acceleration"] == ("weight", "velocity")
         for task in tasks.values():
             if "gain" not in task.replaceable:
-                with pytest.raises(TypeError, match="no 'gain' to replace; it has: weight"):
-                    task.replace(gain=1.0)
+                refuses(TypeError, "no 'gain' to replace; it has: weight", task.replace, gain=1.0)
         none = [f"['{name}'].gain" for name, task in tasks.items() if "gain" not in task.replaceable]
         assert len(none) == 6
         assert_every_number_counts(robot, tasks, configurations[0], idle=none)
@@ -241,9 +218,6 @@ class TestMistakes:
         ("make", "error", "message"),
         [
             (lambda r: osik.DampingTask(r, joints=("elbwo",)), KeyError, "did you mean 'elbow'"),
-            (lambda r: osik.DampingTask(r, weight=-1.0), ValueError, "weight is"),
-            (lambda r: osik.DampingTask(r, priority=0), ValueError, "priority"),
-            (lambda r: osik.FreezeTask(r, "elbow"), TypeError, "sequence of names"),
             (lambda r: osik.FreezeTask(r, ()), ValueError, "at least one joint"),
             (lambda r: osik.JointVelocityTask(r, [1.0, 2.0]), ValueError, r"target has shape \(2,\), expected \(6,\)"),
             (lambda r: osik.LowAccelerationTask(r, velocity=[1.0]), ValueError, r"velocity has shape \(1,\)"),
@@ -251,25 +225,9 @@ class TestMistakes:
             (lambda r: osik.JointCouplingTask(r, {"elbow": 0.0}), ValueError, "not 0"),
             (lambda r: osik.JointCouplingTask(r, {}), ValueError, "not 0"),
             (lambda r: osik.JointCouplingTask(r, NO_MAPPING), TypeError, "a mapping"),
-            (lambda r: osik.JointCouplingTask(r, {"elbwo": 1.0}), KeyError, "did you mean 'elbow'"),
             (lambda r: osik.JointCouplingTask(r, {"elbow": 1.0, "shoulder": 1.0}), ValueError, "leave out shoulder"),
             (lambda r: osik.JointCouplingTask(r, {"elbow": 1.0}, target=1.0, lower=0.0), TypeError, "not both"),
-            (lambda r: osik.JointCouplingTask(r, {"elbow": 1.0}, upper=0.0, lower=1.0), ValueError, "lower > upper"),
         ],
     )
     def test_are_told(self, robot, make, error, message):
-        with pytest.raises(error, match=message):
-            make(robot)
-
-
-def test_a_float32_robot_has_float32_tasks(robot):
-    small = jax.tree.map(lambda x: x.astype(jnp.float32), robot)
-    made = (
-        osik.DampingTask(small),
-        osik.FreezeTask(small, ("elbow",)),
-        osik.JointVelocityTask(small, 0.1),
-        osik.LowAccelerationTask(small),
-        osik.JointCouplingTask(small, {"elbow": 1.0}, lower=0.0),
-    )
-    for leaf in jax.tree.leaves(made):
-        assert leaf.dtype == jnp.float32
+        refuses(error, message, make, robot)

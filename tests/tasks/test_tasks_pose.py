@@ -1,6 +1,7 @@
 """FrameTask, and the rotations that it rests on, against mink, Pinocchio, SciPy and exact solutions."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,14 +9,9 @@ import mink
 import numpy as np
 import pinocchio as pin
 import pytest
+from refusals import refuses
 from scipy.spatial.transform import Rotation
-from task_checks import (
-    anywhere,
-    kinematics_at,
-    random_pose,
-    rows_of_each,
-    the_same_in_mink,
-)
+from task_checks import anywhere, assert_finite_gradients, kinematics_at, random_pose, rows_of_each, the_same_in_mink
 
 import osik_jax as osik
 from osik_jax.tasks._rotation import inverse_left_jacobian, rotation_log
@@ -29,16 +25,6 @@ SMALL = """
   </body>
 </worldbody></mujoco>
 """
-
-
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
 
 
 @pytest.fixture
@@ -94,14 +80,6 @@ class TestErrors:
         np.testing.assert_allclose(rows["frame"].error, own, atol=1e-13)
         np.testing.assert_allclose(rows["world"].lower, -10.0 * world, atol=1e-12)
         np.testing.assert_array_equal(rows["world"].lower, rows["world"].upper)
-
-    def test_a_matrix_is_a_pose(self, arm, rng):
-        p, R = random_pose(rng, np.zeros(3))
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = R, p
-        task = osik.FrameTask(arm, "hand", target=matrix)
-        np.testing.assert_array_equal(task.target[0], p)
-        np.testing.assert_array_equal(task.target[1], R)
 
     def test_weights_multiply(self, arm):
         frame = "hand"
@@ -203,30 +181,23 @@ class TestFeedForward:
         np.testing.assert_allclose(errors, np.exp(-gain * times)[:, None] * errors[0], atol=1e-6 * 0.1)
 
 
-class TestGradients:
-    @pytest.mark.variants(release=["True"])
-    @pytest.mark.parametrize("x64", [True, False])
-    def test_finite_at_zero_error_and_near_pi(self, x64):
-        with jax.enable_x64(x64):
-            arm, frame = osik.Robot.from_mjcf(SMALL), "tip"
-            p, R = kinematics_at(arm, arm.q0).frame_pose(arm, frame)
-            adaptive = osik.AdaptiveGain(10.0, 1.0, 2.0)
-            angles = np.array([0.0, 1e-12, 1e-6, math.pi - 1e-4, math.pi - 1e-7, math.pi])
-            turns = jnp.asarray(Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix(), R.dtype)
-
-            def cost(tasks, q):
-                kinematics = osik.forward_kinematics(arm, q)
-                rows = [task.rows(arm, kinematics, q) for task in tasks]
-                bounds = [jnp.where(jnp.isfinite(r.lower), r.lower, 0.0) for r in rows]
-                return sum(jnp.sum(b) for b in bounds) + sum(jnp.sum(r.jacobian**2) for r in rows)
-
-            world = osik.FrameTask(arm, frame, gain=adaptive)
-            own = osik.FrameTask(arm, frame, axes="frame", gain=adaptive, lower=-jnp.inf)
-            tasks = jax.vmap(lambda turn: [task.replace(target=(p, turn @ R)) for task in (world, own)])(turns)
-            gradients = jax.jit(jax.vmap(jax.grad(cost, argnums=(0, 1)), in_axes=(0, None)))(tasks, arm.q0)
-            for leaf in jax.tree.leaves(gradients):
-                assert leaf.dtype == (jnp.float64 if x64 else jnp.float32)
-                assert np.isfinite(leaf).all()
+@pytest.mark.slow
+@pytest.mark.variants(release=["True"])
+@pytest.mark.parametrize("x64", [True, False])
+def test_gradients_are_finite_at_zero_error_and_near_pi(x64):
+    with jax.enable_x64(x64):
+        robot = osik.Robot.from_mjcf(SMALL)
+        p, R = kinematics_at(robot, robot.q0).frame_pose(robot, "tip")
+        angles = np.array([0.0, 1e-12, 1e-6, math.pi - 1e-4, math.pi - 1e-7, math.pi])
+        turns = jnp.asarray(Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix(), R.dtype)
+        adaptive = osik.AdaptiveGain(10.0, 1.0, 2.0)
+        made = {
+            "world": osik.FrameTask(robot, "tip", gain=adaptive),
+            "own": osik.FrameTask(robot, "tip", axes="frame", gain=adaptive, lower=-jnp.inf),
+        }
+        tasks = jax.vmap(lambda t: {name: task.replace(target=(p, t @ R)) for name, task in made.items()})(turns)
+        rows = partial(rows_of_each, robot)
+        assert_finite_gradients(rows, tasks, jnp.tile(robot.q0, (len(angles), 1)))
 
 
 class TestMistakes:
@@ -234,26 +205,12 @@ class TestMistakes:
         ("options", "error", "message"),
         [
             (dict(target=np.eye(3)), ValueError, r"\(4, 4\)"),
-            (dict(target=(np.zeros(3), 2 * np.eye(3))), ValueError, "rotation"),
-            (dict(target=(np.zeros(3), np.diag([1.0, 1.0, -1.0]))), ValueError, "rotation"),
-            (dict(target=(np.zeros((5, 3)), np.eye(3))), ValueError, "vmap"),
-            (dict(target=(np.zeros(3), np.full((3, 3), np.nan))), ValueError, "rotation"),
             (dict(lower=1.0, upper=[0, 2, 2, 2, 2, 0]), ValueError, r"rows \[0, 5\]"),
             (dict(lower=[1.0, 2.0]), ValueError, r"lower has shape \(2,\)"),
             (dict(position_weight=-1.0), ValueError, "position_weight is"),
-            (dict(weight=np.nan), ValueError, "weight is"),
-            (dict(weight=[1.0, 2.0]), ValueError, "weight has shape"),
-            (dict(gain=-1.0), ValueError, "gain is"),
-            (dict(rows="orient"), ValueError, "did you mean 'orientation'"),
-            (dict(rows=(True, False)), ValueError, "six booleans"),
-            (dict(rows=(False,) * 6), ValueError, "at least one"),
-            (dict(axes="body"), ValueError, "'world', 'frame'"),
             (dict(orientation_jacobian="exact"), ValueError, "'analytic', 'geometric'"),
-            (dict(priority=0), ValueError, "priority"),
-            (dict(priority=1.5), ValueError, "priority"),
             (dict(target_velocity=[1.0, 2.0]), ValueError, "target_velocity"),
         ],
     )
     def test_frame_task(self, arm, options, error, message):
-        with pytest.raises(error, match=message):
-            osik.FrameTask(arm, "hand", **options)
+        refuses(error, message, osik.FrameTask, arm, "hand", **options)
