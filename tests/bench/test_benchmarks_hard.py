@@ -11,9 +11,9 @@ from benchmarks import curvature
 from benchmarks.data_file import read_csv
 from benchmarks.hard import _motion, _page, _results
 from benchmarks.hard._balance import balance
-from benchmarks.hard._cases import BEYOND, CHUNK, Case, cases, directions, without_turning
+from benchmarks.hard._cases import BEYOND, Case, cases, directions, without_turning
 from benchmarks.hard._judge import Numbers, judged, worst
-from benchmarks.hard._motion import Entrant, Motion, motions
+from benchmarks.hard._motion import Entrant, Motion
 from benchmarks.hard._reach import Search, farthest
 from benchmarks.robots import pinocchio_model, workload
 from benchmarks.workload import DT
@@ -131,22 +131,6 @@ class TestNumbers:
 
 
 class TestMotions:
-    @pytest.mark.release
-    def test_ours_and_minks_are_one_inside(self, work, monkeypatch):
-        """Nothing is out of reach in the first second: all that differs is the damping."""
-        work = without_turning(work, posture=True)
-        case = next(case for case in cases(work) if case.name == "inside")
-        case = dataclasses.replace(case, hand=case.hand[:CHUNK], com=case.com[:CHUNK])
-        ours, theirs = (
-            next(m for m in motions(Entrant("arm7", solver, "float64", True), work, [case]) if m.gain == 200.0)
-            for solver in ("weighted", "mink")
-        )
-        assert ours.path.shape == theirs.path.shape == (CHUNK + 1, 7)
-        assert ours.solved == theirs.solved == 1.0 and min(ours.seconds, theirs.seconds) > 0.0
-        np.testing.assert_array_equal(ours.path[0], theirs.path[0])
-        np.testing.assert_allclose(ours.path, theirs.path, rtol=0, atol=5e-3)
-        assert np.abs(ours.path - work.start).max() > 0.05
-
     def test_what_raises_stands_still(self, work):
         from benchmarks.worker import Loop
 
@@ -157,15 +141,6 @@ class TestMotions:
 
 
 class TestResults:
-    def test_who_takes_part(self):
-        few, many = (_results.entrants(everything=everything) for everything in (False, True))
-        assert len(set(few)) == len(few) and set(few) < set(many)
-        assert {entrant.solver for entrant in few} == {*_motion.SCHEMES, *_motion.PEERS}
-        assert not [e for e in many if e.solver in _motion.OF_POSTURES and not e.posture]
-        assert {e.robot for e in many if e.solver == _motion.HARD_FEET} == {"nao", "g1"}
-        (one,) = _results.entrants(everything=False, only="g1, hierarchy, float64, no")
-        assert one == Entrant("g1", "hierarchy", "float64", False)
-
     @pytest.mark.slow
     def test_hard_feet_are_constraints(self, humanoid):
         tasks = _motion.OurLoop(humanoid, _motion.SCHEMES[_motion.HARD_FEET], posture=True)
@@ -178,15 +153,6 @@ class TestResults:
         _results.keep(tmp_path / "rows.json", rows)
         assert _results.read(tmp_path / "rows.json") == rows
         assert _results.read(tmp_path / "none.json") == []
-
-    def test_tables_mark_what_is_too_much(self):
-        fine = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0))
-        entrant = Entrant("nao", "hierarchy", "float64", False)
-        rows = [_results.Row(entrant, "beyond", g, fine._replace(rms=rms)) for g, rms in ((10.0, 0.05), (200.0, 0.2))]
-        found = _page.tables(rows, times=False)
-        assert "| nao | hierarchy | no | 0.05 / **0.2** |" in found["beyond"]
-        assert "| hierarchy | 1 of 2 | 2 of 2 | 2 of 2 | 0 of 0 |" in found["summary"]
-        assert "µs a step" not in found["beyond"] and "µs a step" in _page.tables(rows, times=True)["beyond"]
 
 
 def test_the_page_and_the_file_have_the_tables_of_the_command():

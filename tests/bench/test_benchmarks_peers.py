@@ -1,7 +1,6 @@
 """The benchmark beside the peers: motions are judged by Pinocchio, wrong ones fail, processes take turns."""
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import mujoco
@@ -12,7 +11,7 @@ from rich.console import Console
 
 import osik_jax as osik
 from benchmarks import figures, gate, motions, report
-from benchmarks.__main__ import LONGEST, QUICK, Selection, affordable, many_robots, one_robot
+from benchmarks.__main__ import LONGEST, affordable
 from benchmarks.descriptions import ROBOTS
 from benchmarks.judge import BOUNDS, failures, judged, verdict
 from benchmarks.peers import ours, peer
@@ -206,21 +205,3 @@ def test_the_gate_sees_what_is_slow_or_wrong():
     )
     found = gate.verdicts(rows, baseline)
     assert "1.6 times the kernel > 1.5" in found["slow"] and "hand" in found["wrong"] and not found["fine"]
-
-
-def test_everyone_is_in_the_program():
-    names = [entrant.name for entrant in one_robot(Selection())]
-    assert {"mink", "pink", "placo", "mjinx", "mink-warp"} < set(names)
-    assert len(names) == len(set(names)) == 5 + 6 + 4  # peers, schemes in precisions, two of them cold
-    entrants = [entrant for group in many_robots(Selection()) for entrant in group]
-    assert len({entrant.name for entrant in entrants}) == len(entrants)
-    mine = [entrant.options["batch"] for entrant in entrants if entrant.peer == "osik_jax"]
-    assert sorted(set(mine)) == [1, 64, 1024, 16384] and len(mine) == 24 + 4
-    for name in ("mjinx", "mink-warp"):
-        assert [entrant.robots for entrant in entrants if entrant.peer == name] == [1, 64, 1024, 16384]
-    group, *alone = many_robots(QUICK)
-    assert [entrant.peer for entrant in group] == ["mink", "pink", "placo", "osik_jax"]
-    assert group[-1].robots == 1024 and group[0].robots == len(cores())
-    assert [[entrant.peer for entrant in each] for each in alone] == [["mjinx"], ["mink-warp"]]
-    (kept, *_), *_ = many_robots(replace(QUICK, resident=True, peers=["osik_jax"]))
-    assert kept.options["resident"] == 4

@@ -10,6 +10,8 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from model_files import MJCF
+from mujoco_states import mujoco_at
 from small_files import files_of_at_most
 
 import osik_jax as osik
@@ -18,21 +20,7 @@ from osik_jax._progress import spoken
 from osik_jax.demo import _demo, _estimate, _folder
 from osik_jax.viewer import _opengl
 
-ARM = """<mujoco><worldbody><body name="base"><geom type="box" size=".1 .1 .1"/>
-<body name="a" pos="0 0 .1"><joint name="j1" axis="0 0 1" range="-90 90"/>
-<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
-<body name="b" pos="0 0 .2"><joint name="j2" axis="0 1 0" range="-90 90"/>
-<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
-<body name="c" pos="0 0 .2"><joint name="j3" axis="0 1 0" range="-90 90"/>
-<geom type="capsule" size=".03 .1" pos="0 0 .1"/>
-<site name="tool" pos="0 0 .2"/></body></body></body></body></worldbody></mujoco>"""
-
-
-@pytest.fixture
-def arm_file(tmp_path):
-    path = tmp_path / "arm.xml"
-    path.write_text(ARM)
-    return path
+ARM_FILE = str(MJCF / "three_joints.xml")
 
 
 def run(*arguments):
@@ -50,13 +38,15 @@ def refused(capsys, *arguments):
     return lines[0]
 
 
-def test_help_names_commands_and_options():
-    everything, demo = run("--help"), run("demo", "--help")
-    assert everything.returncode == demo.returncode == 0
-    assert "demo" in everything.stdout and "info" in everything.stdout
-    for option in ("--motion", "--robot", "--frame", "--support", "--duration", "--frequency", "--schemes", "--out"):
-        assert option in demo.stdout
-    assert "--no-animation" in demo.stdout and "--renderer" in demo.stdout
+def test_help_names_commands_and_options(capsys):
+    everything = run("--help")
+    assert everything.returncode == 0 and "demo" in everything.stdout and "info" in everything.stdout
+    with pytest.raises(SystemExit):
+        cli.main(["demo", "--help"])
+    said = capsys.readouterr().out
+    for option in ("motion", "robot", "frame", "support", "duration", "frequency", "schemes", "out", "renderer"):
+        assert f"--{option}" in said
+    assert "--no-animation" in said
 
 
 def test_version_is_the_packages(capsys):
@@ -95,18 +85,18 @@ def _written(path, text):
     return path
 
 
-def test_unknown_frames_are_listed(capsys, arm_file):
-    line = refused(capsys, "demo", "--robot", str(arm_file), "--frame", "tol")
+def test_unknown_frames_are_listed(capsys):
+    line = refused(capsys, "demo", "--robot", ARM_FILE, "--frame", "tol")
     assert "'tol'" in line and "did you mean 'tool'" in line and "base, a, b, c" in line
-    assert "'foot'" in refused(capsys, "demo", "--robot", str(arm_file), "--support", "foot")
-    assert "both move and stand" in refused(capsys, "demo", "--robot", str(arm_file), "--frame", "c", "--support", "c")
+    assert "'foot'" in refused(capsys, "demo", "--robot", ARM_FILE, "--support", "foot")
+    assert "both move and stand" in refused(capsys, "demo", "--robot", ARM_FILE, "--frame", "c", "--support", "c")
 
 
-def test_options_that_make_no_sense_are_explained(capsys, arm_file):
+def test_options_that_make_no_sense_are_explained(capsys):
     assert "--robot" in refused(capsys, "demo", "--frame", "torso")
     assert "--frequency is 0" in refused(capsys, "demo", "--frequency", "0")
     assert "two control steps" in refused(capsys, "demo", "--duration", "0")
-    line = refused(capsys, "demo", "--robot", str(arm_file), "--motion", "single-support")
+    line = refused(capsys, "demo", "--robot", ARM_FILE, "--motion", "single-support")
     assert "--motion single-support is NAO's" in line and "--frame" in line
     assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")
 
@@ -120,13 +110,13 @@ def test_a_renderer_that_does_not_work_is_explained(capsys, monkeypatch):
     assert "no OpenGL context; use auto or raycast" in refused(capsys, "demo", "--renderer", "mujoco")
 
 
-def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path, arm_file):
+def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):
     blocked = _written(tmp_path / "file", "")
-    line = refused(capsys, "demo", "--robot", str(arm_file), "--out", str(blocked / "out"))
+    line = refused(capsys, "demo", "--robot", ARM_FILE, "--out", str(blocked / "out"))
     assert str(blocked) in line
 
 
-def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tmp_path, arm_file, monkeypatch):
+def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tmp_path, monkeypatch):
     """No file can be made in /proc, not even by root; a disk with hardly any room is told apart."""
 
     def worked(*args, **kwargs):
@@ -135,16 +125,16 @@ def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tm
     monkeypatch.setattr(_demo, "run_demo", worked)
     monkeypatch.setattr(_estimate, "estimate_seconds", worked)
     if os.path.isdir("/proc/self"):
-        assert "cannot write to /proc" in refused(capsys, "demo", "--robot", str(arm_file), "--out", "/proc")
+        assert "cannot write to /proc" in refused(capsys, "demo", "--robot", ARM_FILE, "--out", "/proc")
     free = shutil.disk_usage(tmp_path)._replace(free=3_000_000)
     monkeypatch.setattr(_folder.shutil, "disk_usage", lambda path: free)
-    line = refused(capsys, "demo", "--robot", str(arm_file), "--out", str(tmp_path / "out"))
+    line = refused(capsys, "demo", "--robot", ARM_FILE, "--out", str(tmp_path / "out"))
     assert "has 3.0 MB of room left" in line and "MB are needed" in line
 
 
-def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
+def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path):
     """The system refuses to write files of more than 32 kB: smaller than the comparison."""
-    words = ["demo", "--robot", str(arm_file), "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
+    words = ["demo", "--robot", ARM_FILE, "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
     with files_of_at_most(32_000):
         code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
     told = capsys.readouterr().err.strip().splitlines()
@@ -153,9 +143,9 @@ def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path, arm_file):
 
 
 @pytest.mark.slow
-def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
+def test_an_interrupt_ends_in_one_line(tmp_path):
     """Ctrl-C once the time that it takes has been told."""
-    words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", str(arm_file), "--duration", "60", "--out"]
+    words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", ARM_FILE, "--duration", "60", "--out"]
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with subprocess.Popen(
         [*words, str(tmp_path / "out")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
@@ -169,14 +159,8 @@ def test_an_interrupt_ends_in_one_line(tmp_path, arm_file):
 
 
 def test_times_are_told_no_more_exactly_than_they_are_known():
-    assert [spoken(seconds) for seconds in (0.2, 42.0, 89.0, 100.0, 340.0, 9500.0)] == [
-        "5 s",
-        "40 s",
-        "90 s",
-        "1.5 min",
-        "5.5 min",
-        "2.5 h",
-    ]
+    seconds = (0.2, 42.0, 89.0, 100.0, 340.0, 9500.0)
+    assert [spoken(given) for given in seconds] == ["5 s", "40 s", "90 s", "1.5 min", "5.5 min", "2.5 h"]
 
 
 def test_a_name_without_its_extra_is_one_line(capsys, monkeypatch):
@@ -203,27 +187,12 @@ def test_info_lists_joints_limits_frames_and_mass(capsys):
 
 
 @pytest.mark.release
-def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
+def test_demo_of_a_file_writes_its_folder(capsys, tmp_path):
     out = tmp_path / "out"
-    arguments = [
-        "demo",
-        "--robot",
-        str(arm_file),
-        "--duration",
-        "1.0",
-        "--frequency",
-        "50",
-        "--schemes",
-        "hierarchical",
-    ]
-    assert cli.main([*arguments, "--out", str(out), "--picture"]) == 0
-    assert {path.name for path in out.iterdir()} >= {
-        "motion.gif",
-        "comparison.png",
-        "motion.npz",
-        "report.json",
-        "picture.png",
-    }
+    words = f"demo --robot {ARM_FILE} --duration 1.0 --frequency 50 --schemes hierarchical --picture --out {out}"
+    assert cli.main(words.split()) == 0
+    written = {"motion.gif", "comparison.png", "motion.npz", "report.json", "picture.png"}
+    assert {path.name for path in out.iterdir()} >= written
     summary = json.loads((out / "report.json").read_text())
     told = summary["schemes"]["hierarchical"]
     assert summary["steps"] == 50 and told["hand_once_there_mm"] < 1.0
@@ -232,16 +201,12 @@ def test_demo_of_a_file_writes_its_folder(capsys, tmp_path, arm_file):
     assert "Hierarchical QP" in printed and "hand" in printed
 
 
-def test_ik_finds_a_configuration_or_says_what_stops_it(capsys):
+def test_ik_finds_a_configuration_or_says_what_stops_it(arm, capsys):
     """The printed joints put the hand there, by MuJoCo."""
     assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "0.4", "0.1", "0.5"]) == 0
     out = capsys.readouterr().out
     values = [float(line.split()[5]) for line in out.splitlines() if line.startswith("│ joint")]
-    model = osik.load_robot("arm7").mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = values
-    mujoco.mj_kinematics(model, data)
-    np.testing.assert_allclose(data.site("hand").xpos, [0.4, 0.1, 0.5], atol=1e-3)
+    np.testing.assert_allclose(mujoco_at(arm, values).site("hand").xpos, [0.4, 0.1, 0.5], atol=1e-3)
     assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "4", "0", "0", "--seeds", "2"]) == 1
     assert "out of reach" in capsys.readouterr().out
     assert "no frame 'hnd'" in refused(capsys, "ik", "arm7", "--frame", "hnd", "--position", "0", "0", "0")

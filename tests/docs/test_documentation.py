@@ -18,38 +18,11 @@ README = ROOT / "README.md"
 NOTEBOOKS = ROOT / "docs" / "notebooks.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
-PACKAGES = (
-    "osik_jax",
-    "osik_jax.runtime",
-    "osik_jax.solvers",
-    "osik_jax.schemes",
-    "osik_jax.physics",
-    "osik_jax.demo",
-    "osik_jax.interop.ros2",
-    "osik_jax.viewer",
-    "osik_jax.tuning",
-    "osik_jax.scaling",
-    "osik_jax.retargeting",
-    "osik_jax.reachability",
-    "osik_jax.interop",
-)
-OPTIONAL = (
-    "matplotlib",
-    "tyro",
-    "rich",
-    "torch",
-    "pinocchio",
-    "cyclonedds",
-    "mink",
-    "osik_jax.viewer",
-    "osik_jax.demo",
-    "osik_jax.tuning",
-    "osik_jax.scaling",
-    "osik_jax.retargeting",
-    "osik_jax.reachability",
-    "osik_jax.interop",
-    "optax",
-)
+PARTS = ["viewer", "demo", "tuning", "scaling", "retargeting", "reachability", "interop"]
+PACKAGES = [*PARTS, "runtime", "solvers", "schemes", "physics", "interop.ros2"]
+PACKAGES = ("osik_jax", *(f"osik_jax.{part}" for part in PACKAGES))
+OPTIONAL = ["matplotlib", "tyro", "rich", "torch", "pinocchio", "cyclonedds", "mink", "optax"]
+OPTIONAL += [f"osik_jax.{part}" for part in PARTS]
 
 BLOCK = re.compile(r"^```python(?: title=\"([\w-]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 """A block's title may be one of ``LIBRARIES``; the block runs where that is installed."""
@@ -88,9 +61,9 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-IN_THE_GATE = ("tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch")
-IN_THE_GATE += ("reinforcement_learning", "porting")
-AT_NIGHT = (
+IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
+IN_THE_GATE += ["reinforcement_learning", "porting"]
+AT_NIGHT = [
     "batches",
     "inverse_kinematics",
     "retargeting",
@@ -99,13 +72,12 @@ AT_NIGHT = (
     "tasks_and_limits",
     "tuning",
     "viewer",
-)
+]
 
 
 @pytest.mark.variants(**{t: [f"docs/{p}.md" for p in ps] for t, ps in (("slow", IN_THE_GATE), ("release", AT_NIGHT))})
 @pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, id=relative(page)) for page in PAGES if BLOCK.search(page.read_text())],
+    "page", [pytest.param(page, id=relative(page)) for page in PAGES if BLOCK.search(page.read_text())]
 )
 def test_code_runs(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -134,8 +134,8 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
-IN_THE_GATE = [so101_teleoperation, allegro_grasp]
-AT_NIGHT = [check for check in CHECKS if check not in (*IN_THE_GATE, retarget_a_person)]
+IN_THE_GATE = [so101_teleoperation, allegro_grasp, retarget_a_person]
+AT_NIGHT = [check for check in CHECKS if check not in IN_THE_GATE]
 
 
 @pytest.mark.variants(slow=[check.__name__ for check in IN_THE_GATE], release=[check.__name__ for check in AT_NIGHT])

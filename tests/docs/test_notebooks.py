@@ -42,16 +42,7 @@ def shown_text(output: Any) -> str:
     return re.sub(r"base64,[\w+/=]+", "", text)  # pictures inside a page
 
 
-@pytest.mark.variants(
-    release=[
-        "3_many_at_once",
-        "4_tuning_by_gradient",
-        "6_inverse_kinematics",
-        "2_schemes_compared",
-        "5_the_paper",
-        "7_nao_dances",
-    ]
-)
+@pytest.mark.variants(release=[path.stem for path in SOURCES[1:]])
 @pytest.mark.slow
 @each_notebook
 def test_runs_in_fast_mode(source: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from made_up_arm import SIX_JOINTS
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.core import _build
@@ -244,8 +245,7 @@ def test_other_files_are_refused_with_the_reason(built, tmp_path):
         with pytest.raises(ValueError) as refused:
             Controller(built, path)
         assert message in str(refused.value) and str(refused.value).startswith(str(path)), name
-    with pytest.raises(ValueError, match="none.json: it cannot be read"):
-        Controller(built, tmp_path / "none.json")
+    refuses(ValueError, "none.json: it cannot be read", Controller, built, tmp_path / "none.json")
     robot, tasks = arm()
     hand, frame = tasks["hand"], osik.FrameTask
     lacking: dict[str, dict[str, Any]] = {"the scheme NullSpace": dict(scheme=osik.NullSpace())}
@@ -257,8 +257,7 @@ def test_other_files_are_refused_with_the_reason(built, tmp_path):
     lacking["the task 'hand', which .*LookAtTask"] = dict(hand=osik.LookAtTask(robot, "tool", target=[1.0, 0.0, 0.0]))
     for part, options in lacking.items():
         osik.save_controller(path, robot, {"hand": options.pop("hand", hand)}, **options)
-        with pytest.raises(ValueError, match=f"(?i)the compiled core does not have {part}"):
-            Controller(built, path)
+        refuses(ValueError, f"(?i)the compiled core does not have {part}", Controller, built, path)
 
 
 def test_a_stored_file_is_still_read(built):

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -15,11 +16,6 @@ NOWHERE = np.full(3, np.nan), np.full((3, 3), np.nan)
 def pose(seed: int, turn: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return rng.normal(size=3), Rotation.from_rotvec(turn * rng.normal(size=3)).as_matrix()
-
-
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
 
 
 def test_motion_since_the_press_is_scaled_turned_and_added():
@@ -129,9 +125,6 @@ def test_poses_in_every_form_batches_and_gradients():
 
 
 def test_what_is_wrong_is_refused():
-    with pytest.raises(ValueError, match="scale is -1"):
-        osik.Clutch(pose(0), scale=-1.0)
-    with pytest.raises(ValueError, match=r"shape \(3,\)"):
-        osik.Clutch(pose(0)).step(True, np.zeros(3), pose(0))
-    with pytest.raises(ValueError, match="scale is 0"):
-        osik.Clutch(pose(0)).replace(scale=0.0)
+    refuses(ValueError, "scale is -1", osik.Clutch, pose(0), scale=-1.0)
+    refuses(ValueError, r"shape \(3,\)", osik.Clutch(pose(0)).step, True, np.zeros(3), pose(0))
+    refuses(ValueError, "scale is 0", osik.Clutch(pose(0)).replace, scale=0.0)

@@ -1,7 +1,6 @@
 """Kinematics of Pinocchio in place of MJX's: an adapter, and steps with both."""
 
 from collections.abc import Callable
-from importlib.metadata import files
 from typing import Any
 
 import jax
@@ -9,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+from example_files import example_file
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.interop.kinematics import kinematics_from
-
-
-def urdf(name: str) -> str:
-    return str(next(f for f in files("example-robot-data") or () if f.match(name)).locate())
 
 
 def by_pinocchio(robot: osik.Robot, file: str, floating_base: bool) -> Callable[[Any], osik.Kinematics]:
@@ -61,8 +58,8 @@ ROBOTS = {
 @pytest.fixture(scope="module", params=ROBOTS)
 def other(request: pytest.FixtureRequest) -> tuple[osik.Robot, Callable[[Any], osik.Kinematics], str]:
     name, floating_base, frame = ROBOTS[request.param]
-    robot = osik.Robot.from_urdf(urdf(name), floating_base=floating_base)
-    return robot, by_pinocchio(robot, urdf(name), floating_base), frame
+    robot = osik.Robot.from_urdf(str(example_file(name)), floating_base=floating_base)
+    return robot, by_pinocchio(robot, str(example_file(name)), floating_base), frame
 
 
 def configurations(robot: osik.Robot, rng: np.random.Generator, count: int) -> jax.Array:
@@ -135,8 +132,6 @@ def test_wrong_arrays_are_named() -> None:
     jacobian = osik.frame_jacobian(robot, kinematics, robot.body_names)
     with pytest.raises(ValueError, match=r"jacobian has shape \(6, 7\); expected \("):
         kinematics_from(robot, position, rotation, jacobian[0])
-    with pytest.raises(ValueError, match="position has shape"):
-        kinematics_from(robot, kinematics.body_position, rotation, jacobian)
+    refuses(ValueError, "position has shape", kinematics_from, robot, kinematics.body_position, rotation, jacobian)
     locked = osik.load_robot("arm7", locked_joints=robot.joint_names[:1])
-    with pytest.raises(ValueError, match="without locked and following joints"):
-        kinematics_from(locked, position, rotation, jacobian)
+    refuses(ValueError, "without locked and following joints", kinematics_from, locked, position, rotation, jacobian)

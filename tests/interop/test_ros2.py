@@ -2,9 +2,10 @@
 
 from types import SimpleNamespace as Message
 
-import mujoco
 import numpy as np
 import pytest
+from mujoco_states import mujoco_at
+from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -65,9 +66,10 @@ class Run:
         return np.array([o.command.positions for o in self.outputs if o.command is not None])
 
 
-@pytest.fixture(scope="module")
-def arm():
-    return osik.load_robot("arm7")
+def started(controller, joints=None):
+    run = Run(controller, joints)
+    run.tick()
+    return run
 
 
 @pytest.fixture(scope="module")
@@ -121,8 +123,7 @@ class TestNames:
         controller = Controller(arm, Settings(names={"panda_joint2": "joint2"}))
         assert controller.joints.names[:3] == ("joint1", "panda_joint2", "joint3")
         assert Run(controller).tick().command.names == controller.joints.names
-        with pytest.raises(KeyError, match="no joint 'joint9'"):
-            Controller(arm, Settings(names={"a": "joint9"}))
+        refuses(KeyError, "no joint 'joint9'", Controller, arm, Settings(names={"a": "joint9"}))
 
     @pytest.mark.parametrize(
         "change, reason",
@@ -137,8 +138,7 @@ class TestNames:
         ],
     )
     def test_a_broken_state_is_refused_and_said(self, controller, change, reason):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         before = run.memory
         broken = state(run.now, run.joints)
         change(broken.message)
@@ -156,8 +156,7 @@ class TestStart:
 
     def test_speeds_and_accelerations_are_bounded_from_the_first_command_on(self, arm):
         settings = Settings(speed=0.8, acceleration=6.0)
-        run = Run(Controller(arm, settings))
-        run.tick()
+        run = started(Controller(arm, settings))
         run.tick(to_hand(run, [0.3, 0.4, -0.2]))
         run.ticks(500)
         q = run.positions()
@@ -169,18 +168,14 @@ class TestStart:
         assert (q >= lower).all() and (q <= upper).all()
 
     def test_a_target_is_reached(self, controller):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         position, rotation = run.pose("hand")
         wanted = position + np.array([0.05, -0.1, 0.05]), Rotation.from_euler("x", 0.3).as_matrix() @ rotation
         run.tick(lambda now: target(now, "hand", *wanted))
         run.ticks(800)
-        model = controller.robot.mj_model
-        data = mujoco.MjData(model)
-        data.qpos[:] = [run.joints[name] for name in controller.joints.names]
-        mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.site("hand").xpos, wanted[0], atol=1e-3)
-        np.testing.assert_allclose(data.site("hand").xmat.reshape(3, 3), wanted[1], atol=5e-3)
+        hand = mujoco_at(controller.robot, [run.joints[name] for name in controller.joints.names]).site("hand")
+        np.testing.assert_allclose(hand.xpos, wanted[0], atol=1e-3)
+        np.testing.assert_allclose(hand.xmat.reshape(3, 3), wanted[1], atol=5e-3)
 
     def test_a_joint_outside_its_range_returns_at_a_bounded_speed(self, controller):
         top = float(controller.robot.position_upper[1])
@@ -197,8 +192,7 @@ class TestStart:
         osik.save_controller(tmp_path / "c.json", arm, tasks, scheme=osik.NullSpace(), dt=0.01, source="arm7")
         controller = Controller(None, Settings(controller=str(tmp_path / "c.json")))
         assert controller.dt == 0.01 and controller.frames == ("hand",)
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         run.tick(to_hand(run, [1.5, 1.0, 0.0]))
         run.ticks(300)
         q = run.positions()
@@ -209,8 +203,7 @@ class TestStart:
 
 class TestHold:
     def test_the_command_stands_still_within_100_ms_of_the_last_state(self, controller):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         run.tick(to_hand(run, [0.2, 0.3, 0.0]))
         run.ticks(40)
         last = len(run.outputs)
@@ -238,8 +231,7 @@ class TestHold:
         assert run.outputs[-1].phase == "holding" and "not newer" in run.outputs[-1].message
 
     def test_it_begins_anew_at_what_is_measured_then_and_forgets_targets(self, controller):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         run.tick(to_hand(run, [0.2, 0.3, 0.0]))
         run.ticks(20)
         run.ticks(20, states=False)
@@ -250,8 +242,7 @@ class TestHold:
         np.testing.assert_allclose(run.positions()[-50:], np.tile(measured, (50, 1)), atol=1e-9)
 
     def test_it_waits_for_a_robot_that_does_not_follow(self, controller):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         start = run.outputs[-1].command.positions
         run.tick(to_hand(run, [0.2, 0.3, 0.0]), moves=False)
         output = run.ticks(400, moves=False)
@@ -276,8 +267,7 @@ class TestTargets:
         ],
     )
     def test_that_are_wrong_are_refused_and_move_nothing(self, controller, options, reason):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         options = {"position": run.pose("hand")[0] + 0.1, **options}
         output = run.tick(lambda now: target(now, "hand", **options))
         assert output.level == 1 and reason in output.message
@@ -286,8 +276,7 @@ class TestTargets:
         assert run.ticks(200).level == 0  # it is told for a second
 
     def test_a_late_target_does_not_replace_a_newer_one(self, controller):
-        run = Run(controller)
-        run.tick()
+        run = started(controller)
         goal = run.pose("hand")[0] + 0.05
         run.tick(lambda now: target(now, "hand", goal))
         run.tick(lambda now: target(now, "hand", goal + 1.0, stamp=now - 2 * PERIOD))
@@ -295,45 +284,32 @@ class TestTargets:
         assert "not newer" in run.outputs[-1].message
 
     def test_without_stamps_where_the_settings_say_so(self, arm):
-        run = Run(Controller(arm, Settings(check_stamps=False)))
-        run.tick()
+        run = started(Controller(arm, Settings(check_stamps=False)))
         run.tick(lambda now: target(now, "hand", [0.4, 0.0, 0.5], stamp=0))
         assert run.outputs[-1].level == 0
         np.testing.assert_array_equal(run.memory.targets["hand"][0], [0.4, 0.0, 0.5])
 
     def test_in_the_frame_of_a_base_that_moves_freely(self, nao):
-        run = Run(nao, {"LKneePitch": 0.6, "LAnklePitch": -0.3, "LHipPitch": -0.3})
-        run.tick()
-        data = measured_nao(nao, run)
-        body = data.body("torso")
+        run = started(nao, {"LKneePitch": 0.6, "LAnklePitch": -0.3, "LHipPitch": -0.3})
+        body = mujoco_at(nao.robot, run.memory.q).body("torso")
         local = np.array([0.15, 0.1, 0.1])
         run.tick(lambda now: target(now, "l_gripper", local, frame_id="torso"))
         expected = body.xpos + body.xmat.reshape(3, 3) @ local
         np.testing.assert_allclose(run.memory.targets["l_gripper"][0], expected, atol=1e-9)
 
 
-def measured_nao(controller, run):
-    """MuJoCo's poses at the controller's configuration."""
-    model = controller.robot.mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = controller.robot.mujoco_qpos(run.memory.q)
-    mujoco.mj_kinematics(model, data)
-    return data
-
-
 def test_a_robot_on_feet_stands_where_it_stood_at_home_and_keeps_its_feet(nao):
     """One knee is bent as measured: the base is put where the left sole stands as at home, and the soles stay."""
-    run = Run(nao, {"LKneePitch": 0.6, "LAnklePitch": -0.3, "LHipPitch": -0.3})
-    run.tick()
-    start = measured_nao(nao, run)
+    run = started(nao, {"LKneePitch": 0.6, "LAnklePitch": -0.3, "LHipPitch": -0.3})
     robot = nao.robot
+    start = mujoco_at(robot, run.memory.q)
     home = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, "l_sole")
     np.testing.assert_allclose(start.site("l_sole").xpos, home[0], atol=1e-9)
     np.testing.assert_allclose(start.site("l_sole").xmat.reshape(3, 3), home[1], atol=1e-9)
     goal = run.pose("l_gripper")[0] + [0.03, 0.03, -0.05]
     run.tick(lambda now: target(now, "l_gripper", goal, run.pose("l_gripper")[1]))
     run.ticks(600)
-    end = measured_nao(nao, run)
+    end = mujoco_at(robot, run.memory.q)
     for sole in ("l_sole", "r_sole"):
         np.testing.assert_allclose(end.site(sole).xpos, start.site(sole).xpos, atol=1e-3)
     np.testing.assert_allclose(end.body("l_gripper").xpos, goal, atol=5e-3)
@@ -359,17 +335,14 @@ def test_a_clutch_moves_nothing_when_pressed_and_scales_motion(arm):
 
 class TestSettings:
     def test_positions_need_the_order_of_their_receiver(self, arm):
-        with pytest.raises(ValueError, match="has no names"):
-            Settings(commands="positions")
+        refuses(ValueError, "has no names", Settings, commands="positions")
         order = tuple(f"joint{number}" for number in (7, 1, 6, 2, 5, 3, 4))
         run = Run(Controller(arm, Settings(commands="positions", joints=order)), {"joint7": 0.7, "joint1": 0.1})
         command = run.tick().command
         assert command.names == order
         np.testing.assert_allclose(command.positions[:2], [0.7, 0.1], atol=1e-9)
-        with pytest.raises(KeyError, match="no joint 'joint8'"):
-            Controller(arm, Settings(joints=("joint8",)))
-        with pytest.raises(ValueError, match="twice"):
-            Controller(arm, Settings(joints=("joint1", "joint1")))
+        refuses(KeyError, "no joint 'joint8'", Controller, arm, Settings(joints=("joint8",)))
+        refuses(ValueError, "twice", Controller, arm, Settings(joints=("joint1", "joint1")))
 
     @pytest.mark.parametrize(
         "text, message",
@@ -387,8 +360,7 @@ class TestSettings:
     )
     def test_what_a_file_gets_wrong_is_named(self, tmp_path, text, message):
         (tmp_path / "s.toml").write_text(text)
-        with pytest.raises((ValueError, KeyError, TypeError), match=message.replace("?", r"\?")):
-            read_settings(tmp_path / "s.toml")
+        refuses((ValueError, KeyError, TypeError), message.replace("?", r"\?"), read_settings, tmp_path / "s.toml")
 
     def test_a_file_is_read(self, tmp_path):
         text = (
@@ -401,10 +373,8 @@ class TestSettings:
         assert settings.controller == str(tmp_path / "c.json")
 
     def test_frames_that_do_not_exist_or_cannot_be_led_are_named(self, arm):
-        with pytest.raises(KeyError, match="'hnad'"):
-            Controller(arm, Settings(frames=("hnad",)))
-        with pytest.raises(ValueError, match="in support or in frames"):
-            Controller(osik.load_robot("nao"), Settings(frames=("l_sole",)))
+        refuses(KeyError, "'hnad'", Controller, arm, Settings(frames=("hnad",)))
+        refuses(ValueError, "in support or in frames", Controller, osik.load_robot("nao"), Settings(frames=("l_sole",)))
 
     def test_names_of_topics(self):
         assert dds_name("/osik/targets/hand") == "rt/osik/targets/hand"
@@ -413,5 +383,4 @@ class TestSettings:
             and topic_of_frame("/t", "2nd") == "/t/_2nd"
         )
         for wrong in ("joint_states", "/a b", "/1a", "/a/", "/"):
-            with pytest.raises(ValueError, match="no absolute name"):
-                dds_name(wrong)
+            refuses(ValueError, "no absolute name", dds_name, wrong)

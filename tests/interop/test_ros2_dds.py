@@ -101,15 +101,10 @@ class Session:
         (folder / "settings.toml").write_text(f"rate = {rate}\n")
         command = [
             sys.executable,
-            "-m",
-            "osik_jax.cli",
-            "ros2",
-            "--robot",
-            "arm7",
-            "--config",
+            *["-m", "osik_jax.cli", "ros2", "--robot", "arm7", "--config"],
             folder / "settings.toml",
         ]
-        options = ["--domain", str(domain), "--loopback", "--record", self.bag]
+        options = ["--config", folder / "settings.toml", "--domain", str(domain), "--loopback", "--record", self.bag]
         robot = subprocess.Popen([sys.executable, ROBOT, str(domain), str(rate)])
         node = subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True)
         try:
@@ -167,17 +162,17 @@ def session(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_robot_in_another_process_follows_targets_by_name(session):
+def test_a_robot_in_another_process_follows_targets_by_name(session, arm):
     assert session.exit_code == 0
     assert session.commands[-1].joint_names == [f"joint{number}" for number in range(1, 8)]
     assert session.states[-1].name == [f"joint{number}" for number in range(7, 0, -1)]
-    arm = osik.load_robot("arm7")
     last = dict(zip(session.states[-1].name, session.states[-1].position, strict=True))
     hand = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.configuration(last)), "hand")[0]
     np.testing.assert_allclose(np.asarray(hand)[[0, 2]], [0.45, 0.5], atol=0.05)
     assert np.ptp([m.points[0].positions[0] for m in session.commands]) > 0.2
 
 
+@pytest.mark.slow
 def test_it_starts_where_the_robot_is_and_keeps_its_limits(session):
     from ros2_robot import START
 
@@ -187,6 +182,7 @@ def test_it_starts_where_the_robot_is_and_keeps_its_limits(session):
     assert np.abs(speed).max() <= 1.0 + 1e-9 and np.abs(speed).max() > 0.3
 
 
+@pytest.mark.slow
 def test_a_robot_that_is_killed_is_held_within_100_ms(session):
     times, q, velocity = session.recorded()
     moving = np.abs(velocity).max(1) > 0.0
@@ -211,6 +207,7 @@ def test_a_bag_gives_the_same_commands_again_to_the_last_bit(session, capsys):
     assert dds.replay(other, session.bag).difference > 0.01
 
 
+@pytest.mark.slow
 def test_another_reader_reads_the_bag(session):
     decoder = pytest.importorskip("mcap_ros2.decoder")
     from mcap.reader import make_reader

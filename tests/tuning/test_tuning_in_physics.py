@@ -101,8 +101,7 @@ def test_what_the_bound_is_for(tuned):
     assert fell or tilt > 3.0 or slip > 0.005
 
 
-def test_targets_by_step_are_those_of_a_function_of_time():
-    arm = osik.load_robot("arm7")
+def test_targets_by_step_are_those_of_a_function_of_time(arm):
     world = physics.build_world(arm, servos={"*": physics.Servo(600.0, 50.0)})
     hand = osik.FrameTask(arm, "hand", rows="position", gain=5.0)
     home, rotation = hand.target

@@ -20,9 +20,8 @@ SCHEMES = {
 
 @pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
 @pytest.mark.parametrize("name", SCHEMES)
-def test_the_step_is_the_gradient(name):
+def test_the_step_is_the_gradient(name, arm):
     """Plain descent with rate 1, against central differences of the loss that the same program reports."""
-    arm = osik.load_robot("arm7")
     tasks = {
         "hand": osik.FrameTask(arm, "hand", rows="position", gain=osik.AdaptiveGain(6.0, 2.0, 3.0)),
         "elbow": osik.FrameTask(arm, "link4", rows="position", gain=3.0, priority=2),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from other_processes import finish, free_port, start
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import tuning
@@ -96,19 +97,8 @@ def test_two_processes_tune_as_one(eight):
     assert_same(first, eight["one"])
 
 
-def test_mistakes():
-    arm = osik.load_robot("arm7")
-    loop = tuning.Loop(
-        arm,
-        {"posture": osik.PostureTask(arm, weight=1.0)},
-        scheme=osik.NullSpace(),
-        limits=osik.no_limits,
-        dt=0.05,
-        steps=1,
-    )
-    mesh: Any = 8
-    scenarios = tuning.Scenarios(q0=arm.q0[None])
-    with pytest.raises(TypeError, match=r"mesh is 8; it is a jax\.sharding\.Mesh"):
-        tuning.tune(tuning.Effort(), ["posture.gain"], scenarios, loop=loop, mesh=mesh)
-    with pytest.raises(TypeError, match=r"mesh is 8; it is a jax\.sharding\.Mesh"):
-        tuning.evaluate(tuning.Effort(), loop, scenarios, mesh=mesh)
+def test_mistakes(arm):
+    loop = tuning.Loop(arm, {"posture": osik.PostureTask(arm)}, scheme=osik.NullSpace(), limits=osik.no_limits, steps=1)
+    scenarios, message = tuning.Scenarios(q0=arm.q0[None]), r"mesh is 8; it is a jax\.sharding\.Mesh"
+    refuses(TypeError, message, tuning.tune, tuning.Effort(), ["posture.gain"], scenarios, loop=loop, mesh=8)
+    refuses(TypeError, message, tuning.evaluate, tuning.Effort(), loop, scenarios, mesh=8)
