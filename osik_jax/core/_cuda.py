@@ -129,6 +129,7 @@ _METHODS = {
     "center_of_mass": "move_centers",
     "center_rows": "find_center_rows",
     "pose_rows": "find_pose_rows",
+    "frame_rows": "find_frame_rows",
 }
 
 

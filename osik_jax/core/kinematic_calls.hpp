@@ -1,4 +1,4 @@
-// Kinematics and rows of tasks of a batch: what kinematics/_kernels.py, tasks/_pose.py and tasks/_com.py call.
+// Kinematics and rows of tasks of a batch: what kinematics/_kernels.py, tasks/_pose.py, tasks/_frame.py and tasks/_com.py call.
 //
 // A call has arguments and results with a leading axis of lanes, or of length 1 where all lanes share one argument:
 //   size(k, axis), result_size(k, axis)   the length of an axis of argument or result k
@@ -119,18 +119,42 @@ template <class Call> void find_center_rows(const Call& call) {
   });
 }
 
+// What a pose task asks for: its target, velocity, weights and gain, one after another, and eight options.
+template <class In> PoseGoal<In> pose_goal(Reader<In> numbers, int m, const int* options) {
+  PoseGoal<In> goal{};
+  goal.position = numbers.take(3), goal.rotation = numbers.take(9), goal.velocity = numbers.take(6);
+  goal.weight = numbers.take(m), goal.gain = numbers.at, goal.kept = options;
+  goal.in_frame = options[6] != 0, goal.geometric = options[7] != 0;
+  return goal;
+}
+
 // Arguments as in tasks/_pose.py.
 template <class Call> void find_pose_rows(const Call& call) {
   using In = typename Call::In;
   const int m = call.result_size(1, 1), nv = call.result_size(1, 2);
-  const int* options = call.integers(4);
   call.each_lane([&](int lane) {
-    Reader<In> numbers{call.in(3, lane)};
-    PoseGoal<In> goal{};
-    goal.position = numbers.take(3), goal.rotation = numbers.take(9), goal.velocity = numbers.take(6);
-    goal.weight = numbers.take(m), goal.gain = numbers.at, goal.kept = options;
-    goal.in_frame = options[6] != 0, goal.geometric = options[7] != 0;
-    pose_rows(goal, call.in(0, lane), call.in(1, lane), call.in(2, lane), nv, rows_of(call, lane));
+    const auto goal = pose_goal(Reader<In>{call.in(3, lane)}, m, call.integers(4));
+    const StoredColumns<In> columns{call.in(2, lane), nv};
+    pose_rows(goal, call.in(0, lane), call.in(1, lane), columns, nv, rows_of(call, lane));
+  });
+}
+
+// Arguments as in tasks/_frame.py.
+template <class Call> void find_frame_rows(const Call& call) {
+  using In = typename Call::In;
+  using Real = typename Call::Real;
+  const int m = call.result_size(1, 1), nv = call.result_size(1, 2);
+  const int body = *call.integers(6), *moved = call.integers(6) + 1;
+  call.each_lane([&](int lane) {
+    Reader<In> numbers{call.in(5, lane)};
+    const In factor = numbers.take(nv), offset = numbers.take(3), turn = numbers.take(9);
+    const auto there = placed(call, lane);
+    const auto carrier = Mat3<Real>::of(there.rotation + 9 * body);
+    const auto at = Vec3<Real>::of(there.position + 3 * body) + carrier * Vec3<Real>::of(offset);
+    Real position[3], rotation[9];
+    at.put(position + 0), (carrier * Mat3<Real>::of(turn)).put(rotation + 0);
+    const CarriedColumns<In, In> columns{there, factor, moved, at};
+    pose_rows(pose_goal(numbers, m, moved + nv), position + 0, rotation + 0, columns, nv, rows_of(call, lane));
   });
 }
 }  // namespace osik

@@ -96,6 +96,20 @@ template <class In> struct DofColumns {
   In factor;          // [dofs]
 };
 
+// A velocity, and an angular velocity.
+template <class Real> struct Twist {
+  Vec3<Real> linear, angular;
+};
+
+// The motion of a point at `at` for a unit velocity of a full dof that carries it, times a factor.
+template <class From, class Real>
+Twist<Real> motion_of(const Placed<From>& placed, int dof, Vec3<Real> at, Real factor) {
+  using V = Vec3<Real>;
+  const V axis = V::of(placed.angular + 3 * dof);
+  const V speed = V::of(placed.linear + 3 * dof) + cross(axis, at - V::of(placed.anchor + 3 * dof));
+  return {factor * speed, factor * axis};
+}
+
 // A point and a frame that go along with a body, and the Jacobian J [6, nv] of the point: rows [linear; angular].
 // body_position: [3], body_rotation: [9]; offset: [3] and turn: [9] of the frame in its body; moved: [dofs] flags
 template <class In, class From, class Out>
@@ -111,11 +125,9 @@ void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, I
   for (int dof = 0; dof < d.dofs; ++dof) {
     const int column = d.column[dof];
     if (column < 0 || !(moved[dof] || alone)) continue;
-    const V axis = V::of(placed.angular + 3 * dof);
-    const V speed = V::of(placed.linear + 3 * dof) + cross(axis, at - V::of(placed.anchor + 3 * dof));
-    const Real factor = d.factor[dof];
+    const auto [speed, axis] = motion_of(placed, dof, at, Real(d.factor[dof]));
     Out to = J + column;
-    auto add = [&](Real v) { to[0] = alone ? (moved[dof] ? factor * v : Real(0)) : to[0] + factor * v, to += d.nv; };
+    auto add = [&](Real v) { to[0] = alone ? (moved[dof] ? v : Real(0)) : to[0] + v, to += d.nv; };
     add(speed.x), add(speed.y), add(speed.z), add(axis.x), add(axis.y), add(axis.z);
   }
 }

@@ -30,5 +30,6 @@ void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place
 void* osik_moving_frames(xla::CallFrame* frame) { return xla::handle<of_lanes<move_frames<Lanes>>>(frame); }
 void* osik_center_of_mass(xla::CallFrame* frame) { return xla::handle<of_lanes<move_centers<Lanes>>>(frame); }
 void* osik_center_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_center_rows<Lanes>>>(frame); }
+void* osik_frame_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_frame_rows<Lanes>>>(frame); }
 void* osik_pose_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_pose_rows<Lanes>>>(frame); }
 }

@@ -263,7 +263,7 @@ class Step {
                    jacobian + 6 * nv * f);
       }
       if (count == 2) see_from_root(at, turn, jacobian);
-      if (task.valid) pose_rows(goal, at, turn, jacobian, nv, task.rows);
+      if (task.valid) pose_rows(goal, at, turn, StoredColumns<const double*>{jacobian, nv}, nv, task.rows);
     } else if (task.kind == CENTER) {  // options: whether there is a polygon, axes, whether each body counts
       CenterGoal<const double*> goal{m, options + 1, turning, nullptr, velocity, task.weight, &gain};
       for (int i = 0; i < m; ++i) task.weight[i] = weights[i];

@@ -56,26 +56,46 @@ template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real*
   return squared > 0 ? size * sqrt(squared) : 0;
 }
 
+// The columns of a frame's Jacobian J [6, nv], which are there.
+template <class At> struct StoredColumns {
+  using Real = NumberAt<At>;
+  At J;
+  int nv;
+  Twist<Real> operator[](int j) const {
+    return {{J[j], J[nv + j], J[2 * nv + j]}, {J[3 * nv + j], J[4 * nv + j], J[5 * nv + j]}};
+  }
+};
+
+// The same of a frame at a point, computed where they are asked for; each dof has a column of its own.
+template <class In, class From> struct CarriedColumns {
+  using Real = NumberAt<From>;
+  Placed<From> placed;
+  In factor;         // [nv]
+  const int* moved;  // [nv] flags
+  Vec3<Real> at;
+  Twist<Real> operator[](int j) const { return moved[j] ? motion_of(placed, j, at, Real(factor[j])) : Twist<Real>{}; }
+};
+
 // A bound on the curvature of a pose's error along force and torque on the frame: tasks/_curvature.py, pose_curvature.
-template <class Real, class In> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, In J, int nv) {
+template <class Real, class Columns> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, const Columns& J, int nv) {
   Real axes[6] = {}, arms[6] = {};
   auto add = [](Real* sums, Real x, Real y, Real z) {
     sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
   };
   for (int j = 0; j < nv; ++j) {
-    const Real x = J[3 * nv + j], y = J[4 * nv + j], z = J[5 * nv + j];
-    if (x == 0 && y == 0 && z == 0) continue;
-    add(axes, x, y, z), add(arms, J[j], J[nv + j], J[2 * nv + j]);
+    const auto [moves, axis] = J[j];
+    if (axis.x == 0 && axis.y == 0 && axis.z == 0) continue;
+    add(axes, axis.x, axis.y, axis.z), add(arms, moves.x, moves.y, moves.z);
   }
   return (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
 }
 
-// Rows of a pose task, from the frame's position [3], rotation [9] and Jacobian J [6, nv].
+// Rows of a pose task, from the frame's position [3], rotation [9] and the columns of its Jacobian.
 //
 // The error of the position is p - p*; that of the rotation R is the logarithm e of R R*', or of R*'R in the frame's
 // axes. Its rate is E w: E the inverse left Jacobian of SO(3) at e, w the angular velocity; in the frame's axes E'R' w.
-template <class In, class From, class Out>
-void pose_rows(const PoseGoal<In>& goal, From position, From rotation, From J, int nv, const Rows<Out>& to) {
+template <class In, class From, class Columns, class Out>
+void pose_rows(const PoseGoal<In>& goal, From position, From rotation, const Columns& J, int nv, const Rows<Out>& to) {
   using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   using M = Mat3<Real>;
@@ -91,7 +111,7 @@ void pose_rows(const PoseGoal<In>& goal, From position, From rotation, From J, i
   const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
   Real squares[6] = {};
   for (int j = 0; j < nv; ++j) {
-    const V moves{J[j], J[nv + j], J[2 * nv + j]}, axis{J[3 * nv + j], J[4 * nv + j], J[5 * nv + j]};
+    const auto [moves, axis] = J[j];
     const V v = goal.in_frame ? own * (moves + cross(offset, axis)) : moves, w = factor * axis;
     const Real column[6] = {v.x, v.y, v.z, w.x, w.y, w.z};
     Real lever = 0;

@@ -24,7 +24,7 @@ from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, equality_rows, task_rows
 
 
 class ComTask(Task):
@@ -104,9 +104,7 @@ class ComTask(Task):
         if kinematics.backend != "jax" and self.target is not None and not isinstance(self.gain, AdaptiveGain):
             mass = body_masses(robot, self.subtree)
             alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
-            error, rows, wanted, weight, bound, pull, arms, squares = _by_kernel(self, *alike)
-            fields = error, rows, wanted, wanted, weight, bound, pull, arms
-            return TaskRows(*fields, is_equality=True, squares=squares)
+            return equality_rows(*_by_kernel(self, *alike))
         return self._plain_rows(robot, kinematics)
 
     def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..execution._backends import Backend
+from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics
+from ..kinematics._forward import moving_frames
+from ..kinematics._kernels import Call, dof_columns
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
-from ._pose import PoseTask
+from ._pose import Fields, PoseTask, fields_of, goal_arguments, pose_fields, shapes_of
 from ._targets import PoseLike
-from ._task import DEFAULT_GAIN, TaskRows
+from ._task import DEFAULT_GAIN, TaskRows, equality_rows
 
 
 class FrameTask(PoseTask):
@@ -112,6 +118,13 @@ class FrameTask(PoseTask):
         """Return the name of the frame."""
         return (self.frame,)
 
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Return error, Jacobian and wanted velocities at configuration q with given kinematics."""
+        columns, _ = dof_columns(robot.tree)
+        if self._in_core(kinematics.backend) and np.array_equal(columns, np.arange(robot.tree.nv)):
+            return equality_rows(*_by_kernel(self, robot, replace(kinematics, backend="jax")))
+        return super().rows(robot, kinematics, q)
+
     def rows_at(
         self,
         positions: Float[Array, "1 3"],
@@ -125,3 +138,22 @@ class FrameTask(PoseTask):
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         del q
         return dict(target=kinematics.frame_pose(robot, self.frame))
+
+
+def _fields(task: FrameTask, robot: Robot, kinematics: Kinematics) -> Fields:
+    return pose_fields(task, *(a[0] for a in moving_frames(robot, kinematics, task.frames)))
+
+
+def _fields_by_kernel(call: Call, task: FrameTask, robot: Robot, kinematics: Kinematics) -> Fields:
+    """Return the fields of a batch of robots in which each dof has a column of its own, computed by the core."""
+    tree = robot.tree
+    frame = tree.frame(task.frame)
+    body = tree.frame_bodies[frame]
+    goal, options, weight = goal_arguments(task)
+    place = dof_columns(tree)[1][None], robot.frame_position[:, frame], robot.frame_rotation[:, frame]
+    integers = np.concatenate([[body], tree.moves[body], options]).astype(np.int32)
+    given = *jax.tree.leaves(kinematics), side_by_side(*place, *goal), integers
+    return fields_of(call("frame_rows", shapes_of(task, tree.nv, given), *given), weight)
+
+
+_by_kernel = by_kernel(_fields, _fields_by_kernel)

@@ -23,7 +23,7 @@ from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._targets import Pose, PoseLike, as_pose
-from ._task import TaskRows, check_priority, task_rows
+from ._task import TaskRows, check_priority, equality_rows, task_rows
 from ._twist import pose_log, seen_from
 
 _ROWS = {
@@ -117,11 +117,13 @@ class PoseTask(FramedTask):
 
         Pose, target and Jacobian are in the outer axes: the world's, or those of the frame that the pose is in.
         """
-        if backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain)):
-            error, rows, wanted, weight, curvature, pull, arms, squares = _by_kernel(self, position, rotation, jacobian)
-            fields = error, rows, wanted, wanted, weight, curvature, pull, arms
-            return TaskRows(*fields, is_equality=True, squares=squares)
+        if self._in_core(backend):
+            return equality_rows(*_by_kernel(self, position, rotation, jacobian))
         return self._plain_rows(position, rotation, jacobian)
+
+    def _in_core(self, backend: Backend) -> bool:
+        """Return whether the compiled core may compute the rows."""
+        return backend != "jax" and not (self.coupled or self.bounded or isinstance(self.gain, AdaptiveGain))
 
     def _plain_rows(
         self, position: Float[Array, "3"], rotation: Float[Array, "3 3"], jacobian: Float[Array, "6 nv"]
@@ -214,33 +216,47 @@ class PoseTask(FramedTask):
         check_bounds(self.lower, self.upper)
 
 
-def _fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> tuple[Array, ...]:
-    """Return the fields of ``TaskRows`` for an equality pose task; ``lower`` is used for both bounds."""
+Fields = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
+
+
+def pose_fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:
+    """Return the arguments of ``equality_rows`` for a pose task."""
     rows = task._plain_rows(position, rotation, jacobian)
     fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
     return *fields, rows.squared_lengths()
 
 
-def _fields_by_kernel(
-    call: Call, task: PoseTask, position: Array, rotation: Array, jacobian: Array
-) -> tuple[Array, ...]:
-    """Return the fields of ``_fields`` for a batch of frames, computed by the core."""
+def _fields_by_kernel(call: Call, task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:
+    """Return ``pose_fields`` for a batch of frames, computed by the core."""
+    numbers, options, weight = goal_arguments(task)
+    given = position, rotation, jacobian, side_by_side(*numbers), options
+    return fields_of(call("pose_rows", shapes_of(task, jacobian.shape[-1], given), *given), weight)
+
+
+def goal_arguments(task: PoseTask) -> tuple[tuple[Array, ...], np.ndarray, Float[Array, "lanes m"]]:
+    """Return the numbers and the options of a batch of tasks as the core takes them, and their weights."""
     assert not isinstance(task.gain, AdaptiveGain)
-    kept = np.flatnonzero(task.kept)
     both = jnp.concatenate([task.position_weight, task.orientation_weight], 1) * task.weight[:, None]
-    weight = jnp.concatenate([both[:, i, None] for i in kept], 1)
-    numbers = side_by_side(*task.target, task.target_velocity, weight, task.gain)
-    given = (position, rotation, jacobian, numbers)
-    lanes, count, nv = max(len(a) for a in given), len(kept), jacobian.shape[-1]
+    weight = jnp.concatenate([both[:, i, None] for i in np.flatnonzero(task.kept)], 1)
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
+    return (*task.target, task.target_velocity, weight, task.gain), options, weight
+
+
+def shapes_of(task: PoseTask, nv: int, given: tuple[Any, ...]) -> list[tuple[tuple[int, ...], Any]]:
+    """Return the shapes and types of the core's results for these arguments."""
+    count, lanes = sum(task.kept), max(len(a) for a in given if jnp.issubdtype(a.dtype, jnp.floating))
     shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (lanes, count)
-    error, rows, wanted, curvature, pull, levers, squares = call(
-        "pose_rows", [(shape, float) for shape in shapes], *given, options
-    )
+    return [(shape, float) for shape in shapes]
+
+
+def fields_of(results: list[Array], weight: Float[Array, "lanes m"]) -> Fields:
+    """Return the arguments of ``equality_rows`` from the core's results."""
+    error, rows, wanted, *rest = results
+    curvature, pull, levers, squares = rest
     return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
 
 
-_by_kernel = by_kernel(_fields, _fields_by_kernel)
+_by_kernel = by_kernel(pose_fields, _fields_by_kernel)
 
 
 def _axes(axes: str | None, outer_axes: str, error: str) -> str:

@@ -33,10 +33,14 @@ _APART = {"frame", "root", "target_frame", "priority", "hard"}
 def rows_of(
     robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], tasks: Mapping[str, Task]
 ) -> dict[str, TaskRows]:
-    """Return ``task.rows`` of each task; frame tasks of the same structure are evaluated in one batch."""
+    """Return ``task.rows`` of each task; frame tasks of the same structure are evaluated in one batch.
+
+    A GPU's kernels keep lanes last in memory, and tasks apart.
+    """
+    apart = kinematics.backend != "jax" and cuda_is_default()
     groups: dict[Hashable, dict[str, FramedTask]] = {}
     for name, task in tasks.items():
-        if isinstance(task, FramedTask) and type(task) in _TOGETHER:
+        if isinstance(task, FramedTask) and type(task) in _TOGETHER and not apart:
             groups.setdefault(_manner(task), {})[name] = task
     found: dict[str, TaskRows] = {}
     for alike in groups.values():
@@ -65,8 +69,6 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     def rows_at(task: FramedTask, *frames: Array) -> TaskRows:
         return task.rows_at(*frames, backend=kinematics.backend)
 
-    if kinematics.backend != "jax" and cuda_is_default():  # the kernels keep lanes last in memory, tasks apart
-        return {name: rows_at(task, *(a[i] for a in by_task)) for i, (name, task) in enumerate(tasks.items())}
     rows = jax.vmap(rows_at)(together, *by_task)
     apart = [jax.tree.map(partial(_of_task, i), rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # one array for both bounds

@@ -165,6 +165,21 @@ def check_priority(priority: int) -> int:
     return int(priority)
 
 
+def equality_rows(
+    error: Array,
+    jacobian: Array,
+    wanted: Array,
+    weight: Array,
+    curvature: Array,
+    pull: Array,
+    levers: Array,
+    squares: Array,
+) -> TaskRows:
+    """Return the rows of an equality from their fields, as the compiled core computes them."""
+    fields = error, jacobian, wanted, wanted, weight, curvature, pull, levers
+    return TaskRows(*fields, is_equality=True, squares=squares)
+
+
 def task_rows(
     error: Float[Array, " m"],
     jacobian: Float[Array, "m nv"],

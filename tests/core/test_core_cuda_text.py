@@ -43,6 +43,7 @@ TEXTS = {
     "bodies": lambda: _cuda._lanes_source("kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((3, 3), *[(2, 3)] * 4)),
     "frames": lambda: _cuda._lanes_source("moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((1, 3), (1, 6, 7))),
     "centre of mass": lambda: _cuda._lanes_source("center_rows", True, (*PLACED, (1, 50), (9,), (2, 9)), (6,), ROWS),
+    "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 44), (16,)), (6,), ROWS),
     "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
     "banded": lambda: banded.kernel_source(13, 2),
 }

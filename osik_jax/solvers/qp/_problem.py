@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE, ROW_MULTIPLIER, ZERO_TOL
 from ...numerics._dense import apply
 from .._box import violation
-from .._certificate import relative_kkt_residual
+from .._certificate import largest_of_each, relative_kkt_residual
 from ._cost import LeastSquares, Quadratic
 
 
@@ -141,8 +141,8 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     """
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
     newton = jnp.abs(qp.cost.gradient(x)) / root**2
-    sizes = jnp.stack([jnp.abs(x) * root, newton * root, jnp.abs(x), newton])
-    scaled, scaled_newton, plain, plain_newton = jnp.max(sizes, 1, initial=0.0)
+    sizes = jnp.abs(x) * root, newton * root, jnp.abs(x), newton
+    scaled, scaled_newton, plain, plain_newton = largest_of_each(*sizes)
     is_zero = scaled <= ZERO_TOL * jnp.finfo(x.dtype).eps * scaled_newton
     # what a constraint's value may be for such an x: in curvature units and in units of the variables, the smaller
     per_curvature = jnp.concatenate([1.0 / root, apply(jnp.abs(qp.rows), 1.0 / root)])
