@@ -18,6 +18,7 @@ from .._errors import warn
 from . import _build
 
 _REMEDY = "install a C++ compiler (Debian: g++, macOS: xcode-select --install) and install osik_jax again"
+_REBUILD = "python -m osik_jax.core._build builds it again"
 _registered: set[str] = set()
 _lock = threading.Lock()
 
@@ -57,14 +58,16 @@ def core() -> Core:
             continue
         library.osik_sources.restype = ctypes.c_char_p
         if library.osik_sources().decode() != _build.fingerprint():
-            reasons.append(f"{path.name} was built from other sources (python -m osik_jax.core._build builds it again)")
+            reasons.append(f"{path.name} was built from other sources")
             continue
         if level == "x86_64" and library.osik_has_x86_64_v3():
             fast = _build.library_path("x86_64_v3")
             if fast.exists():
                 return Core(ctypes.CDLL(str(fast)), fast, f"{fast.name}: this processor has AVX2 and FMA")
         return Core(library, path, f"{path.name}: the instruction set {level}")
-    return Core(None, None, f"no compiled core: {'; '.join(reasons)}. Methods run in plain JAX; {_REMEDY}")
+    remedy = _REBUILD if any("other sources" in reason for reason in reasons) else _REMEDY
+    slower = "Methods run in plain JAX: the answers are the same, and come more slowly"
+    return Core(None, None, f"no compiled core: {'; '.join(reasons)}. {slower}; {remedy}")
 
 
 def installed() -> bool:

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
-from ..kinematics._home import compiled_kinematics
 from ..robot import Robot
 from ..robot._tree import SLIDE
 from ._motion import Goal, Rows
@@ -75,7 +74,7 @@ def sway(robot: Robot, q0: Array, frame: str, *, size: float, duration: float) -
 
     A frame that cannot move left moves in the direction in which its joints move it most.
     """
-    kinematics = compiled_kinematics(robot, q0)
+    kinematics = forward_kinematics(robot, q0)
     position, rotation = (np.asarray(part) for part in kinematics.frame_pose(robot, frame))
     J = np.asarray(jax.jit(frame_jacobian, static_argnums=2)(robot, kinematics, frame))
     length, stride, u = sway_of(size), strides(robot, size), duration / 8.0

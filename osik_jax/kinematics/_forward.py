@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -87,7 +88,7 @@ def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[
 
 
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
-    """Return the poses of all bodies and motion axes of all dofs at configuration q.
+    """Return the poses of all bodies and motion axes of all dofs at configuration q, compiled on first use.
 
     Quaternions are normalised first.
 
@@ -98,6 +99,11 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """
     check_robot(robot, "forward_kinematics(robot, q)")
     robot.check_configuration(q)
+    return _forward_kinematics(robot, jnp.asarray(q))
+
+
+@jax.jit
+def _forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     local = joint_transforms(robot, robot.mujoco_qpos(q))
     position, rotation = world_poses(robot.tree, local.xpos, rotation_matrix(local.xquat))
     joint_parents = robot.tree.parents[np.asarray(robot.tree.joint_bodies, int)]
@@ -135,7 +141,12 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[st
     """
     if isinstance(name, str):
         return frame_jacobian(robot, kinematics, (name,))[0]
-    ids = np.array([robot.tree.frame(one) for one in name], int)
+    return _frame_jacobians(robot, kinematics, tuple(robot.tree.frame(one) for one in name))
+
+
+@partial(jax.jit, static_argnums=2)
+def _frame_jacobians(robot: Robot, kinematics: Kinematics, frames: tuple[int, ...]) -> Float[Array, "k 6 nv"]:
+    ids = np.array(frames, int)
     bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
     points = kinematics.body_position[bodies] + rotate(kinematics.body_rotation[bodies], robot.frame_position[ids])
     mask = robot.tree.moves[bodies][:, None, :]

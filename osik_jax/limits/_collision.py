@@ -131,7 +131,7 @@ class CollisionAvoidanceLimit(Limit):
 
     def distances(self, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
         """Return signed distances [m] of all ``pairs``, negative where they overlap."""
-        return self._nearest(robot, kinematics).distance
+        return _distances(self, robot, kinematics)
 
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
@@ -314,3 +314,8 @@ def _stacked(values: Sequence[Array], shape: tuple[int, ...], dtype: Any) -> Arr
 
 def _taking_part(pairs: Sequence[tuple[int, int]]) -> list[int]:
     return sorted({k for pair in pairs for k in pair})
+
+
+@jax.jit
+def _distances(limit: CollisionAvoidanceLimit, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
+    return limit._nearest(robot, kinematics).distance

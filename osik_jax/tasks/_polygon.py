@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics._home import compiled_kinematics
+from ..kinematics import forward_kinematics
 from ..numerics._guarded import greatest
 from ..robot import Robot
 
@@ -97,7 +97,7 @@ def _ground_points(robot: Robot, q: Array, frame: str, corners: ArrayLike | None
     """Return the corners of one frame, projected to the ground [m]. (k, 2)."""
     robot.tree.frame(frame)
     robot.check_configuration(q)
-    kinematics = compiled_kinematics(robot, q)
+    kinematics = forward_kinematics(robot, q)
     if corners is None:
         names = _corner_names(robot, frame)
         return np.asarray(kinematics.frame_poses(robot, names)[0])[:, :2]

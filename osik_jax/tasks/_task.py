@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics import Kinematics
-from ..kinematics._home import compiled_kinematics
+from ..kinematics import Kinematics, forward_kinematics
 from ..numerics._dense import short_sum
 from ..numerics._replace import Replaceable
 from ..robot import Robot
@@ -135,7 +134,7 @@ class Task(MadeForRobot, Replaceable):
             ValueError: q has the wrong length or, outside jit, is not finite.
         """
         robot.check_configuration(q)
-        return self.replace(**self._held(robot, compiled_kinematics(robot, jnp.asarray(q)), jnp.asarray(q)))
+        return self.replace(**self._held(robot, forward_kinematics(robot, jnp.asarray(q)), jnp.asarray(q)))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         """Return the fields with which the error at q is 0, by name (``target`` mostly)."""

@@ -39,6 +39,18 @@ def robots() -> dict[str, osik.Robot]:
     return {name: make(name) for name in NAMES}
 
 
+def test_kinematics_outside_jit_are_one_program(robots):
+    """Operation by operation they took half a second for one configuration."""
+    robot = robots["arm7"]
+    kinematics = osik.forward_kinematics(robot, robot.q0)
+    frame = robot.frame_names[-1]
+    for function in (
+        lambda q: osik.forward_kinematics(robot, q),
+        lambda q: osik.frame_jacobian(robot, kinematics, (frame,)) * q[0],
+    ):
+        assert len(jax.make_jaxpr(function)(robot.q0).eqns) < 6
+
+
 def everything(robot: osik.Robot, subtree: str):
     """Poses and Jacobians of all frames, centre of mass and its Jacobian, of the whole and of a subtree."""
 

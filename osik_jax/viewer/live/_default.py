@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...kinematics._home import compiled_kinematics
+from ...kinematics import forward_kinematics
 from ...robot import Robot
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task
@@ -44,7 +44,7 @@ def default_session(
         dt: time of a step [s].
     """
     start = robot.q0 if q is None else q
-    poses = compiled_kinematics(robot, start)
+    poses = forward_kinematics(robot, start)
     flat = "pose" if len(feet) <= 2 else "position"
     tasks: dict[str, Task] = {
         foot: FrameTask(robot, foot, target=poses.frame_pose(robot, foot), rows=flat, weight=WEIGHTS["foot"])
