@@ -147,7 +147,6 @@ def test_derivatives_with_the_damping_on(scheme, arm):
     np.testing.assert_allclose(reverse, slope, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
-@pytest.mark.variants(release=["hierarchical", "weighted", "null-space"])
 @pytest.mark.release
 @pytest.mark.parametrize("scheme", [*SCHEMES, "saturated"])
 def test_derivatives_where_little_room_is_left(scheme, arm):

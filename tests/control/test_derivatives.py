@@ -102,7 +102,7 @@ class TestArrays:
         out = check(lambda a: qp_answer(solve_factored(a)), straight, least_squares(rng, rows=5))
         assert_exact(out, most=0.9)
 
-    @pytest.mark.variants(release=["more-rows-than-variables", "few-rows"])
+    @pytest.mark.release
     @pytest.mark.parametrize("sizes, n", [((3, 4, 4), 10), ((2, 9), 6)], ids=["few-rows", "more-rows-than-variables"])
     def test_hierarchies(self, rng, sizes, n):
         """Levels of equalities and inequalities with weights, over a box: the answer and what levels lack."""
@@ -113,7 +113,7 @@ class TestArrays:
 
         assert_exact(check(solve, straight, hierarchies(rng, sizes, n)), most=0.9)
 
-    @pytest.mark.variants(release=["undamped", "saturated", "reverse", "damped"])
+    @pytest.mark.release
     @pytest.mark.parametrize("method", ["damped", "undamped", "reverse", "saturated"])
     def test_null_space(self, rng, method):
         """Levels, secondary motion, damping and bounds; undamped: the Moore-Penrose inverse at its rank."""
@@ -177,32 +177,30 @@ class TestSwitches:
         np.testing.assert_allclose(jax.jacfwd(answer)(column), 0.0, rtol=0, atol=1e-9)
 
 
-class TestHessian:
-    @pytest.mark.variants(release=["saturated", "projections", "quadratic program", "hierarchy"])
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
-    def test_through_a_loop(self, name):
-        """The rules of the solvers outlive the linearisation of a scan, also where singular values are equal or 0."""
-        rows = jnp.array([[1.0, 0.2, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
-        box = jnp.full(3, -0.3), jnp.full(3, 0.25)
+@pytest.mark.release
+@pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
+def test_hessian_through_a_loop(name):
+    """The rules of the solvers outlive the linearisation of a scan, also where singular values are equal or 0."""
+    rows = jnp.array([[1.0, 0.2, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
+    box = jnp.full(3, -0.3), jnp.full(3, 0.25)
 
-        def step(x, turn):
-            A, b = rows * jnp.cos(x[0] + turn), jnp.sin(x)
-            if name == "quadratic program":
-                s = solve_qp(A.T @ A + jnp.eye(3), -b, *box)
-                return x + s.x, s.active
-            if name == "hierarchy":
-                s = solve_hqp([Level(A[:1], b[:1]), Level(jnp.eye(3), b)], *box)
-                return x + s.x, s.warm_start
-            levels = [Level(A, b), Level(jnp.eye(3), b)]
-            s = solve_nullspace(levels, *box) if name == "saturated" else solve_nullspace(levels, damping=1e-3)
+    def step(x, turn):
+        A, b = rows * jnp.cos(x[0] + turn), jnp.sin(x)
+        if name == "quadratic program":
+            s = solve_qp(A.T @ A + jnp.eye(3), -b, *box)
             return x + s.x, s.active
+        if name == "hierarchy":
+            s = solve_hqp([Level(A[:1], b[:1]), Level(jnp.eye(3), b)], *box)
+            return x + s.x, s.warm_start
+        levels = [Level(A, b), Level(jnp.eye(3), b)]
+        s = solve_nullspace(levels, *box) if name == "saturated" else solve_nullspace(levels, damping=1e-3)
+        return x + s.x, s.active
 
-        def cost(x):
-            end, active = jax.lax.scan(step, x, jnp.array([0.1, 0.3]))
-            return jnp.sum(jnp.sin(end)), active
+    def cost(x):
+        end, active = jax.lax.scan(step, x, jnp.array([0.1, 0.3]))
+        return jnp.sum(jnp.sin(end)), active
 
-        def some_are_active(active):
-            return any(a.any() for a in jax.tree.leaves(active)) or name == "projections"
+    def some_are_active(active):
+        return any(a.any() for a in jax.tree.leaves(active)) or name == "projections"
 
-        assert_hessian(cost, jnp.array([0.4, -0.7, 0.2]), some_are_active)
+    assert_hessian(cost, jnp.array([0.4, -0.7, 0.2]), some_are_active)

@@ -104,9 +104,8 @@ class TestOutOfReach:
             left = np.linalg.norm(places_of(arm, path[lane, -1:], "hand")[0] - place)
             assert left == pytest.approx(np.linalg.norm(nearest - place), rel=0.01)
 
-    @pytest.mark.variants(release=["hierarchy-600", "weighted-400"])
+    @pytest.mark.release
     @pytest.mark.parametrize(("scheme", "rest"), [("weighted", 400), ("hierarchy", 600)])
-    @pytest.mark.slow
     def test_a_nao_comes_to_rest_on_its_feet(self, nao, scheme, rest):
         """The hand's target is 0.6 m from where it is; the hierarchy takes 3 s for the last of the way."""
         tasks: dict[str, osik.Task] = {foot: osik.FrameTask(nao, foot, weight=100.0, priority=1) for foot in FEET}
@@ -172,52 +171,48 @@ def test_a_hand_follows_a_curve_within_reach_while_the_feet_are_hard(nao, scheme
         assert np.linalg.norm(places_of(nao, path[::20], foot) - places_of(nao, [nao.q0], foot)[0], axis=1).max() < 1e-4
 
 
-class TestAtTheStart:
+@pytest.mark.release
+@pytest.mark.parametrize(
+    "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
+)
+def test_derivatives_at_the_start_are_central_differences(arm, rng, method):
     """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
+    tasks = {
+        "hand": osik.FrameTask(arm, "hand", rows="position"),
+        "posture": osik.PostureTask(arm, priority=2, weight=1.0),
+    }
+    along, mix = rng.normal(size=(2, arm.nv))
+    scheme = METHODS[method]()
 
-    @pytest.mark.variants(release=["saturated null space", "hierarchy", "null space", "weighted"])
-    @pytest.mark.variants(slow=["null space"], release=["damped null space", "reverse order"])
-    @pytest.mark.parametrize(
-        "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
-    )
-    def test_derivatives_are_central_differences(self, arm, rng, method):
-        tasks = {
-            "hand": osik.FrameTask(arm, "hand", rows="position"),
-            "posture": osik.PostureTask(arm, priority=2, weight=1.0),
-        }
-        along, mix = rng.normal(size=(2, arm.nv))
-        scheme = METHODS[method]()
+    def cost(t):
+        return osik.solve(arm, arm.q0 + t * along, tasks, scheme=scheme, dt=0.01).velocity @ mix
 
-        def cost(t):
-            return osik.solve(arm, arm.q0 + t * along, tasks, scheme=scheme, dt=0.01).velocity @ mix
-
-        both, h = jax.jit(jax.value_and_grad(cost)), 1e-5
-        expected = float(both(h)[0] - both(-h)[0]) / (2.0 * h)
-        assert abs(expected) > 1.0
-        assert float(both(0.0)[1]) == pytest.approx(expected, rel=1e-6)
-        assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-6)
+    both, h = jax.jit(jax.value_and_grad(cost)), 1e-5
+    expected = float(both(h)[0] - both(-h)[0]) / (2.0 * h)
+    assert abs(expected) > 1.0
+    assert float(both(0.0)[1]) == pytest.approx(expected, rel=1e-6)
+    assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-6)
 
 
-class TestAStepThatIsNone:
-    @pytest.mark.variants(slow=["hierarchy"])
-    @pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
-    def test_a_traced_dt_that_is_none_moves_nothing(self, arm, scheme):
-        """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""
-        place, rotation = jnp.array([0.6, 0.2, 0.5]), jnp.eye(3)
-        tasks = {"hand": osik.FrameTask(arm, "hand", rows="position", target=(place, rotation))}
-        start = arm.q0.at[0].set(0.99 * float(arm.position_upper[0]))
+@pytest.mark.variants(slow=["hierarchy"])
+@pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
+def test_a_traced_dt_that_is_none_moves_nothing(arm, scheme):
+    """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""
+    place, rotation = jnp.array([0.6, 0.2, 0.5]), jnp.eye(3)
+    tasks = {"hand": osik.FrameTask(arm, "hand", rows="position", target=(place, rotation))}
+    start = arm.q0.at[0].set(0.99 * float(arm.position_upper[0]))
 
-        @jax.jit
-        @jax.vmap
-        def run(dt):
-            motion = osik.rollout(arm, start, tasks, scheme=SCHEMES[scheme](), dt=dt, steps=3)
-            return motion.solution.status, motion.solution.velocity, motion.q
+    @jax.jit
+    @jax.vmap
+    def run(dt):
+        motion = osik.rollout(arm, start, tasks, scheme=SCHEMES[scheme](), dt=dt, steps=3)
+        return motion.solution.status, motion.solution.velocity, motion.q
 
-        status, velocity, path = run(jnp.array([DT, 0.0, -DT, jnp.nan, jnp.inf]))
-        assert (status[0] == Status.SOLVED).all() and np.abs(velocity[0]).max() > 0.1
-        assert (status[1:] == Status.NUMERICAL_ERROR).all()
-        np.testing.assert_array_equal(velocity[1:], np.zeros_like(velocity[1:]))
-        np.testing.assert_array_equal(path[1:], np.broadcast_to(start, path[1:].shape))
+    status, velocity, path = run(jnp.array([DT, 0.0, -DT, jnp.nan, jnp.inf]))
+    assert (status[0] == Status.SOLVED).all() and np.abs(velocity[0]).max() > 0.1
+    assert (status[1:] == Status.NUMERICAL_ERROR).all()
+    np.testing.assert_array_equal(velocity[1:], np.zeros_like(velocity[1:]))
+    np.testing.assert_array_equal(path[1:], np.broadcast_to(start, path[1:].shape))
 
 
 def test_the_share_that_is_out_of_reach_in_single_precision():

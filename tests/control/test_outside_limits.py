@@ -6,25 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from model_files import mjcf
 
 import osik_jax as osik
 
-ARM = """
-<mujoco>
-  <worldbody>
-    <body name="upper"><joint name="a" axis="0 1 0" range="-60 60"/>
-      <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-      <body name="lower" pos=".3 0 0"><joint name="b" axis="0 1 0" range="-90 45"/>
-        <geom type="capsule" fromto="0 0 0 .3 0 0" size=".02"/>
-        <body name="rod" pos=".3 0 0"><joint name="c" type="slide" axis="1 0 0" range="-.1 .2"/>
-          <geom type="capsule" fromto="0 0 0 .1 0 0" size=".02"/><site name="tip" pos=".1 0 0"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <keyframe><key name="inside" qpos="0 0 0"/><key name="outside" qpos="0 1 0"/></keyframe>
-</mujoco>
-"""
+ARM = mjcf("two_hinges_and_a_slide")
 UPPER = np.array([np.pi / 3, np.pi / 4, 0.2])
 OUT = UPPER + np.array([0.049, 0.099, 0.019])
 SCHEMES = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -100,17 +102,8 @@ def test_a_rollout_compiles_once(arm, home, name):
     before, after = SCHEMES[name]
 
     def run(robot, scheme, q, tasks, limits, dt, targets, feedback):
-        return osik.rollout(
-            robot,
-            q,
-            tasks,
-            scheme=scheme,
-            limits=limits,
-            dt=dt,
-            steps=STEPS,
-            targets={"posture": targets},
-            feedback=feedback,
-        )
+        options: dict[str, Any] = dict(limits=limits, dt=dt, targets={"posture": targets}, feedback=feedback)
+        return osik.rollout(robot, q, tasks, scheme=scheme, steps=STEPS, **options)
 
     zeros, noise = np.zeros((STEPS, arm.nq)), 0.1 * np.ones((STEPS, arm.nq))
     with Compilations() as first:

@@ -71,8 +71,7 @@ SCHEMES = {
 }
 
 
-@pytest.mark.variants(release=["saturated", "hierarchical", "weighted", "null-space"])
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_where_the_world_is(rng, scheme):
     """The base and all targets turned and moved: the same joint velocities, a base velocity turned with them."""

@@ -38,8 +38,7 @@ def sanitizers(compiler: str) -> str:
     return " ".join(found) if all(Path(path).is_absolute() for path in found) else ""
 
 
-@pytest.mark.slow
-@pytest.mark.variants(release=["all", "some"])
+@pytest.mark.release
 @pytest.mark.parametrize("tests", [SOME, ALL], ids=["some", "all"])
 def test_sanitizers_find_nothing(tests, tmp_path):
     compiler = shutil.which(os.environ.get("CXX") or "c++")

@@ -80,22 +80,6 @@ def chain_with_checkpoints(x):
     return jax.lax.scan(step, x, None, length=2)[0]
 
 
-def reverse_over_forward(f):
-    return jax.grad(lambda x: jax.jvp(f, (x,), (1.0,))[1])
-
-
-def forward_over_reverse(f):
-    return lambda x: jax.jvp(jax.grad(f), (x,), (1.0,))[1]
-
-
-def forward_over_forward(f):
-    return lambda x: jax.jvp(lambda y: jax.jvp(f, (y,), (1.0,))[1], (x,), (1.0,))[1]
-
-
-def reverse_over_reverse(f):
-    return jax.grad(jax.grad(f))
-
-
 LOOPS = {
     "unrolled": lambda x: cube(cube(x) + x) + x,
     "scan": chain,
@@ -105,7 +89,12 @@ LOOPS = {
     "vmap": lambda x: jax.vmap(chain)(jnp.stack([x, 2.0 * x]))[0],
     "cond": lambda x: jax.lax.cond(x > 0.0, chain, lambda x: x, x),
 }
-SECOND = [reverse_over_forward, forward_over_reverse, forward_over_forward, reverse_over_reverse]
+SECOND = {
+    "reverse over forward": lambda f: jax.grad(lambda x: jax.jvp(f, (x,), (1.0,))[1]),
+    "forward over reverse": lambda f: lambda x: jax.jvp(jax.grad(f), (x,), (1.0,))[1],
+    "forward over forward": lambda f: lambda x: jax.jvp(lambda y: jax.jvp(f, (y,), (1.0,))[1], (x,), (1.0,))[1],
+    "reverse over reverse": lambda f: jax.grad(jax.grad(f)),
+}
 
 
 @pytest.mark.parametrize("loop", LOOPS)
@@ -118,8 +107,8 @@ def test_a_rule_holds_in_a_loop_to_second_order(loop):
     first = 6 * y**2 * dy + 1
     assert float(jax.grad(f)(x)) == pytest.approx(first, rel=1e-12)
     assert float(jax.jvp(f, (x,), (1.0,))[1]) == pytest.approx(first, rel=1e-12)
-    for derivative in SECOND:
-        assert float(derivative(f)(x)) == pytest.approx(12 * y * dy**2 + 6 * y**2 * ddy, rel=1e-12), derivative
+    for name, derivative in SECOND.items():
+        assert float(derivative(f)(x)) == pytest.approx(12 * y * dy**2 + 6 * y**2 * ddy, rel=1e-12), name
 
 
 def stepwise(gains, x):

@@ -168,8 +168,7 @@ print("done")
 """
 
 
-@pytest.mark.slow
-@pytest.mark.variants(release=["hqp", "nullspace", "qp"])
+@pytest.mark.release
 @pytest.mark.parametrize("solver", ["nullspace", "hqp", "qp"])
 def test_batches_side_by_side_wait_for_no_workers(solver):
     """Two cores, nothing configured: null spaces with ``backend="jax"`` wait for ever, as QPs by 16 lanes can."""

@@ -8,32 +8,18 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model_files import mjcf
 from mujoco_states import mujoco_at
 from refusals import refuses
 
 import osik_jax as osik
 
 POSITION, ORIENTATION = 1e-3, 1e-2
-PLANAR = """<mujoco><worldbody><body name="a"><joint name="j1" axis="0 0 1" range="-170 170"/>
-<geom type="capsule" fromto="0 0 0 .5 0 0" size=".02"/>
-<body name="b" pos=".5 0 0"><joint name="j2" axis="0 0 1" range="-170 170"/>
-<geom type="capsule" fromto="0 0 0 .4 0 0" size=".02"/>
-<site name="tip" pos=".4 0 0"/></body></body></worldbody></mujoco>"""
-MIXED = """<mujoco><worldbody><body name="cart" pos="0 .1 .2" euler="0 0 30"><joint name="rail" type="slide"
-axis="1 0 0" range="-.4 .6"/><joint name="turn" axis="0 .6 .8" pos=".03 0 .02" range="-150 150"/><geom size=".05"/>
-<body name="upper" pos=".1 0 .3" euler="10 20 0"><joint name="lift" axis="0 1 0" pos="0 .02 0" range="-120 120"/>
-<geom size=".05"/>
-<body name="fore" pos=".25 0 0"><joint name="bend" axis="0 1 0" range="-130 130" ref="10"/><geom size=".05"/>
-<body name="hand" pos=".25 0 0"><joint name="roll" axis="1 0 0" range="-160 160"/><joint name="tilt" axis="0 0 1"
-range="-90 90"/><geom size=".05"/><body name="thumb" pos=".1 0 0"><joint name="coupled" axis="0 1 0"/><geom size=".02"/>
-<site name="tool" pos=".05 .01 0" euler="0 40 0"/></body></body></body></body></body>
-<body name="other" pos="1 0 0"><joint name="aside" axis="0 0 1" range="-90 90"/><geom size=".05"/></body></worldbody>
-<equality><joint joint1="coupled" joint2="tilt" polycoef="0.1 0.5 0 0 0"/></equality></mujoco>"""
 
 
 @pytest.fixture(scope="module")
 def planar():
-    return osik.Robot.from_mjcf(PLANAR)
+    return osik.Robot.from_mjcf(mjcf("two_links_with_a_tip"))
 
 
 def mujoco_pose(robot, q, frame):
@@ -90,7 +76,7 @@ def test_finds_what_is_reachable(arm, rng, precision):
 
 
 def test_slides_followers_and_two_joints_on_a_body(rng):
-    robot = osik.Robot.from_mjcf(MIXED)
+    robot = osik.Robot.from_mjcf(mjcf("joints_of_all_kinds_on_a_rail"))
     position, rotation = random_poses(robot, "tool", 100, rng)
     found = osik.inverse_kinematics(robot, {"tool": (position, rotation)})
     away, turned = errors_by_mujoco(robot, found.q, "tool", position, rotation)
@@ -185,16 +171,9 @@ def test_pure_form_is_differentiable_and_batched(arm, rng):
     _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
 
     def find(position, start):
-        return osik.inverse_kinematics(
-            arm,
-            {"hand": (position, rotation)},
-            q0=start,
-            seeds=2,
-            steps=24,
-            position_tolerance=1e-8,
-            orientation_tolerance=1e-8,
-            closest=False,  # half the time to compile
-        ).q
+        options: dict[str, Any] = dict(seeds=2, steps=24, closest=False)  # half the time to compile
+        options |= dict(position_tolerance=1e-8, orientation_tolerance=1e-8)
+        return osik.inverse_kinematics(arm, {"hand": (position, rotation)}, q0=start, **options).q
 
     both = jax.jit(jax.vmap(lambda p, q: (find(p, q), jax.jacfwd(find)(p, q), jax.jacrev(find)(p, q))))
     positions = jnp.asarray(mujoco_pose(arm, np.asarray(arm.q0), "hand")[0] + rng.uniform(-0.1, 0.1, (2, 3)))
@@ -246,8 +225,7 @@ def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     assert_within_limits(arm, found.q)
 
 
-@pytest.mark.variants(release=["False", "True"])
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("hard", [False, True])
 def test_floating_base_with_feet_held_and_balance(rng, hard):
     nao = osik.load_robot("nao")

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from model_files import mjcf
 from scipy.optimize import minimize
 
 import osik_jax as osik
@@ -19,13 +20,6 @@ FINGER = (
     '<joint name="{n}2" axis="0 1 0" range="-1.5 1.5"/><geom size=".01"/><site name="{n}" pos="0 0 .05"/></body></body>'
 )
 HEAD = "<mujoco><compiler angle='radian' autolimits='true'/><worldbody>"
-CART = """<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
-<body pos="0 0 .2"><joint name="rail" type="slide" axis="1 0 0" range="-.4 .6"/><geom size=".05"/>
-<body pos=".1 0 .1"><joint name="lift" axis="0 1 0" pos="0 .02 0" range="-2 2"/><geom size=".05"/>
-<body pos=".3 0 0"><joint name="bend" axis="0 1 .2" range="-2 2"/><geom size=".05"/>
-<body pos=".2 0 0"><joint name="wrist" axis="1 0 0" range="-2 2"/><joint name="coupled" axis="0 0 1"/><geom size=".05"/>
-<site name="tip" pos=".1 .02 0"/></body></body></body></body></worldbody>
-<equality><joint joint1="coupled" joint2="bend" polycoef="0.1 0.5 0 0 0"/></equality></mujoco>"""
 
 
 RADIAN = 0.1
@@ -112,7 +106,7 @@ def test_limbs_that_share_no_joint_stay_on_their_targets():
 @pytest.mark.parametrize("rows", [(True,) * 6, (True,) * 3 + (False,) * 3])
 def test_hessian_of_the_error_by_central_differences(rng, rows):
     """A slide, hinges off their origins, two joints on a body and a follower."""
-    robot = osik.Robot.from_mjcf(CART)
+    robot = osik.Robot.from_mjcf(mjcf("arm_on_a_cart"))
     settings = Settings(robot.q0, *joint_box(robot, None), 0, jnp.array([1e-3, 1e-2]), 8)
     search = ChainRoute(("tip",), (rows,)).search(robot, settings, warm=False, near=False)
     rotation = np.linalg.qr(rng.standard_normal((3, 3)))[0]

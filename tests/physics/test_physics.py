@@ -1,5 +1,7 @@
 """The dynamics: the world against the robot's own model, servos, the loop, and falls; forces from statics."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -167,16 +169,8 @@ def test_a_fall_ends_the_run(nao, nao_world):
     def push(t, simulation):
         simulation.push("torso", (0.0, 60.0, 0.0) if t > 0.1 else (0.0, 0.0, 0.0))
 
-    recording = physics.simulate(
-        simulation,
-        posture,
-        scheme=osik.WeightedQP(),
-        dt=DT,
-        steps=400,
-        command=physics.Integrated(),
-        before_step=push,
-        limits=osik.no_limits,
-    )
+    options: dict[str, Any] = dict(command=physics.Integrated(), limits=osik.no_limits, before_step=push)
+    recording = physics.simulate(simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=400, **options)
     assert recording.fell and simulation.fallen()
     assert 20 < len(recording.command) < 300
     assert len(recording.time) == len(recording.q) == len(recording.command) + 1 == len(recording.solution.status) + 1

@@ -209,14 +209,8 @@ class TestWeightedQP:
     def test_a_row_of_weight_zero_costs_nothing(self, arm):
         """An inequality that is violated however the arm moves, and no other task of weight: nothing moves."""
         tasks = {"position": osik.FrameTask(arm.robot, "hand", rows="position", lower=1.0, weight=0.0)}
-        ours = osik.solve(
-            arm.robot,
-            arm.robot.q0,
-            tasks,
-            scheme=osik.WeightedQP(damping=1e-6, curvature_damping=0.0),
-            dt=DT,
-            limits=osik.no_limits,
-        )
+        scheme = osik.WeightedQP(damping=1e-6, curvature_damping=0.0)
+        ours = osik.solve(arm.robot, arm.robot.q0, tasks, scheme=scheme, dt=DT, limits=osik.no_limits)
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED
 
@@ -238,16 +232,9 @@ class TestWeightedQP:
             ),
             "posture": osik.PostureTask(robot, target=posture, weight=0.01, gain=gain),
         }
-        fast = osik.VelocityLimit(robot, velocity={"*": 1.2})
-        trajectory = osik.rollout(
-            robot,
-            robot.q0,
-            ours,
-            scheme=osik.WeightedQP(damping=1e-4, curvature_damping=0.0),
-            limits=(osik.ConfigurationLimit(robot), fast),
-            dt=DT,
-            steps=count,
-        )
+        limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot, velocity={"*": 1.2})
+        scheme = osik.WeightedQP(damping=1e-4, curvature_damping=0.0)
+        trajectory = osik.rollout(robot, robot.q0, ours, scheme=scheme, limits=limits, dt=DT, steps=count)
         theirs = mink_loop(robot, feet, goal, (turn, R), posture, gain * DT, count)
         np.testing.assert_array_equal(trajectory.solution.status, osik.Status.SOLVED)
         np.testing.assert_allclose(trajectory.q, theirs, rtol=0, atol=1e-6)
@@ -417,45 +404,33 @@ class TestHierarchicalQP:
         assert apart[2] < 1e-3
 
 
-class TestCentreOfMass:
-    @pytest.mark.slow
-    def test_is_kept_over_the_feet_while_the_waist_pulls(self, nao):
-        """MuJoCo C says where the centre of mass and the feet are. Without the task it would leave the polygon."""
-        robot, feet = nao.robot, ("l_sole", "r_sole")
-        polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.03)
-        p, R = at_home(robot, "torso")
-        com = osik.ComTask(robot, polygon=polygon, gain=50.0, priority=2)
-        tasks = {
-            **{foot: osik.FrameTask(robot, foot, gain=50.0) for foot in feet},
-            "waist": osik.FrameTask(robot, "torso", target=(p + np.array([0.0, 0.1, -0.02]), R), gain=2.0, priority=3),
-            "posture": osik.PostureTask(robot, gain=1.0, priority=4, weight=1.0),
-        }
-        limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
-        outside = {}
-        for weight in (0.0, 1.0):
-            now = {**tasks, "com": com.replace(weight=weight)}
-            run = osik.rollout(
-                robot,
-                robot.q0,
-                now,
-                scheme=osik.HierarchicalQP(curvature_damping=0.0),
-                limits=limits,
-                dt=0.01,
-                steps=150,
-            )
-            np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
-            com_at, feet_at = mujoco_path(robot, np.asarray(run.q), feet)
-            beyond = com_at[:, :2] @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
-            outside[weight] = beyond.max(1)
-            assert np.abs(feet_at - feet_at[0]).max() < 1e-4
-            joints = np.asarray(run.q)[:, 7:]
-            assert (joints >= np.asarray(robot.position_lower)[6:]).all()
-            assert (joints <= np.asarray(robot.position_upper)[6:]).all()
-        assert outside[0.0][-1] > 2e-3
-        assert outside[1.0].max() < 1e-5
-        assert outside[1.0][-1] > -1e-4  # it got as far as it may
-
-
-def mujoco_path(robot, qs, sites):
-    data = [mujoco_at(robot, q) for q in qs]
-    return np.array([d.subtree_com[0] for d in data]), np.array([[d.site(s).xpos for s in sites] for d in data])
+@pytest.mark.slow
+def test_the_centre_of_mass_is_kept_over_the_feet_while_the_waist_pulls(nao):
+    """MuJoCo C says where the centre of mass and the feet are. Without the task it would leave the polygon."""
+    robot, feet = nao.robot, ("l_sole", "r_sole")
+    polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.03)
+    p, R = at_home(robot, "torso")
+    com = osik.ComTask(robot, polygon=polygon, gain=50.0, priority=2)
+    tasks = {
+        **{foot: osik.FrameTask(robot, foot, gain=50.0) for foot in feet},
+        "waist": osik.FrameTask(robot, "torso", target=(p + np.array([0.0, 0.1, -0.02]), R), gain=2.0, priority=3),
+        "posture": osik.PostureTask(robot, gain=1.0, priority=4, weight=1.0),
+    }
+    limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
+    outside, scheme = {}, osik.HierarchicalQP(curvature_damping=0.0)
+    for weight in (0.0, 1.0):
+        now = {**tasks, "com": com.replace(weight=weight)}
+        run = osik.rollout(robot, robot.q0, now, scheme=scheme, limits=limits, dt=0.01, steps=150)
+        np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
+        path = [mujoco_at(robot, q) for q in np.asarray(run.q)]
+        feet_at = np.array([[data.site(foot).xpos for foot in feet] for data in path])
+        com_at = np.array([data.subtree_com[0, :2] for data in path])
+        beyond = com_at @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
+        outside[weight] = beyond.max(1)
+        assert np.abs(feet_at - feet_at[0]).max() < 1e-4
+        joints = np.asarray(run.q)[:, 7:]
+        assert (joints >= np.asarray(robot.position_lower)[6:]).all()
+        assert (joints <= np.asarray(robot.position_upper)[6:]).all()
+    assert outside[0.0][-1] > 2e-3
+    assert outside[1.0].max() < 1e-5
+    assert outside[1.0][-1] > -1e-4  # it got as far as it may

@@ -9,28 +9,18 @@ import numpy as np
 import pink
 import pinocchio as pin
 import pytest
+from model_files import mjcf
 from refusals import refuses
 from task_checks import rows_of_each, square
 
 import osik_jax as osik
 
 DT = 0.01
-FLOATING = """
-<mujoco><worldbody>
-  <body name="trunk"><freejoint name="base"/><geom size="0.1"/>
-    <body pos="0 0 0.3"><joint name="shoulder" axis="0 1 0"/><geom size="0.1" pos="0.1 0 0.1"/>
-      <body pos="0 0 0.3"><joint name="elbow" axis="1 0 0"/><geom size="0.1" pos="0 0.1 0.1"/>
-        <body name="hand" pos="0 0 0.3"><joint name="wrist" axis="0 0 1"/><geom size="0.1" pos="0.1 0 0"/></body>
-      </body>
-    </body>
-  </body>
-</worldbody></mujoco>
-"""
 
 
 @pytest.fixture(scope="module")
 def floating():
-    return osik.Robot.from_mjcf(FLOATING)
+    return osik.Robot.from_mjcf(mjcf("floating_arm"))
 
 
 def assert_answers(robot, q, ours, expected):
@@ -67,17 +57,7 @@ class TestAgainstPeers:
 
     def test_mink_by_constraint(self, rng):
         """One cost for each equality constraint, whatever its rows."""
-        loop = osik.Robot.from_mjcf("""
-        <mujoco><worldbody>
-          <body name="a"><joint name="first" axis="0 0 1"/><geom size="0.1"/>
-            <body name="b" pos="1 0 0"><joint name="second" axis="0 1 0"/><geom size="0.1"/></body></body>
-          <body name="c" pos="0 1 0"><joint name="third" axis="0 0 1"/><geom size="0.1"/>
-            <body name="d" pos="1 0 0"><joint name="fourth" axis="1 0 0"/><geom size="0.1"/></body></body>
-        </worldbody><equality>
-          <connect name="near" body1="b" body2="d" anchor="0 0.4 0"/>
-          <joint name="bent" joint1="second" joint2="third" polycoef="0 0.5 0.2 0 0"/>
-        </equality></mujoco>
-        """)
+        loop = osik.Robot.from_mjcf(mjcf("two_arms_in_a_loop"))
         q = rng.uniform(-0.3, 0.3, 4)
         configuration = mink.Configuration(loop.mj_model, q=q)
         closed = mink.EqualityConstraintTask(loop.mj_model, cost=[0.7, 2.0], gain=0.1)

@@ -89,10 +89,6 @@ def problem(case):
     return rows, osik.limit_box(case.robot, case.q, case.limits, DT)
 
 
-def lane_of(tree, i):
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[i], tree)
-
-
 class Problem(NamedTuple):
     """One lane in NumPy: the groups of tasks, what is hard first."""
 
@@ -101,7 +97,7 @@ class Problem(NamedTuple):
 
 
 def numbers(cases, i, groups) -> Problem:
-    one = lane_of(cases, i)
+    one = jax.tree.map(lambda leaf: np.asarray(leaf)[i], cases)
     rows, box = jax.tree.map(np.asarray, problem(one))
 
     def together(names, more=()):
@@ -225,43 +221,41 @@ def spoiled(lanes):
     return tuple(map(jnp.asarray, (q, place, matrix, lower, upper)))
 
 
-class TestContradictions:
-    @pytest.mark.variants(release=["saturated"])
-    @pytest.mark.parametrize("name", SCHEMES)
-    def test_in_their_lane_only(self, arm, lanes, spoiled, name):
-        clean = solve_lanes(cases(arm, lanes), SCHEMES[name])
-        some = cases(arm, spoiled)
-        ours = solve_lanes(some, SCHEMES[name])
-        expected = np.full(LANES, Status.SOLVED)
-        expected[3], expected[5] = Status.INFEASIBLE, Status.NUMERICAL_ERROR
-        np.testing.assert_array_equal(ours.status, expected)
-        others = np.flatnonzero(expected == Status.SOLVED)
-        np.testing.assert_allclose(ours.velocity[others], clean.velocity[others], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(ours.velocity[5], 0.0)
-        for leaf in jax.tree.leaves(ours):
-            assert np.isfinite(leaf).all()
-        if name in ("weighted", "hierarchical"):
-            p = numbers(some, 3, [[name] for name in ORDER[1:]])
-            v = np.asarray(ours.velocity[3])
-            assert (p.box[0] <= v).all() and (v <= p.box[1]).all()
-            whole = Hierarchies([Rows(*(a[None] for a in g)) for g in p.groups], p.box[0][None], p.box[1][None])
-            np.testing.assert_allclose(norms(whole, 0, v)[0], reference(whole, 0)[1][0], rtol=1e-6)
-            assert 0.5 < ours.box_violation[3] <= 1.0 + 1e-9
+@pytest.mark.variants(release=["saturated"])
+@pytest.mark.parametrize("name", SCHEMES)
+def test_contradictions_stay_in_their_lane(arm, lanes, spoiled, name):
+    clean = solve_lanes(cases(arm, lanes), SCHEMES[name])
+    some = cases(arm, spoiled)
+    ours = solve_lanes(some, SCHEMES[name])
+    expected = np.full(LANES, Status.SOLVED)
+    expected[3], expected[5] = Status.INFEASIBLE, Status.NUMERICAL_ERROR
+    np.testing.assert_array_equal(ours.status, expected)
+    others = np.flatnonzero(expected == Status.SOLVED)
+    np.testing.assert_allclose(ours.velocity[others], clean.velocity[others], rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(ours.velocity[5], 0.0)
+    for leaf in jax.tree.leaves(ours):
+        assert np.isfinite(leaf).all()
+    if name in ("weighted", "hierarchical"):
+        p = numbers(some, 3, [[name] for name in ORDER[1:]])
+        v = np.asarray(ours.velocity[3])
+        assert (p.box[0] <= v).all() and (v <= p.box[1]).all()
+        whole = Hierarchies([Rows(*(a[None] for a in g)) for g in p.groups], p.box[0][None], p.box[1][None])
+        np.testing.assert_allclose(norms(whole, 0, v)[0], reference(whole, 0)[1][0], rtol=1e-6)
+        assert 0.5 < ours.box_violation[3] <= 1.0 + 1e-9
 
 
-class TestRest:
-    @pytest.mark.variants(slow=["saturated"])
-    @pytest.mark.parametrize("name", SCHEMES)
-    def test_nothing_to_do_is_no_contradiction(self, arm, lanes, name):
-        """Where all is met to rounding the velocity is rounding, and what it misses of the constraints as large."""
-        rng = np.random.default_rng(9)
-        place = 10.0 ** rng.uniform(-16, -8, (LANES, 1)) * rng.normal(size=(LANES, 3))
-        q, ones = jnp.tile(arm.q0, (LANES, 1)), jnp.ones((LANES, 3))
-        still = cases(arm, (q, jnp.asarray(place), lanes[2], -ones, ones))
-        ours = solve_lanes(still, SCHEMES[name])
-        assert (ours.status == Status.SOLVED).all()
-        if name != "null-space":
-            assert np.abs(ours.velocity).max() < 1e-5
+@pytest.mark.variants(slow=["saturated"])
+@pytest.mark.parametrize("name", SCHEMES)
+def test_nothing_to_do_is_no_contradiction(arm, lanes, name):
+    """Where all is met to rounding the velocity is rounding, and what it misses of the constraints as large."""
+    rng = np.random.default_rng(9)
+    place = 10.0 ** rng.uniform(-16, -8, (LANES, 1)) * rng.normal(size=(LANES, 3))
+    q, ones = jnp.tile(arm.q0, (LANES, 1)), jnp.ones((LANES, 3))
+    still = cases(arm, (q, jnp.asarray(place), lanes[2], -ones, ones))
+    ours = solve_lanes(still, SCHEMES[name])
+    assert (ours.status == Status.SOLVED).all()
+    if name != "null-space":
+        assert np.abs(ours.velocity).max() < 1e-5
 
 
 class TestPrograms:
@@ -315,21 +309,19 @@ def test_mistakes(arm):
     refuses(ValueError, "lower > upper", osik.LinearLimit, arm, np.ones((2, 7)), 1.0, 0.0)
 
 
-@pytest.mark.slow
-class TestDerivatives:
-    @pytest.mark.variants(release=["hierarchical", "null-space", "weighted"])
-    @pytest.mark.parametrize("name", ["weighted", "null-space", "hierarchical"])
-    def test_against_differences(self, arm, lanes, name):
-        """With respect to the configuration, a target, and the rows and bounds of the limit."""
-        rng = np.random.default_rng(6)
-        rates = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), lanes)
+@pytest.mark.release
+@pytest.mark.parametrize("name", ["weighted", "null-space", "hierarchical"])
+def test_derivatives_against_differences(arm, lanes, name):
+    """With respect to the configuration, a target, and the rows and bounds of the limit."""
+    rng = np.random.default_rng(6)
+    rates = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), lanes)
 
-        def function(lane):
-            c = case(arm, lane)
-            s = osik.solve(c.robot, c.q, c.tasks, scheme=SCHEMES[name], limits=c.limits, dt=DT)
-            return (s.velocity, s.slack), (s.status, s.warm_start)
+    def function(lane):
+        c = case(arm, lane)
+        s = osik.solve(c.robot, c.q, c.tasks, scheme=SCHEMES[name], limits=c.limits, dt=DT)
+        return (s.velocity, s.slack), (s.status, s.warm_start)
 
-        def path(both, t):
-            return jax.tree.map(lambda leaf, rate: leaf + 0.01 * t * rate, *both)
+    def path(both, t):
+        return jax.tree.map(lambda leaf, rate: leaf + 0.01 * t * rate, *both)
 
-        assert_exact(check(function, path, (lanes, rates)), most=0.7)
+    assert_exact(check(function, path, (lanes, rates)), most=0.7)

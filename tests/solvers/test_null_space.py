@@ -136,23 +136,22 @@ cost_and_slope = jax.jit(jax.value_and_grad(cost))
 cost_along = jax.jit(lambda t, *given: jax.jvp(lambda t: cost(t, *given), (t,), (1.0,))[1])
 
 
-class TestDerivatives:
-    @pytest.mark.variants(release=["0.0"])
-    @pytest.mark.parametrize("damping", [0.0, 0.05])
-    def test_gradients_are_central_differences_in_both_modes(self, rng, damping):
-        """In matrices, targets and weights, with a level whose rank is not full and one that is overdetermined."""
-        data = random_levels(rng, (3, 2, 5))
-        data[1] = (rng.normal(size=2)[:, None] * rng.normal(size=N), data[1][1], data[1][2])
-        direction, secondary = random_levels(rng, (3, 2, 5)), rng.normal(size=N)
-        along = rng.normal(size=2)[:, None] * data[1][0]  # keeps the rank
-        direction[1] = (along, direction[1][1], direction[1][2])
+@pytest.mark.variants(release=["0.0"])
+@pytest.mark.parametrize("damping", [0.0, 0.05])
+def test_gradients_are_central_differences_in_both_modes(rng, damping):
+    """In matrices, targets and weights, with a level whose rank is not full and one that is overdetermined."""
+    data = random_levels(rng, (3, 2, 5))
+    data[1] = (rng.normal(size=2)[:, None] * rng.normal(size=N), data[1][1], data[1][2])
+    direction, secondary = random_levels(rng, (3, 2, 5)), rng.normal(size=N)
+    along = rng.normal(size=2)[:, None] * data[1][0]  # keeps the rank
+    direction[1] = (along, direction[1][1], direction[1][2])
 
-        given, h = (data, direction, secondary, damping), 1e-5
-        (ahead, _), (behind, _) = cost_and_slope(h, *given), cost_and_slope(-h, *given)
-        expected = (ahead - behind) / (2.0 * h)
-        forward, reverse = cost_along(0.0, *given), cost_and_slope(0.0, *given)[1]
-        assert float(forward) == pytest.approx(float(expected), rel=1e-6)
-        assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
+    given, h = (data, direction, secondary, damping), 1e-5
+    (ahead, _), (behind, _) = cost_and_slope(h, *given), cost_and_slope(-h, *given)
+    expected = (ahead - behind) / (2.0 * h)
+    forward, reverse = cost_along(0.0, *given), cost_and_slope(0.0, *given)[1]
+    assert float(forward) == pytest.approx(float(expected), rel=1e-6)
+    assert float(reverse) == pytest.approx(float(forward), rel=1e-10)
 
 
 class TestPotential:

@@ -96,8 +96,7 @@ def test_contradictions_get_the_least_violating_answer(family, rng):
     assert max(least_violation_residual(p, i, x[i]) for i in range(COUNT)) < 1e-5
 
 
-@pytest.mark.variants(release=["inconsistent_equalities", "inconsistent_rows"])
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("family", [inconsistent_equalities, inconsistent_rows])
 def test_rates_of_the_least_violating_answer_by_differences(family, rng):
     """``INFEASIBLE_COMPLIANCE``: ten times as much moves these rates by 3e-5, a tenth loses as much to rounding."""

@@ -55,12 +55,6 @@ def session(**changes: Any) -> Session:
     return Session(**{**given, **changes})
 
 
-def answer(one: Session) -> osik.Solution:
-    return osik.solve(
-        ROBOT, jnp.asarray(one.q), one.active_tasks, scheme=one.scheme, limits=one.active_limits, dt=one.dt
-    )
-
-
 def test_a_session_comes_back_from_its_file_to_the_last_bit(tmp_path: Path) -> None:
     saved = session(limits_off=frozenset({1}))
     saved.save(tmp_path / "session.json")
@@ -75,7 +69,8 @@ def test_its_lines_of_python_make_the_same_controller() -> None:
     names: dict[str, Any] = {}
     exec(wanted.to_python(), names)
     assert list(names["tasks"]) == [name for name in wanted.tasks if name != "waist"]
-    expected = answer(wanted)
+    options: dict[str, Any] = dict(scheme=wanted.scheme, limits=wanted.active_limits, dt=wanted.dt)
+    expected = osik.solve(ROBOT, jnp.asarray(wanted.q), wanted.active_tasks, **options)
     assert expected.status == osik.Status.SOLVED and np.abs(expected.velocity).max() > 0.05
     np.testing.assert_array_equal(names["solution"].velocity, expected.velocity)
 

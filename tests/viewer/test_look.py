@@ -1,6 +1,7 @@
 """What pictures of URDFs show: mesh files against Coal, triangles against brute force, cameras against projections."""
 
 import struct
+from pathlib import Path
 
 import coal
 import mujoco
@@ -21,51 +22,10 @@ from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._shapes import lowest_points, robot_surface
 from osik_jax.viewer._stage import Stage, frame_camera
 
-COLLADA = """<?xml version="1.0"?>
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset>
-<library_effects><effect id="e"><profile_COMMON><technique sid="c"><phong><diffuse><color>1 0.5 0 1</color></diffuse>
-</phong></technique></profile_COMMON></effect></library_effects>
-<library_materials><material id="m"><instance_effect url="#e"/></material></library_materials>
-<library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 1 1 0 0 1 0</float_array>
-<technique_common><accessor source="#pa" count="4" stride="3"/></technique_common></source>
-<source id="n"><float_array id="na" count="3">0 0 1</float_array>
-<technique_common><accessor source="#na" count="1" stride="3"/></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<polylist count="1" material="red"><input semantic="VERTEX" source="#v" offset="0"/>
-<input semantic="NORMAL" source="#n" offset="1"/><vcount>4</vcount><p>0 0 1 0 2 0 3 0</p></polylist>
-<lines count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1</p></lines>
-</mesh></geometry></library_geometries>
-<library_visual_scenes><visual_scene id="s"><node><translate>100 0 0</translate><rotate>0 0 1 90</rotate>
-<scale>2 3 1</scale><node><matrix>1 0 0 0 0 1 0 0 0 0 1 50 0 0 0 1</matrix><instance_geometry url="#g">
-<bind_material><technique_common><instance_material symbol="red" target="#m"/></technique_common></bind_material>
-</instance_geometry></node></node></visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
-
-CUBE_OBJ = """v 0 0 0
-v 1 0 0
-v 1 1 0
-v 0 1 0
-v 0 0 2
-v 1 0 2
-v 1 1 2
-v 0 1 2
-f 4 3 2 1
-f 5 6 7 8
-f 1 2 6 5
-f 2 3 7 6
-f 3 4 8 7
-f 4 1 5 8
-"""
-
-ARM = """<robot name="arm"><link name="base"><visual><geometry><mesh filename="{mesh}" scale="0.1 0.1 0.1"/></geometry>
-</visual><collision><geometry><cylinder radius="0.05" length="0.2"/></geometry></collision></link>
-<link name="upper"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-<visual><origin xyz="0 0 0.1" rpy="0 0 1.5707963267948966"/><geometry><box size="0.1 0.2 0.3"/></geometry>
-<material name="red"><color rgba="0.9 0.1 0.1 1"/></material></visual>
-</link><joint name="j" type="continuous"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.2"/>
-<axis xyz="0 1 0"/></joint></robot>"""
+MESHES = Path(__file__).parents[1] / "data" / "meshes"
+COLLADA = (MESHES / "square.dae").read_text(encoding="utf-8")
+CUBE_OBJ = (MESHES / "box.obj").read_text(encoding="utf-8")
+ARM = (MESHES / "arm.urdf").read_text(encoding="utf-8")
 
 
 def written(path, text):

@@ -9,6 +9,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from model_files import mjcf
 from mujoco_states import mujoco_at
 from PIL import Image
 from refusals import refuses
@@ -22,22 +23,6 @@ from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._shapes import robot_surface
 from osik_jax.viewer._stage import Camera, Stage
 
-SHAPES = """<mujoco><worldbody><body name="base" pos="0.1 0.2 1">
-<joint name="yaw" axis="0 0 1"/><geom type="sphere" size="0.1"/>
-<body name="a" pos="0.5 0 0"><joint name="ja" axis="1 2 3"/>
-<geom type="capsule" size="0.05 0.2" euler="10 20 30"/></body>
-<body name="b" pos="0 0.5 0"><joint name="jb" axis="3 1 0"/><geom type="cylinder" size="0.07 0.1" pos="0.1 0 0"/></body>
-<body name="c" pos="0 -0.5 0"><joint name="jc" axis="0 1 0"/>
-<geom type="box" size="0.05 0.1 0.2" euler="0 40 0"/></body>
-<body name="d" pos="-0.5 0 0"><joint name="jd" axis="0 1 0"/><geom type="ellipsoid" size="0.05 0.1 0.2"/></body>
-</body></worldbody></mujoco>"""
-
-BARE = """<mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/>
-<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
-<body name="upper" pos="0.3 0 0"><joint name="j1" axis="0 1 0"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
-<body name="lower" pos="0 0 -0.4"><joint name="j2" axis="0 1 0"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
-<site name="tip" pos="0 0 -0.2"/></body></body></body></worldbody></mujoco>"""
-
 CAMERA = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
 BALL = """<mujoco><worldbody><body name="ball" pos="0 0 0.5"><joint name="j" axis="0 0 1"/>
 <geom type="sphere" size="0.2" rgba="1 0 0 1"/></body></worldbody></mujoco>"""
@@ -45,7 +30,7 @@ BALL = """<mujoco><worldbody><body name="ball" pos="0 0 0.5"><joint name="j" axi
 
 @pytest.fixture(scope="module")
 def shapes():
-    return osik.Robot.from_mjcf(SHAPES)
+    return osik.Robot.from_mjcf(mjcf("one_geom_of_each_kind"))
 
 
 def random_configurations(robot, count, seed=0):
@@ -145,7 +130,7 @@ def test_frame_of_a_fused_link_follows_its_body():
 
 
 def test_sticks_where_there_is_no_geom():
-    robot = osik.Robot.from_mjcf(BARE)
+    robot = osik.Robot.from_mjcf(mjcf("links_without_geoms"))
     shape = robot_parts(robot)
     assert shape.style == "sticks"
     data = mujoco_at(robot, robot.configuration({"j1": 0.3, "j2": -0.7}))
