@@ -2,7 +2,6 @@
 
 import functools
 import os
-import warnings
 
 import coal
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from collision_pairs import coal_hull, named, pair_set
 from model_files import mjcf
-from refusals import refuses
+from refusals import no_warnings, refuses
 from task_checks import kinematics_at
 
 import osik_jax as osik
@@ -536,8 +535,7 @@ class TestTooNearAtHome:
 
     @pytest.mark.slow
     def test_pairs_asked_for_by_name_are_kept_and_part(self, arm, shapes):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with no_warnings():
             limit = osik.CollisionAvoidanceLimit(
                 arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], minimum_distance=self.MINIMUM
             )
@@ -560,8 +558,7 @@ class TestTooNearAtHome:
     def test_what_is_chosen_here_is_left_out_and_can_be_seen(self, arm, shapes):
         with pytest.warns(osik.OsikWarning, match=r"not kept apart.*hand-ball \(0.005 m\)"):
             limit = osik.CollisionAvoidanceLimit(arm, shapes=shapes, minimum_distance=self.MINIMUM)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
+        with no_warnings():
             asked = osik.CollisionAvoidanceLimit(
                 arm, shapes=shapes, pairs=[("hand", "ball"), ("floor", "hand")], q0_distance=self.MINIMUM
             )
