@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikValueError
-from ..kinematics._home import compiled_kinematics
+from ..kinematics import forward_kinematics
 from ..physics._world import contact_corners
 from ..robot import Robot
 from ..robot._feet import guess_feet
@@ -58,7 +58,7 @@ def file_motion(
     q0 = start(robot, outline, moving, standing, rows)
     if robot.floating_base:
         q0 = raised(robot, q0, -robot_outline(robot, q0, look).lowest)
-    kinematics = compiled_kinematics(robot, q0)
+    kinematics = forward_kinematics(robot, q0)
     still: dict[str, Task] = {
         foot: FrameTask(robot, foot, target=kinematics.frame_pose(robot, foot), rows=rows, weight=1e4, gain=GAIN)
         for foot in standing
