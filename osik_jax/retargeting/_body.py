@@ -39,8 +39,10 @@ that begins to move in the frame before would have to accelerate beyond its limi
 # A plan stays 1 mrad (or 1 mm) inside the ranges and below 98 % of speed and acceleration limits, so that the
 # last pass, which holds the limits exactly, can follow it.
 _INSET, _SHARE = 1e-3, 0.98
-_LONG = 60
-"""Number of frames of contact beyond which a contact point gets a larger weight."""
+_LONG = 15
+"""Number of frames of contact beyond which a contact point gets a larger weight. A pull of 1 per frame, as that of a
+limb 1 rad off, then moves the point by at most ``_LONG^2 / 4`` over ``Weights.stance``, which is 0.06 mm.
+"""
 _AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
 """Shares of a joint's range: a leg joint within 1 % of an end, or an arm joint within 5 % (a GR3's elbow extends 3 %
 beyond straight), starts from a bent position. That position is 1 rad from the end, or the middle of the range if
@@ -109,7 +111,7 @@ class Build:
     Attributes:
         profile: the robot's profile.
         points: world positions of the keypoints [m]. (3,) each
-        lengths: lengths of the limbs that give the scale (``_measured``) [m].
+        lengths: lengths of the limbs that give the scale (``measured``) [m].
         ankle: height of the ankles above the soles, or of the pelvis if the robot does not walk [m].
         root: the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]. (3,)
         base: origin of the root body [m]. (3,)
@@ -145,7 +147,7 @@ class Build:
         positions, turns = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
         positions = positions + np.einsum("kij,kj->ki", turns, np.array([point for _, point in places]))
         points = dict(zip(profile.keypoints, positions, strict=False))
-        lengths = {(a, b): float(np.linalg.norm(points[b] - points[a])) for a, b in _measured(profile)}
+        lengths = {(a, b): float(np.linalg.norm(points[b] - points[a])) for a, b in measured(profile)}
         lengths |= {limb: reach_length(robot, profile, limb) for limb in profile.reached if limb in lengths}
         ankle = 0.0
         if profile.feet:
@@ -213,7 +215,7 @@ class Build:
         profile = self.profile
         if profile.scale is not None:
             return profile.scale
-        return profile.stretch * self.size / sum(person.lengths[limb] for limb in _measured(profile))
+        return profile.stretch * self.size / sum(person.lengths[limb] for limb in measured(profile))
 
     def goals(self, person: Person) -> Goals:
         """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot."""
@@ -326,7 +328,7 @@ def held_point(
     return out
 
 
-def _measured(profile: Profile) -> tuple[Limb, ...]:
+def measured(profile: Profile) -> tuple[Limb, ...]:
     """Return the limbs whose lengths are compared with the person's: the legs, or all limbs without legs."""
     return LEGS if profile.walks and len(profile.feet) == 2 else profile.reached or profile.followed
 

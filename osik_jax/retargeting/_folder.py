@@ -23,7 +23,7 @@ from ._lanes import Clip, one_a_core, shared_length
 from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
-from ._profile_file import profile_text, save_profile
+from ._profile_file import find_profile, profile_text, save_profile
 from ._report import report
 from ._retarget import Retargeter, Source
 
@@ -92,6 +92,8 @@ def retarget_folder(
         OSError: something cannot be written.
     """
     files, reader = clips_in(folder), Reader() if reader is None else reader
+    if reader.source is not None:
+        retargeter = retargeter._led_by(reader.profile or find_profile(reader.source))
     job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
     with only_job(out):
         _claim(out, job)

@@ -62,9 +62,13 @@ class OnRobot:
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
         self._pairs = pairs_apart(robot, self.profile)
-        self._body = Body.of(robot, self.profile, self._pairs, balance)
+        self._take(self.profile)
+
+    def _take(self, profile: Profile) -> None:
+        """Set the profile, and the data derived from its keypoints."""
+        self.profile, self._build = profile, Build.of(self.robot, profile)
+        self._body = Body.of(self.robot, profile, self._pairs, self.balance)
         self._bodies: dict[tuple[Limb, ...], Body] = {(): self._body}
-        self._build = Build.of(robot, self.profile)
 
     def _body_that(self, touching: tuple[Limb, ...]) -> Body:
         """Return the body data for motions that hold these pairs, made once for each set of pairs."""
@@ -78,13 +82,19 @@ class OnRobot:
         needed = tuple(dict.fromkeys(role for limb in limbs for role in limb))
         if isinstance(motion, HumanMotion):
             return find_roles(motion.joint_names, mapping, needed)
-        source = motion.seen
-        missing = [role for role in needed if role not in source.keypoints]
+        missing = self._lacks(motion.seen)
         if missing:
             raise OsikValueError(f"the robot that is followed has no {', '.join(missing)}")
-        if self.profile.walks and source.standing != self.profile.standing:
-            raise OsikValueError(f"{len(self.profile.feet)} feet cannot follow {len(source.feet)}: they walk otherwise")
+        if self.profile.walks and motion.seen.standing != self.profile.standing:
+            raise OsikValueError(
+                f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
+            )
         return {}
+
+    def _lacks(self, source: Profile) -> tuple[str, ...]:
+        """Return the roles that this robot follows and a source robot does not have."""
+        roles = dict.fromkeys(role for limb in self.profile.followed for role in limb)
+        return tuple(role for role in roles if role not in source.keypoints)
 
     def _bounds(self, dt: float) -> Bounds:
         """Return the joint bounds of a plan with one frame per ``dt`` seconds."""

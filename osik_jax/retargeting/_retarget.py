@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import itertools
 import os
@@ -14,13 +15,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, warn
 from ..execution._workers import cores
 from ..robot import Robot
 from ..scaling import run_in_chunks
 from ..scaling._progress import reported
 from ..scaling._saved import Saved
+from ._body import measured
 from ._finish import follow
+from ._guess import describe_profile
 from ._lanes import (
     LENGTHS,
     Clip,
@@ -79,11 +82,36 @@ class Retargeter(OnRobot):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
         self.smoothness = smoothness
         self.max_iterations = max_iterations
+        self._less: dict[tuple[str, ...], Retargeter] = {}
+
+    def _led_by(self, source: Profile) -> Retargeter:
+        """Return the retargeter without the limbs that a source robot lacks; this one if none or all are lacking.
+
+        An ``OsikWarning`` says which limbs are left out.
+        """
+        lacks = self._lacks(source)
+        limbs = [limb for limb in self.profile.followed if set(lacks).isdisjoint(limb)]
+        whole = len(limbs) == len(self.profile.followed)
+        if whole or not limbs or (self.profile.walks and not set(measured(self.profile)) <= set(limbs)):
+            return self
+        if lacks not in self._less:
+            own = self._less[lacks] = copy.copy(self)
+            own._take(self.profile.without(lacks))
+            warn(
+                f"the source robot has no {', '.join(lacks)}; this is followed: "
+                f"{describe_profile(self.robot, own.profile)}"
+            )
+        return self._less[lacks]
+
+    def _for(self, motion: Source) -> Retargeter:
+        return self if isinstance(motion, HumanMotion) else self._led_by(motion.seen)
 
     def retarget(
         self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """Retarget one clip; see the function ``retarget``."""
+        if (other := self._for(motion)) is not self:
+            return other.retarget(motion, fps=fps)
         clip = self._prepared(motion, mapping, fps)
         weights = self.profile.weights.smoother(self.smoothness, clip.dt)
         plan = make_plan(
@@ -120,6 +148,17 @@ class Retargeter(OnRobot):
         Raises:
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
+        makers = [self._for(motion) for motion in motions]
+        if any(own is not self for own in makers):
+            found: dict[int, Retargeted] = {}
+            for own in dict.fromkeys(makers):
+                members = [i for i, maker in enumerate(makers) if maker is own]
+                name = "_".join(["limbs", *itertools.chain(*own.profile.followed)])
+                folder = None if out is None else Path(out) / name
+                some = [motions[i] for i in members]
+                made = own.retarget_all(some, mapping=mapping, fps=fps, chunk=chunk, out=folder, progress=progress)
+                found |= dict(zip(members, made, strict=True))
+            return [found[i] for i in range(len(motions))]
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
         if out is None and one_a_core():
             with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
@@ -132,7 +171,7 @@ class Retargeter(OnRobot):
         groups: dict[tuple[int, tuple[Limb, ...]], list[int]] = {}
         for i, clip in enumerate(clips):
             groups.setdefault((shared_length(clip), clip.touching), []).append(i)
-        found: dict[int, Retargeted] = {}
+        found = {}
         for (length, touching), members in sorted(groups.items()):
             lanes = [as_lane(clips[i], length) for i in members]
             solved = run_in_chunks(

@@ -211,3 +211,16 @@ def write_bvh(
         lines.append(" ".join(repr(float(x)) for x in numbers))
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def sliding(frames: int, far: float) -> HumanMotion:
+    """A person whose feet move apart by ``2 far`` [m] and are said to stand all the time."""
+    way, points = far * (1.0 - np.cos(np.linspace(0.0, np.pi, frames))), {}
+    heights = dict(hip=0.9, shoulder=1.4, elbow=1.1, wrist=0.9, knee=0.5, ankle=0.08, heel=0.0, toe=0.0)
+    shares = dict(knee=0.5, ankle=1.0, heel=1.0, toe=1.0)
+    for side, sign in (("left", 1.0), ("right", -1.0)):
+        for name, z in heights.items():
+            x, y = {"heel": -0.05, "toe": 0.15, "knee": 0.05}.get(name, 0.0), 0.1 + shares.get(name, 0.0) * way
+            points[f"{side}_{name}"] = np.stack([np.full(frames, x), sign * y, np.full(frames, z)], 1)
+    positions = np.stack(list(points.values()), 1)
+    return HumanMotion("slides", 30.0, tuple(points), positions, contact=np.ones((frames, 4), bool))
