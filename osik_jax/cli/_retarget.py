@@ -164,7 +164,7 @@ def _fit(command: Retarget, file: Path) -> None:
     said = f"step {step} of {len(losses) - 1}: the loss of {learned} clips is {losses[step]:.3f} times what it was"
     if held_out:
         said += f", of {held_out} held out {found.held_out[step]:.3f} times"
-    Console().print(f"{said}\nwritten to {file}", markup=False, highlight=False, soft_wrap=True)
+    _say(Console(), f"{said}\nwritten to {file}")
 
 
 def _retargeter(command: Retarget) -> Retargeter:
@@ -182,7 +182,7 @@ def _retargeter(command: Retarget) -> Retargeter:
 
 
 def _retarget_folder(command: Retarget) -> int:
-    """Return all clips of a folder; returns the exit code."""
+    """Retarget all clips of a folder; return the exit code."""
     from rich.console import Console
 
     from ..retargeting._folder import retarget_folder
@@ -202,15 +202,13 @@ def _retarget_folder(command: Retarget) -> int:
     console = Console()
     if summary["clips"]:
         console.print(_table(summary))
-    console.print(
+    _say(
+        console,
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
         f"{command.out / 'report.json'}",
-        markup=False,
-        highlight=False,
-        soft_wrap=True,
     )
     for note in noted[:_MOST_NOTES]:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"note: {note}")
     if len(noted) > _MOST_NOTES:
         console.print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
     for name, reason in failed.items():
@@ -306,7 +304,12 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
     )
     console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
     for note in notes(figures, command.balance):
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+        _say(console, f"note: {note}")
+
+
+def _say(console: Console, text: str) -> None:
+    """Print a text as it is, on as many lines as it has."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _robot_to_retarget(source: str, base: str = "floating") -> Robot:

@@ -12,12 +12,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from .._errors import OsikKeyError, OsikValueError, warn
 from ._bvh_lines import Lines
 from ._motion import HumanMotion
 from ._rest_frames import rest_frames
-from ._rotations import UNTURNED, about, continuous, forward, multiply
+from ._rotations import UNTURNED, continuous, forward
 from ._up import UPS, Up, checked_up, find_up, named, standing_up
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "cmu": 0.0254 / 0.45}
@@ -200,12 +201,15 @@ def _moves(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.nda
     column, offsets = 0, np.tile([joint.offset for joint in joints], (len(values), 1, 1))
     local = np.tile(UNTURNED, (*offsets.shape[:2], 1))
     for i, joint in enumerate(joints):
-        for kind, axis in joint.channels:
+        own = values[:, column : column + len(joint.channels)]
+        column += len(joint.channels)
+        turns = [k for k, (kind, _) in enumerate(joint.channels) if kind == "rotation"]
+        for k, (kind, axis) in enumerate(joint.channels):
             if kind == "position":
-                offsets[:, i, "xyz".index(axis)] = values[:, column]
-            else:
-                local[:, i] = multiply(local[:, i], about(axis, np.radians(values[:, column])))
-            column += 1
+                offsets[:, i, "xyz".index(axis)] = own[:, k]
+        if turns:  # capital letters: about the axes that the earlier channels have turned
+            order = "".join(joint.channels[k][1] for k in turns).upper()
+            local[:, i] = Rotation.from_euler(order, own[:, turns], degrees=True).as_quat(scalar_first=True)
     return offsets, local
 
 

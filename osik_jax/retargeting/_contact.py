@@ -44,14 +44,14 @@ def find_noise(points: Float[np.ndarray, "F k 3"]) -> float:
     return float(np.quantile(np.quantile(change, _STILLEST, axis=0), _POINTS) / np.sqrt(_chi_square(_STILLEST, _AXES)))
 
 
-def noise_steps(noise: float, fps: float, speed: float = SPEED) -> int:
+def noise_steps(noise: float, fps: float) -> int:
     """Return the number of frame steps over which a speed is measured so that noise is a small share of it.
 
     A straight line fitted over n steps has a slope whose standard deviation is ``noise * fps / sqrt(n (n + 1) (n + 2) /
     12)``. The result is 1 if that is enough, and at most 0.25 s.
     """
     steps = 1
-    while steps < _LONGEST * fps and noise * fps > _SPEED_SHARE * speed * np.sqrt(_lever(steps)):
+    while steps < _LONGEST * fps and noise * fps > _SPEED_SHARE * SPEED * np.sqrt(_lever(steps)):
         steps += 1
     return steps
 
@@ -88,11 +88,10 @@ def find_contact(
     *,
     noise: float = 0.0,
     height: float = HEIGHT,
-    speed: float = SPEED,
 ) -> Bool[np.ndarray, "F k"]:
     """Return whether each point stands on the ground. (F, k).
 
-    A point stands if it is lower than ``height`` [m] above the ground and slower than ``speed`` [m/s], both since the
+    A point stands if it is lower than ``height`` [m] above the ground and slower than 0.3 m/s, both since the
     frame before and until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two
     of the windows that contain a frame, a line fitted to the point's positions must be slow, and noise must explain the
     residuals. So landing and lifting are found to the frame.
@@ -106,11 +105,10 @@ def find_contact(
         ground: height of the floor [m].
         noise: standard deviation on each coordinate [m] (``find_noise``).
         height: [m]
-        speed: [m/s]
     """
-    steps = min(noise_steps(noise, fps, speed), max(len(points) - 1, 1))
+    steps = min(noise_steps(noise, fps), max(len(points) - 1, 1))
     low = mean_over(points[..., 2], steps) - ground < height
-    stands = low & _still(points, fps, noise, speed, steps)
+    stands = low & _still(points, fps, noise, steps)
     # a contact lasts two frames at least, also at low rates
     least = max(2, round(_SHORTEST * fps))
     # two means over ``steps`` frames differ by noise with a standard deviation of noise * sqrt(2 / steps) per axis
@@ -128,9 +126,7 @@ def find_contact(
     return stands
 
 
-def _still(
-    points: Float[np.ndarray, "F k 3"], fps: float, noise: float, speed: float, steps: int
-) -> Bool[np.ndarray, "F k"]:
+def _still(points: Float[np.ndarray, "F k 3"], fps: float, noise: float, steps: int) -> Bool[np.ndarray, "F k"]:
     """Return whether at least two windows that contain a frame (or the only one) show a point at rest. (F, k)."""
     frames = len(points)
     if frames == 1:
@@ -139,8 +135,8 @@ def _still(
     time = np.arange(steps + 1) - 0.5 * steps
     slope = windows @ time / _lever(steps)
     # the threshold is lowered by the variance that noise gives a speed, up to its allowed share
-    share = 0.0 if steps == 1 else min((noise * fps) ** 2 / _lever(steps), (_SPEED_SHARE * speed) ** 2)
-    still = np.sum(slope**2, -1) * fps**2 + share < speed**2
+    share = 0.0 if steps == 1 else min((noise * fps) ** 2 / _lever(steps), (_SPEED_SHARE * SPEED) ** 2)
+    still = np.sum(slope**2, -1) * fps**2 + share < SPEED**2
     if steps > 1:
         off = windows - windows.mean(-1, keepdims=True) - slope[..., None] * time
         still &= np.sum(off**2, (-1, -2)) < noise**2 * _chi_square(_LINE, _AXES * (steps - 1))

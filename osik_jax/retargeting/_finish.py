@@ -36,7 +36,8 @@ def follow(
     dt = jnp.asarray(dt, plan.dtype)
 
     def step(state: tuple[Array, Array], goals: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        q, velocity = inside_limits(robot, *state, *goals, limits, dt)
+        velocity, _, _ = velocity_inside(robot, *state, *goals, limits, dt)
+        q, velocity = moved(robot, state[0], velocity, dt)
         return (q, velocity), (q, jnp.abs(difference(robot, q, goals[1])).max())
 
     start = inside_ranges(robot, plan[0])
@@ -46,20 +47,6 @@ def follow(
     _, (q, off) = jax.lax.scan(step, (start, velocity), (plan[:-1], plan[1:]))
     first = jnp.abs(difference(robot, start, plan[0])).max()
     return jnp.concatenate([start[None], q]), jnp.concatenate([first[None], off])
-
-
-def inside_limits(
-    robot: Robot,
-    q: Float[Array, " nq"],
-    velocity: Float[Array, " nv"],
-    goal: Float[Array, " nq"],
-    following: Float[Array, " nq"],
-    limits: Sequence[Limit],
-    dt: Float[Array, ""],
-) -> tuple[Float[Array, " nq"], Float[Array, " nv"]]:
-    """Return the next configuration and the velocity that leads to it: from near ``goal`` towards ``following``."""
-    v, _, _ = velocity_inside(robot, q, velocity, goal, following, limits, dt)
-    return moved(robot, q, v, dt)
 
 
 def velocity_inside(

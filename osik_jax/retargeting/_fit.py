@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, missing_extra
-from ..kinematics import difference, forward_kinematics
-from ..kinematics._rigid import rotate
+from ..kinematics import difference
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._body import Build
@@ -165,7 +164,10 @@ def fit(
         learned.append([value for value, _, _ in found])
         plans = [plan for _, _, plan in found]
         judged.append([setting.loss(now, problem) for problem in others])
-        scaled = [_over(slope, unit) for (_, slope, _), unit in zip(found, learned[0], strict=True)]
+        scaled = [
+            jax.tree.map(lambda leaf, unit=unit: leaf / unit, slope)
+            for (_, slope, _), unit in zip(found, learned[0], strict=True)
+        ]
         slopes: Any = jax.tree.map(lambda *leaves: sum(leaves) / len(leaves), *scaled)
         if step == steps or not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes)):
             break
@@ -175,10 +177,6 @@ def fit(
     best = int(np.nanargmin(held if others else losses))  # the last loss may be NaN
     chosen = own.profile if best == 0 else setting.profile(seen[best])
     return Fit(chosen, best, losses, held)
-
-
-def _over(slope: Any, unit: float) -> Any:
-    return jax.tree.map(lambda leaf: leaf / unit, slope)
 
 
 def _relative(losses: Sequence[Sequence[float]]) -> Float[np.ndarray, " steps"]:
@@ -321,26 +319,13 @@ _value_and_slope = jax.jit(jax.value_and_grad(_loss))
 def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
     """Return the five terms that ``FitLoss`` weighs, in its order."""
     body, problem, weights, _ = given
-    robot, keys, goals = body.robot, len(body.keys), problem.goals
-    names = tuple(dict.fromkeys(body.frames))
-    index = np.array([names.index(name) for name in body.frames])
-
-    def placed(x: Array) -> tuple[Array, Array]:
-        positions, turns = (part[index] for part in forward_kinematics(robot, x).frame_poses(robot, names))
-        return positions + rotate(turns, body.offsets), turns[keys : keys + 4]
-
-    points, turns = jax.vmap(placed)(q)
-    first, second = (np.array([limb[i] for limb in body.limbs]) for i in range(2))
-    across = points[:, second] - points[:, first]
-    length = jnp.linalg.norm(across, axis=-1)
-    length = length.at[:, len(first) - len(body.lengths) :].set(body.lengths)
-    direction = across / length[..., None]
-    tracking = jnp.sum((direction - goals.directions) ** 2, -1).mean(-1)
-    wanted = jnp.stack([goals.pelvis, goals.torso, goals.feet[:, 0], goals.feet[:, 1]], 1) @ body.home
-    asked = np.array(body.turned, int)
-    # |R - W|^2 / 2 = 2 - 2 cos of the angle between R and W: its square, up to the fourth power
-    turning = 0.5 * jnp.sum((turns - wanted)[:, asked] ** 2, (-1, -2)).sum(-1) / max(len(asked), 1)
+    robot, goals = body.robot, problem.goals
     rows = jax.vmap(lambda x, goal: frame_rows(body, x, goal, weights, problem.bounds))(q, goals)
+    # in the order of ``frame_rows``: limbs, the root, turned frames
+    limbs, turned = 3 * len(body.limbs), 3 * len(body.turned)
+    first = limbs + (3 if body.roots else 0)
+    tracking = jnp.sum(rows.residual[:, :limbs] ** 2, -1) / len(body.limbs)
+    turning = jnp.sum(rows.residual[:, first : first + turned] ** 2, -1) / max(len(body.turned), 1)
     stance, both = rows.stance.reshape(len(q), 4, 2), goals.contact[1:] * goals.contact[:-1]
     slip = _weighted_mean(both, jnp.sum((stance[1:] - stance[:-1]) ** 2, -1))
     left = jnp.sum(rows.stiff * rows.residual**2, -1) + jnp.sum(rows.joints.stiff_weight * rows.joints.stiff**2, -1)

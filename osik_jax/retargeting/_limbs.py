@@ -13,6 +13,7 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..robot._tree import BALL, HINGE
+from ._link_shapes import mesh_vertices
 from ._profile import Place, Point
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
@@ -262,10 +263,7 @@ def _vertices(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> 
     """Return the mesh vertices of some bodies in the world [m]."""
     out = [np.zeros((0, 3))]
     for geom in np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & np.isin(model.geom_bodyid, bodies)):
-        mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        turn = data.geom_xmat[geom].reshape(3, 3)
-        out.append(data.geom_xpos[geom] + model.mesh_vert[first : first + count] @ turn.T)
+        out.append(data.geom_xpos[geom] + mesh_vertices(model, int(geom)) @ data.geom_xmat[geom].reshape(3, 3).T)
     return np.concatenate(out)
 
 

@@ -100,10 +100,15 @@ def _geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
     if kind in _HALVES:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * _HALVES[kind](size)
     else:
-        mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        corners = model.mesh_vert[first : first + count].astype(float)
+        corners = mesh_vertices(model, geom)
     return model.geom_pos[geom] + corners @ rotation_matrix(model.geom_quat[geom]).T
+
+
+def mesh_vertices(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
+    """Return the vertices of a mesh geom in the geom's frame [m]."""
+    mesh = model.geom_dataid[geom]
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    return model.mesh_vert[first : first + count].astype(float)
 
 
 def _unread_points(robot: Robot, body: int) -> list[Float[np.ndarray, "k 3"]]:

@@ -62,9 +62,9 @@ class OnRobot:
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
         self._pairs = pairs_apart(robot, self.profile)
-        self._take(self.profile)
+        self._set_profile(self.profile)
 
-    def _take(self, profile: Profile) -> None:
+    def _set_profile(self, profile: Profile) -> None:
         """Set the profile, and the data derived from its keypoints."""
         self.profile, self._build = profile, Build.of(self.robot, profile)
         self._body = Body.of(self.robot, profile, self._pairs, self.balance)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 import numpy as np
-from jaxtyping import Bool
 
 from ._contact import stretches
+from ._report import joint_tracks
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
@@ -98,16 +98,20 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts = [f"<aside id=osik><h1>{_text(figures.get('clip', ''))}</h1><p>{frames} frames, {fps:g} a second</p>"]
     notes = figures["notes"]
     parts.append("<h2>What gave way</h2>")
-    parts.append(_items(notes, " class=gave") if notes else "<p>nothing</p>")
+    items = "".join(f"<li>{_text(note)}" for note in notes)
+    parts.append(f"<ul class=gave>{items}</ul>" if notes else "<p>nothing</p>")
     names = result.profile.standing
     parts.append("<h2>Contact</h2>")
     rows = {name.replace("_", " "): result.contact[:, k] for k, name in enumerate(names)}
     parts.append(_lines(rows, "#2a9d62") if names else "<p>the robot has no feet</p>")
-    ends, fast = _at_ends(result), _share_of_speed(result)
+    q, low, high, fastest = joint_tracks(result)
+    room = np.where(np.isfinite(high - low), _AT_END * (high - low), 0.0)
+    ends = (q <= low + room) | (q >= high - room)
+    speed = np.abs(np.diff(q, axis=0, prepend=q[:1])) * fps
     parts.append("<h2>Limits</h2>")
     strips = {
         "a joint at an end of its range": ends.any(1),
-        "a joint at its speed limit": (fast > _AT_SPEED).any(1),
+        "a joint at its speed limit": (speed > _AT_SPEED * fastest).any(1),
         "limits keep it from the plan": np.asarray(result.off_plan > _OFF),
     }
     parts.append(_lines(strips, "#d97b1f"))
@@ -118,24 +122,6 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts.append("<h2>Largest values</h2>")
     parts.append(_table({text: _number(figures[group][name]) for text, (group, name) in _FIGURES.items()}))
     return "".join(parts) + "</aside>"
-
-
-def _at_ends(result: Retargeted) -> Bool[np.ndarray, "F joints"]:
-    """Return whether each joint is within 1 % of an end of its range."""
-    robot, names = result.robot, result.robot.joint_names
-    dofs = [robot.joint_dof_index(name) for name in names]
-    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
-    low, high = np.asarray(robot.position_lower)[dofs], np.asarray(robot.position_upper)[dofs]
-    room = np.where(np.isfinite(high - low), _AT_END * (high - low), 0.0)
-    return (q <= low + room) | (q >= high - room)
-
-
-def _share_of_speed(result: Retargeted) -> np.ndarray:
-    """Return each joint's speed over its limit, 0 in the first frame. (F, joints)."""
-    robot, names = result.robot, result.robot.joint_names
-    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
-    limit = np.asarray(robot.velocity_limit)[[robot.joint_dof_index(name) for name in names]]
-    return np.abs(np.diff(q, axis=0, prepend=q[:1])) * result.motion.fps / limit
 
 
 def _lines(rows: Mapping[str, Any], color: str) -> str:
@@ -157,10 +143,6 @@ def _table(rows: Mapping[str, str]) -> str:
 def _number(value: float | None) -> str:
     """Return a number with two decimals, whole ones without."""
     return "-" if value is None else f"{value:.2f}".removesuffix(".00")
-
-
-def _items(texts: Iterable[str], attributes: str) -> str:
-    return f"<ul{attributes}>" + "".join(f"<li>{_text(text)}" for text in texts) + "</ul>"
 
 
 def _text(text: object) -> str:

@@ -59,16 +59,6 @@ class Person:
     objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
     touches: tuple[Touch, ...] = ()
 
-    @property
-    def directions(self) -> Float[np.ndarray, "F limbs 3"]:
-        """Return unit vectors along those of ``LIMBS`` with known ends."""
-        return directions(self.points, [limb for limb in LIMBS if set(limb) <= set(self.points)])
-
-    @property
-    def leg(self) -> float:
-        """Return the length of a leg, thigh and shank [m]."""
-        return 0.5 * float(sum(self.lengths[limb] for limb in LEGS))
-
 
 def unit(vector: np.ndarray) -> np.ndarray:
     """Return vectors scaled to unit length; the x axis where the length is 0. (..., 3)."""
@@ -333,10 +323,7 @@ def _flat(points: Mapping[str, np.ndarray], side: str) -> dict[str, np.ndarray]:
     ankle, toe = points[f"{side}_ankle"][:, 2], points[f"{side}_toe"][:, 2]
     low = np.argsort(ankle + toe, kind="stable")[: int(np.ceil(_FLAT * len(toe)))]
     frame = low[np.argsort((ankle - toe)[low], kind="stable")[len(low) // 2]]
-    return {
-        name: points[f"{side}_{name.split('_', 1)[1]}"][frame, None]
-        for name in (f"{side}_knee", f"{side}_ankle", f"{side}_toe")
-    }
+    return {role: points[role][frame, None] for role in (f"{side}_knee", f"{side}_ankle", f"{side}_toe")}
 
 
 def _heel(points: Mapping[str, np.ndarray], flat: Mapping[str, np.ndarray], side: str) -> np.ndarray:

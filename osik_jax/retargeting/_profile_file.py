@@ -70,6 +70,9 @@ def profile_text(profile: Profile) -> str:
     lines += ["rolls = true"] if profile.rolls else []
     given = {name: getattr(profile, name) for name in ("limbs", "reaches")}
     lines += [f"{name} = {json.dumps(limbs)}" for name, limbs in given.items() if limbs is not None]
+    rows = [f'frame = "{c.frame}", start = {_point(c.start)}, end = {_point(c.end)}, radius = {c.radius!r}'
+            for c in profile.capsules]  # fmt: skip
+    lines += ["capsules = [", *(f"    {{ {row} }}," for row in rows), "]"] if rows else []
     lines += ["", "[keypoints]"]
     lines += [f'{role} = {{ frame = "{f}", point = {_point(p)} }}' for role, (f, p) in profile.keypoints.items()]
     for side, foot in profile.feet.items():
@@ -80,9 +83,6 @@ def profile_text(profile: Profile) -> str:
     for field in dataclasses.fields(Weights):
         value = np.asarray(getattr(profile.weights, field.name), float)
         lines.append(f"{field.name} = {_point(value) if value.ndim else repr(float(value))}")
-    for capsule in profile.capsules:
-        lines += ["", "[[capsules]]", f'frame = "{capsule.frame}"']
-        lines += [f"start = {_point(capsule.start)}", f"end = {_point(capsule.end)}", f"radius = {capsule.radius!r}"]
     return "\n".join(lines) + "\n"
 
 

@@ -52,12 +52,17 @@ def report(result: Retargeted) -> dict[str, Any]:
     return {**figures, "notes": notes(figures)}
 
 
-def _joints(result: Retargeted) -> dict[str, Any]:
-    robot, fps = result.robot, result.motion.fps
-    names = robot.joint_names
+def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return positions of the named joints, their ranges and speed limits. (F, joints), then (joints,) each."""
+    robot, names = result.robot, result.robot.joint_names
     dofs = [robot.joint_dof_index(name) for name in names]
-    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
     low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
+    return result.q[:, [robot.joint_qpos_index(name) for name in names]], low, high, fast
+
+
+def _joints(result: Retargeted) -> dict[str, Any]:
+    (q, low, high, fast), fps = joint_tracks(result), result.motion.fps
+    names = result.robot.joint_names
     speed = np.diff(q, axis=0) * fps
     change = np.abs(np.diff(speed, axis=0))
     worst = int(np.argmax(change.max(0)))

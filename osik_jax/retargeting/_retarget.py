@@ -22,7 +22,6 @@ from ..scaling import run_in_chunks
 from ..scaling._progress import reported
 from ..scaling._saved import Saved
 from ._body import measured
-from ._finish import follow
 from ._guess import describe_profile
 from ._lanes import (
     LENGTHS,
@@ -40,7 +39,6 @@ from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
 from ._path import with_path
 from ._person import read_person
-from ._plan import make_plan
 from ._profile import Limb, Profile
 from ._retargeted import Retargeted, as_retargeted
 from ._source_motion import SourceMotion
@@ -96,7 +94,7 @@ class Retargeter(OnRobot):
             return self
         if lacks not in self._less:
             own = self._less[lacks] = copy.copy(self)
-            own._take(self.profile.without(lacks))
+            own._set_profile(self.profile.without(lacks))
             warn(
                 f"the source robot has no {', '.join(lacks)}; this is followed: "
                 f"{describe_profile(self.robot, own.profile)}"
@@ -113,12 +111,7 @@ class Retargeter(OnRobot):
         if (other := self._for(motion)) is not self:
             return other.retarget(motion, fps=fps)
         clip = self._prepared(motion, mapping, fps)
-        weights = self.profile.weights.smoother(self.smoothness, clip.dt)
-        plan = make_plan(
-            self._body_that(clip.touching), clip.goals, weights, clip.bounds, clip.start, self.max_iterations
-        )
-        q, off = follow(self.robot, plan.q, self.limits, clip.dt)
-        return self._finished(clip, Solved(q, off, plan.iterations, plan.cost))
+        return self._made(clip, len(clip.start))
 
     def retarget_all(
         self,
@@ -148,17 +141,8 @@ class Retargeter(OnRobot):
         Raises:
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
-        makers = [self._for(motion) for motion in motions]
-        if any(own is not self for own in makers):
-            found: dict[int, Retargeted] = {}
-            for own in dict.fromkeys(makers):
-                members = [i for i, maker in enumerate(makers) if maker is own]
-                name = "_".join(["limbs", *itertools.chain(*own.profile.followed)])
-                folder = None if out is None else Path(out) / name
-                some = [motions[i] for i in members]
-                made = own.retarget_all(some, mapping=mapping, fps=fps, chunk=chunk, out=folder, progress=progress)
-                found |= dict(zip(members, made, strict=True))
-            return [found[i] for i in range(len(motions))]
+        if any(self._for(motion) is not self for motion in motions):
+            return self._from_sources(motions, out, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
         if out is None and one_a_core():
             with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
@@ -171,7 +155,7 @@ class Retargeter(OnRobot):
         groups: dict[tuple[int, tuple[Limb, ...]], list[int]] = {}
         for i, clip in enumerate(clips):
             groups.setdefault((shared_length(clip), clip.touching), []).append(i)
-        found = {}
+        found: dict[int, Retargeted] = {}
         for (length, touching), members in sorted(groups.items()):
             lanes = [as_lane(clips[i], length) for i in members]
             solved = run_in_chunks(
@@ -187,6 +171,19 @@ class Retargeter(OnRobot):
             for lane, i in enumerate(members):
                 found[i] = self._finished(clips[i], jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
         return [found[i] for i in range(len(clips))]
+
+    def _from_sources(
+        self, motions: Sequence[Source], out: str | os.PathLike[str] | None, **options: Any
+    ) -> list[Retargeted]:
+        """Retarget clips of which some lack limbs, each by the retargeter and in a folder of its limbs."""
+        makers, found = [self._for(motion) for motion in motions], {}
+        for own in dict.fromkeys(makers):
+            members = [i for i, maker in enumerate(makers) if maker is own]
+            lacks = [role for role in self.profile.keypoints if role not in own.profile.keypoints]
+            folder = None if out is None else Path(out) / "_".join(["without", *lacks])
+            made = own.retarget_all([motions[i] for i in members], out=folder, **options)
+            found |= dict(zip(members, made, strict=True))
+        return [found[i] for i in range(len(motions))]
 
     def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """Return a clip as arrays for planning, after checking it."""
@@ -243,7 +240,11 @@ class Retargeter(OnRobot):
     def _made_by_a_core(self, checked: _Checked) -> Retargeted:
         """Retarget one checked clip in one thread; other threads compute while this one holds the GIL."""
         clip = self._read(*checked)
-        solved = solve_lane(as_lane(clip, shared_length(clip)), *self._shared(clip.touching))
+        return self._made(clip, shared_length(clip))
+
+    def _made(self, clip: Clip, length: int) -> Retargeted:
+        """Retarget one clip by a program for ``length`` frames."""
+        solved = solve_lane(as_lane(clip, length), *self._shared(clip.touching))
         return self._finished(clip, jax.tree.map(np.asarray, solved))
 
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:

@@ -8,8 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-Axis = str
-_UNIT = {"x": 0, "y": 1, "z": 2}
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion of no rotation."""
 
@@ -46,14 +44,6 @@ def forward(
     return positions, rotations
 
 
-def about(axis: Axis, angle: np.ndarray) -> np.ndarray:
-    """Return the quaternion of a rotation about a coordinate axis by an angle [rad]. (..., 4)."""
-    half = 0.5 * np.asarray(angle, float)
-    out = np.zeros((*half.shape, 4))
-    out[..., 0], out[..., 1 + _UNIT[axis]] = np.cos(half), np.sin(half)
-    return out
-
-
 def continuous(quaternion: np.ndarray) -> np.ndarray:
     """Return the same rotations with the quaternion sign nearest to the frame before. (F, ..., 4)."""
     if len(quaternion) < 2:
@@ -65,19 +55,9 @@ def continuous(quaternion: np.ndarray) -> np.ndarray:
 
 def slerp(a: np.ndarray, b: np.ndarray, part: np.ndarray) -> np.ndarray:
     """Return the spherical interpolation from a to b along the shorter arc, at a fraction in [0, 1]. (..., 4)."""
-    dot = np.sum(a * b, -1, keepdims=True)
-    b, dot = np.where(dot < 0.0, -b, b), np.clip(np.abs(dot), 0.0, 1.0)
-    angle, part = np.arccos(dot), np.asarray(part)[..., None]
-    # the sines' quotient loses digits there; the straight line is exact to 1e-12
-    small = angle < 1e-6
-    sine = np.where(small, 1.0, np.sin(angle))
-    out = np.where(small, a + part * (b - a), (np.sin((1.0 - part) * angle) * a + np.sin(part * angle) * b) / sine)
-    return out / np.linalg.norm(out, axis=-1, keepdims=True)
-
-
-def matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrices of unit quaternions. (..., 3, 3)."""
-    return np.stack([rotate(quaternion, axis) for axis in np.eye(3)], -1)
+    first, last = (Rotation.from_quat(q.reshape(-1, 4), scalar_first=True) for q in (a, b))
+    moved = Rotation.from_rotvec(np.reshape(part, (-1, 1)) * (first.inv() * last).as_rotvec())
+    return (first * moved).as_quat(scalar_first=True).reshape(a.shape)
 
 
 def moved_poses(

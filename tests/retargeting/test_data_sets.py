@@ -10,7 +10,18 @@ import dataclasses
 
 import numpy as np
 import pytest
-from motion_files import FIGURE, Figure, along_x, dancer, renamed, with_between, with_rest, write_bvh
+from motion_files import (
+    FIGURE,
+    Figure,
+    along_x,
+    assert_same_person,
+    renamed,
+    seen,
+    turned_dancer,
+    with_between,
+    with_rest,
+    write_bvh,
+)
 from scipy.spatial.transform import Rotation
 from small_robots import quietly, robot_of
 
@@ -19,20 +30,7 @@ from osik_jax.retargeting import HumanMotion, Retargeter, find_roles, load_motio
 from osik_jax.retargeting._path import with_path
 from osik_jax.retargeting._person import read_person
 
-SAME = ("directions", "pelvis", "torso", "feet", "root", "contact")
 SIDES = {"Left": "left", "Right": "right"}
-
-
-def figure(frames=24, fps=30.0):
-    """The dancer, turned by 25 degrees about the vertical."""
-    own = dancer(frames, fps)
-    angles = own.angles.copy()
-    angles[:, 0, 2] = 25.0
-    return dataclasses.replace(own, angles=angles)
-
-
-def seen(motion):
-    return read_person(motion, find_roles(motion.joint_names))
 
 
 def is_figure(motion, own):
@@ -40,9 +38,7 @@ def is_figure(motion, own):
     positions, _ = own.forward()
     z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     names = tuple(name for name, _, _ in FIGURE)
-    truth, person = seen(HumanMotion("truth", own.fps, names, positions @ z_up.T)), seen(motion)
-    for name in SAME:
-        np.testing.assert_allclose(getattr(person, name), getattr(truth, name), atol=2e-8, err_msg=name)
+    person = assert_same_person(motion, seen(HumanMotion("truth", own.fps, names, positions @ z_up.T)))
     assert person.fps == own.fps and person.contact.all()
     across = person.points["left_shoulder"] - person.points["right_shoulder"]
     assert (np.cross(across, [0.0, 0.0, 1.0]) @ [np.cos(np.radians(25)), np.sin(np.radians(25)), 0.0] > 0.3).all()
@@ -68,17 +64,17 @@ def rounded(path, digits):
 
 def test_lafan1(tmp_path):
     """Bones along x on both sides, channels z y x, centimetres, 22 joints; OFFSET of the root is its first place."""
-    own = with_shoulders(with_between(with_between(figure(), "Spine1", "Neck", 0.3), "Spine2", "Neck", 0.5))
+    own = with_shoulders(with_between(with_between(turned_dancer(), "Spine1", "Neck", 0.3), "Spine2", "Neck", 0.5))
     own = renamed(elsewhere(own, (-2.2, 0.9, -4.3)), lambda name: name.replace("ToeBase", "Toe"))
     file = write_bvh(tmp_path / "dance1_subject1.bvh", with_rest(own, along_x(own), "ZYX"), 0.01)
     motion = load_motion(rounded(file, 6))
-    is_figure(motion, figure())
+    is_figure(motion, turned_dancer())
     assert len(motion.joint_names) == 22 and motion.rest_positions is None
 
 
 def test_bandai_namco(tmp_path):
     """A root that rests on the floor, six channels in every joint, bones of the right against x, centimetres."""
-    own = with_shoulders(with_between(figure(), "Chest", "Neck", 0.4))
+    own = with_shoulders(with_between(turned_dancer(), "Chest", "Neck", 0.4))
     parts = dict(Arm="UpperArm", ForeArm="LowerArm", Hand="Hand", UpLeg="UpperLeg", Leg="LowerLeg", Foot="Foot",
                  ToeBase="Toes", Shoulder="Shoulder")  # fmt: skip
     turns = along_x(own, "Right")
@@ -86,12 +82,12 @@ def test_bandai_namco(tmp_path):
     own = renamed(elsewhere(own, (0.01, 0.94, -4.5)), lambda name: names.get(name, name))
     file = tmp_path / "dataset-1_bow_normal_001.bvh"
     write_bvh(file, with_rest(own, turns), 0.01, floor="joint_Root", all_move=True)
-    is_figure(load_motion(rounded(file, 7)), figure())
+    is_figure(load_motion(rounded(file, 7)), turned_dancer())
 
 
 def test_soma(tmp_path):
     """Thighs called Leg, a root on the floor above Hips, fingers, eyes and ends as joints, 120 frames a second."""
-    own = with_between(with_between(figure(40, 120.0), "Spine1", "Spine", 0.5), "Chest", "Neck", 0.3)
+    own = with_between(with_between(turned_dancer(40, 120.0), "Spine1", "Spine", 0.5), "Chest", "Neck", 0.3)
     own = with_shoulders(with_between(own, "Neck2", "Head", 0.4))
     names = dict(Spine="Spine2", Neck="Neck1")
     names |= {side + part: side + theirs for side in SIDES for part, theirs in (("UpLeg", "Leg"), ("Leg", "Shin"))}
@@ -107,7 +103,7 @@ def test_soma(tmp_path):
     own = Figure((*own.joints, *joints), own.root, angles, own.orders[:1] * (len(own.joints) + len(joints)), 120.0)
     for which, turns in (("bones along x", along_x(own)), ("T pose", np.tile(np.eye(3), (len(own.joints), 1, 1)))):
         file = write_bvh(tmp_path / f"{which}.bvh", with_rest(own, turns, "ZYX"), 0.01, floor="Root")
-        is_figure(load_motion(rounded(file, 6)), figure(40, 120.0))
+        is_figure(load_motion(rounded(file, 6)), turned_dancer(40, 120.0))
 
 
 JOINTS = {
@@ -355,3 +351,17 @@ def test_cmu(tmp_path):
     person = seen(motion)
     assert 1.2 < person.points["head"][:, 2].max() < 1.7 and (person.pelvis[:, 2, 2] > 0.9).all()
     assert (person.points["left_hip"] - person.points["right_hip"] > 0.1)[:, 1].all()
+    assert motion.fps == 120.0
+    file = tmp_path / "07_01.amc"
+    text = file.read_text()
+    for changed, message in (
+        (text.replace("lfemur ", "lfemur x ", 1), "line 1?[0-9]: lfemur with 4"),
+        (":DEGREES\n", "has no frames"),
+        (text.replace("ltibia", "nothing", 1), "nothing with 1 numbers is not expected here"),
+    ):
+        file.write_text(changed)
+        with pytest.raises(ValueError, match=message):
+            load_motion(file)
+    (tmp_path / "07.asf").unlink()
+    with pytest.raises(ValueError, match=r"needs its skeleton, an .asf file beside it; there are 0"):
+        load_motion(file)

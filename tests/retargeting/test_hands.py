@@ -1,13 +1,13 @@
 """Hands that follow 21 keypoints: fingertips beside those of a larger hand, and beside a search by SciPy."""
 
 import dataclasses
-import warnings
 
 import mujoco
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from small_robots import quietly
 
 import osik_jax as osik
 from osik_jax.retargeting import (
@@ -57,12 +57,6 @@ def hand_of(names, finger=FINGER, wrist="", follow=False):
         <body name="palm">{wrist}<geom type="box" pos="0 0 0.05" size="0.015 0.04 0.05"/>{inside}</body></body>
         </worldbody><equality>{coupled}</equality></mujoco>""",
     )
-
-
-def quietly(make, *arguments, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", osik.OsikWarning)
-        return make(*arguments, **options)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from typing import Any
 from xml.etree import ElementTree
 
 import jax
@@ -14,6 +15,7 @@ from motion_files import bent_forward, dancer, sliding, with_first, write_bvh
 from other_processes import finish, start
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from small_robots import nao_soles
 
 import osik_jax as osik
 from osik_jax import cli
@@ -53,11 +55,6 @@ from osik_jax.robot.loading import example_urdf
 
 FPS = 30.0
 HIGHEST = jax.lax.Precision.HIGHEST
-
-
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
 
 
 @pytest.fixture(scope="module")
@@ -170,14 +167,8 @@ def test_nao_dances_with_its_feet_where_they_are(nao, danced):
     assert figures["shapes"]["penetration_mm_max"] == 0.0
     assert figures["joints"]["jump_frames"] == 0 and figures["joints"]["beyond_range_max"] == 0.0
     # the same from the file's numbers alone: soles stand where MuJoCo has them
-    model = nao.mj_model
-    data, corners = mujoco.MjData(model), []
-    for qpos in danced.motion.qpos:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        corners.append([data.site(f"{side}_sole_corner_{k}").xpos.copy() for side in "lr" for k in range(4)])
-    drift = np.ptp(np.array(corners), axis=0)
-    assert np.abs(np.array(corners)[..., 2]).max() < 1e-5 and drift.max() < 1e-5
+    corners = nao_soles(nao, danced.motion.qpos)
+    assert np.abs(corners[..., 2]).max() < 1e-5 and np.ptp(corners, axis=0).max() < 1e-5
     assert np.ptp(danced.q[:, 2]) > 0.005  # and the waist goes down and up
 
 
@@ -223,12 +214,11 @@ def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, lea
     margins = []
     for result in (free, kept):
         margins.append([])
-        for qpos in result.motion.qpos:
+        for qpos, corners in zip(result.motion.qpos, nao_soles(nao, result.motion.qpos), strict=True):
             data = mujoco.MjData(nao.mj_model)
             data.qpos[:] = qpos
             mujoco.mj_forward(nao.mj_model, data)
-            corners = [data.site(f"{side}_sole_corner_{k}").xpos[:2] for side in "lr" for k in range(4)]
-            margins[-1].append(-edge_distance(data.subtree_com[0, :2], np.array(corners)))
+            margins[-1].append(-edge_distance(data.subtree_com[0, :2], corners[:, :2]))
     without, within = map(min, margins)
     assert without < -0.01 and within > 0.01 - 5e-5
     figures = report(kept)
@@ -392,10 +382,17 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
         retarget_folder(Retargeter(nao), out, tmp_path / "none", progress=False)
 
 
-def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(nao, dance, danced, tmp_path, capsys):
+def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danced, tmp_path, capsys):
+    """A hand that holds what moves by 2 m drags the feet along."""
     assert report(danced)["notes"] == []
-    arguments = ["--acceleration", "0.5", "--no-animation", "--out", str(tmp_path / "out")]
-    assert cli.main(["retarget", str(dance), *arguments]) == 0
+    motion, many = load_motion(dance), tmp_path / "clips"
+    box = np.linspace([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], motion.frames)
+    held: Any = {"object.box": box, "touch.left_wrist.box": np.ones(motion.frames, bool)}
+    many.mkdir()
+    names = np.array(motion.joint_names)
+    np.savez(many / "dance.npz", fps=FPS, positions=motion.positions, joint_names=names, **held)
+    arguments = ["--no-animation", "--out", str(tmp_path / "out")]
+    assert cli.main(["retarget", str(many / "dance.npz"), *arguments]) == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
     assert figures["feet"]["slip_mm_max"] > 1.0
@@ -406,9 +403,6 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(nao, dance,
     tipped = {**whole, "balance": {"com_margin_mm_min": -3.0}, "shapes": {"penetration_mm_max": 2.5}}
     assert notes(tipped) == ["a bound gave way: shapes overlap by 2.5 mm"]
     assert notes(tipped, 0.01)[1] == "a bound gave way: the centre of mass is 3.0 mm outside the feet"
-    many = tmp_path / "clips"
-    many.mkdir()
-    (many / "dance.bvh").write_bytes(dance.read_bytes())
     assert cli.main(["retarget", str(many), *arguments[:-1], str(tmp_path / "all")]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "note: dance: a bound gave way: " in told
@@ -552,7 +546,7 @@ def test_trunk_and_feet_are_turned_as_the_person_is(dance):
     np.testing.assert_allclose(person.feet[:, 0, 2, 0], 0.0, atol=1e-9)  # flat
     for name in ("left_heel", "left_toe"):
         np.testing.assert_allclose(person.points[name][:, 2], 0.0, atol=1e-9)
-    assert person.contact.all() and person.leg == pytest.approx(0.83)
+    assert person.contact.all() and person.lengths["left_hip", "left_knee"] == pytest.approx(0.42)
 
 
 @pytest.mark.variants(slow=["90.0", "180.0"])
@@ -579,17 +573,9 @@ def test_the_left_of_two_is_told_by_name():
         assert by_name(pair) == pair
 
 
-@pytest.mark.slow
-def test_what_stands_for_long_does_not_creep(nao, tmp_path):
-    # what a foot gives way adds up: 0.12 mm in these 20 s, before it was held more firmly the longer it stands
-    motion = load_motion(write_bvh(tmp_path / "long.bvh", dancer(600)))
-    figures = report(retarget(nao, motion))
-    assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.01
-
-
 def test_feet_stay_where_limbs_pull_at_them(nao):
-    """The legs of a person whose standing feet move apart pull for 59 frames, which moved a NAO's feet by 0.65 mm."""
-    figures = report(Retargeter(nao).retarget(sliding(59, 0.1)))
+    """The legs of a person whose standing feet move apart pull for 90 frames; a step's slip adds up over all frames."""
+    figures = report(Retargeter(nao).retarget(sliding(90, 0.1)))
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.01
     assert figures["tracking"]["segment_angle_deg_mean"] > 1.0  # so that they pull
 
@@ -820,7 +806,7 @@ def test_products_are_in_full_precision(nao, dance):
 
 
 def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
-    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.0)
+    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.1)
     save_profile(profile, tmp_path / "robot.toml")
     assert load_profile(tmp_path / "robot.toml") == profile
     with pytest.raises(KeyError, match="no frame 'pelvis'"):
@@ -832,7 +818,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         ("limb = 1.0", "limb = -1.0", "weights.limb is -1.0"),
         ("left_hip = ", "left_hips = ", "no keypoints left_hip"),
         ("scale = 0.8", "scale = 0.0", "scale is 0.0"),
-        ("scale = 0.8", "stretch = 0.0", "stretch is 0.0"),
+        ("stretch = 1.1", "stretch = 0.0", "stretch is 0.0"),
         ("[feet.left]", "[feet.left", "is no TOML"),
         ("radius = ", "radius = -", "radius and the length have to be more than 0"),
     ):
@@ -856,12 +842,6 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
         retarget(nao, short)
     with pytest.raises(ValueError, match="has no left_hip"):
         retarget(nao, HumanMotion("clip", 30.0, ("Hips",), np.zeros((5, 1, 3))))
-
-
-def test_a_profile_comes_back_from_its_file(tmp_path):
-    changed = dataclasses.replace(load_profile("nao"), stretch=1.1)
-    save_profile(changed, tmp_path / "robot.toml")
-    assert load_profile(tmp_path / "robot.toml") == changed
 
 
 @pytest.mark.release

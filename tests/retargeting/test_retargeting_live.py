@@ -8,10 +8,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from motion_files import bent_forward, dancer, write_bvh
+from small_robots import nao_soles
 
 import osik_jax as osik
 from osik_jax import cli
@@ -21,11 +21,6 @@ from osik_jax.retargeting._stance import Stance, hold_feet
 from osik_jax.retargeting._terms import soles
 
 FPS, LOOK_AHEAD = 30.0, 5
-
-
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
 
 
 @pytest.fixture(scope="module")
@@ -92,13 +87,8 @@ def test_feet_hold_exactly_at_any_rate_with_few_iterations(nao, motion):
     assert live.frames_ahead == 32 and live.latency == pytest.approx(32 / 120)
     frames = streamed(live, fast.positions[:50])
     assert len(frames) == 50 and max(frame.iterations for frame in frames) <= 3
-    data, corners = mujoco.MjData(nao.mj_model), []
-    for frame in frames:
-        data.qpos[:] = np.asarray(nao.mujoco_qpos(frame.q))
-        mujoco.mj_kinematics(nao.mj_model, data)
-        corners.append([data.site(f"{side}_sole_corner_{k}").xpos.copy() for side in "lr" for k in range(4)])
-    corners, stands = np.array(corners), np.array([frame.contact for frame in frames])
-    assert stands.all()
+    corners = nao_soles(nao, [np.asarray(nao.mujoco_qpos(frame.q)) for frame in frames])
+    assert all(frame.contact.all() for frame in frames)
     assert np.abs(corners[..., 2]).max() < 2e-6 and np.ptp(corners[..., :2], axis=0).max() < 4e-6
     assert max(frame.feet_off for frame in frames) < 2e-6
     assert_limits_hold(nao, frames, 120.0)
@@ -124,13 +114,8 @@ def test_a_step_whose_bounds_let_no_foot_hold_is_no_worse_than_planned(nao, live
     planned = np.asarray(held(step, step, step)[2])
     assert (found >= lower - 1e-15).all() and (found <= upper + 1e-15).all()
     assert (off <= planned * (1.0 + 1e-9)).all() and (off < 0.5 * planned).any() and off.max() > 1e-4
-    data = mujoco.MjData(nao.mj_model)
-    names = [f"{side}_sole_corner_{k}" for side in "lr" for k in range(4)]
-    for one, error in zip(q, off, strict=True):
-        data.qpos[:] = np.asarray(nao.mujoco_qpos(one))
-        mujoco.mj_kinematics(nao.mj_model, data)
-        heights = np.abs([data.site(name).xpos[2] for name in names])
-        assert heights.max() <= error + 1e-9
+    corners = nao_soles(nao, [np.asarray(nao.mujoco_qpos(one)) for one in q])
+    assert (np.abs(corners[..., 2]).max(1) <= off + 1e-9).all()
 
 
 def lifted_until(motion, frame, count, aside):
@@ -166,11 +151,8 @@ def test_a_foot_that_cannot_land_in_time_is_told(nao, motion):
     frames = [frame for frame in found if frame is not None] + live.finish()
     told = [f for f, frame in enumerate(frames) if frame.status is LiveStatus.FEET_OFF]
     assert told[0] == 12 and all((frame.feet_off > 1e-3) == (f in told) for f, frame in enumerate(frames))
-    data = mujoco.MjData(nao.mj_model)
-    data.qpos[:] = np.asarray(nao.mujoco_qpos(frames[12].q))
-    mujoco.mj_kinematics(nao.mj_model, data)
-    heights = [data.site(f"{side}_sole_corner_{k}").xpos[2] for side in "lr" for k in range(4)]
-    assert frames[12].feet_off == pytest.approx(np.abs(heights).max(), abs=1e-3) and np.abs(heights).max() > 5e-3
+    height = np.abs(nao_soles(nao, [np.asarray(nao.mujoco_qpos(frames[12].q))])[..., 2]).max()
+    assert frames[12].feet_off == pytest.approx(height, abs=1e-3) and height > 5e-3
     assert_limits_hold(nao, frames, motion.fps, 20.0)
 
 

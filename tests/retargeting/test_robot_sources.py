@@ -26,11 +26,6 @@ from osik_jax.retargeting._roles import HAND, LIMBS, NEEDED
 
 
 @pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
-
-
-@pytest.fixture(scope="module")
 def danced(nao, tmp_path_factory):
     """A NAO that dances, its file, and what retargets to it."""
     retargeter = Retargeter(nao)
@@ -108,7 +103,7 @@ def test_limbs_that_a_source_lacks_are_left_out(tmp_path):
     assert set(whole.profile.followed) - set(led.profile.followed) == {LIMBS[5], LIMBS[7]}
     assert figures["tracking"]["segment_angle_deg_mean"] < 1.0 and figures["feet"]["slip_mm_max"] < 0.1
     elbows = [whole.robot.joint_qpos_index(f"{side}_elbow") for side in ("left", "right")]
-    np.testing.assert_allclose(led.q[:, elbows], np.asarray(whole.robot.q0)[elbows], atol=0.01)
+    assert np.abs(led.q[:, elbows] - np.asarray(whole.robot.q0)[elbows]).max() < 0.01
     both = whole.retarget_all([dance, source], out=tmp_path / "batch", progress=False)
     np.testing.assert_allclose(both[1].q, led.q, atol=1e-5)
     assert len(both[0].profile.followed) == len(LIMBS)

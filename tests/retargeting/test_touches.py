@@ -65,11 +65,6 @@ def on(poses, points):
     return Rotation.from_quat(poses[:, 3:], scalar_first=True).inv().apply(points - poses[:, :3])
 
 
-@pytest.fixture(scope="module")
-def nao():
-    return osik.load_robot("nao")
-
-
 @pytest.mark.slow
 def test_wrists_stay_where_they_hold_the_box(nao):
     motion = carrying()

@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import HumanMotion
+from osik_jax.retargeting import HumanMotion, find_roles
+from osik_jax.retargeting._person import Person, directions, read_person
+from osik_jax.retargeting._roles import LIMBS
 
 FIGURE = (
     ("Hips", -1, (0.0, 0.0, 0.0)),
@@ -85,6 +87,29 @@ def dancer(frames: int = 24, fps: float = 30.0) -> Figure:
     root = np.zeros((frames, 3))
     root[:, 1] = 0.08 + 0.02 + thigh * np.cos(np.radians(bend)) + shank * np.cos(np.radians(lean))
     return Figure(FIGURE, root, angles, ("ZXY",) * len(FIGURE), fps)
+
+
+def turned_dancer(frames: int = 24, fps: float = 30.0) -> Figure:
+    """The dancer, turned by 25 degrees about the vertical."""
+    own = dancer(frames, fps)
+    angles = own.angles.copy()
+    angles[:, 0, 2] = 25.0  # z, x, y
+    return dataclasses.replace(own, angles=angles)
+
+
+def seen(motion: HumanMotion) -> Person:
+    """The person of a clip whose joints are told by their names."""
+    return read_person(motion, find_roles(motion.joint_names))
+
+
+def assert_same_person(motion: HumanMotion, truth: Person, atol: float = 2e-8) -> Person:
+    """The clip shows a person, whatever its file looks like."""
+    person = seen(motion)
+    for name in ("pelvis", "torso", "feet", "root", "contact"):
+        np.testing.assert_allclose(getattr(person, name), getattr(truth, name), atol=atol, err_msg=name)
+    found, known = (directions(own.points, LIMBS) for own in (person, truth))
+    np.testing.assert_allclose(found, known, atol=atol)
+    return person
 
 
 def with_rest(own: Figure, turns: np.ndarray, orders: str = "ZXY") -> Figure:

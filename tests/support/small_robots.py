@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import mujoco
 import numpy as np
 
 import osik_jax as osik
@@ -40,6 +41,16 @@ PAW = """<body name="{s}_hip" pos="{x} {y} 0"><joint name="{s}_abduction" axis="
   <geom type="capsule" fromto="0 0 0 0.12 0 -0.2" size="0.015"/><geom name="{s}_ball" pos="0.12 0 -0.2" size="0.02"/>
   <site name="{s}_foot" pos="0.12 0 -0.2"/></body></body></body>"""
 SIDES = (("left", 1.0), ("right", -1.0))
+
+
+def nao_soles(nao: osik.Robot, qpos: Iterable[np.ndarray]) -> np.ndarray:
+    """Corners of a NAO's soles in the world by MuJoCo, from configurations of its model [m]. (F, 8, 3)."""
+    data, corners = mujoco.MjData(nao.mj_model), []
+    for own in qpos:
+        data.qpos[:] = own
+        mujoco.mj_kinematics(nao.mj_model, data)
+        corners.append([data.site(f"{side}_sole_corner_{k}").xpos.copy() for side in "lr" for k in range(4)])
+    return np.array(corners)
 
 
 def robot_of(*parts: str, free: bool = True, turn: float = 0.0, forearm: str = FOREARM) -> osik.Robot:
