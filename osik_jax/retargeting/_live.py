@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 import time
 from collections.abc import Mapping, Sequence
@@ -242,6 +243,8 @@ class LiveRetargeter(OnRobot):
         own = read_person(motion, self.roles, self._measures, self.profile.standing)
         person, now = self._build.seen(own), self._history
         goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person))
+        # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
+        goals = dataclasses.replace(goals, contact=np.minimum(goals.contact, 1.0))
         self._plan = plan = self._advanced(goals, person.contact[now], began)
         off, feet_off, q = float(plan.off), float(plan.feet_off), np.asarray(plan.q[_PAST])
         status = LiveStatus.HELD_BACK if off > _OFF else LiveStatus.FOLLOWED

@@ -12,20 +12,6 @@ UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 """Quaternion of no rotation."""
 
 
-def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the Hamilton product a b: rotation b first, then a. (..., 4)."""
-    w, v = a[..., :1], a[..., 1:]
-    s, u = b[..., :1], b[..., 1:]
-    return np.concatenate([w * s - np.sum(v * u, -1, keepdims=True), w * u + s * v + np.cross(v, u)], -1)
-
-
-def rotate(quaternion: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Return points rotated by unit quaternions. (..., 3)."""
-    w, v = quaternion[..., :1], quaternion[..., 1:]
-    t = 2.0 * np.cross(v, point)
-    return point + w * t + np.cross(v, t)
-
-
 def forward(
     parents: Sequence[int], offsets: Float[np.ndarray, "*F J 3"], local: Float[np.ndarray, "F J 4"]
 ) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
@@ -36,12 +22,13 @@ def forward(
         offsets: positions in the parent's frame, in any unit. (J, 3) or (F, J, 3)
         local: rotations relative to the parent.
     """
-    positions, rotations = np.array(np.broadcast_to(offsets, (*local.shape[:2], 3))), local.copy()
+    positions = np.array(np.broadcast_to(offsets, (*local.shape[:2], 3)))
+    turns = [Rotation.from_quat(local[:, joint], scalar_first=True) for joint in range(len(parents))]
     for joint, parent in enumerate(parents):
         if parent >= 0:
-            positions[:, joint] = positions[:, parent] + rotate(rotations[:, parent], positions[:, joint])
-            rotations[:, joint] = multiply(rotations[:, parent], rotations[:, joint])
-    return positions, rotations
+            positions[:, joint] = positions[:, parent] + turns[parent].apply(positions[:, joint])
+            turns[joint] = turns[parent] * turns[joint]
+    return positions, np.stack([turn.as_quat(scalar_first=True) for turn in turns], 1)
 
 
 def continuous(quaternion: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError, warn
 from ._motion import HumanMotion
-from ._rotations import continuous, moved_poses, multiply
+from ._rotations import continuous, moved_poses
 from ._skeletons import find_roles
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
@@ -155,8 +155,9 @@ def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMo
     if rotations is not None:
         rotations = np.concatenate([rotations[..., :1], rotations[..., 1:] @ turn.T], -1)
         if rest_up != up:
-            between = Rotation.from_matrix(turn @ rest_turn.T).as_quat(scalar_first=True)
-            rotations = multiply(rotations, np.broadcast_to(between, rotations.shape))
+            own = Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)
+            own = own * Rotation.from_matrix(turn @ rest_turn.T)
+            rotations = own.as_quat(scalar_first=True).reshape(rotations.shape)
         rotations = continuous(rotations)
     return dataclasses.replace(
         motion,

@@ -383,10 +383,10 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
 
 
 def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danced, tmp_path, capsys):
-    """A hand that holds what moves by 2 m drags the feet along."""
+    """A hand that holds what moves by 18 m cannot follow it."""
     assert report(danced)["notes"] == []
     motion, many = load_motion(dance), tmp_path / "clips"
-    box = np.linspace([-1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], motion.frames)
+    box = np.linspace([-9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], motion.frames)
     held: Any = {"object.box": box, "touch.left_wrist.box": np.ones(motion.frames, bool)}
     many.mkdir()
     names = np.array(motion.joint_names)
@@ -395,7 +395,7 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     assert cli.main(["retarget", str(many / "dance.npz"), *arguments]) == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert figures["feet"]["slip_mm_max"] > 1.0
+    assert max(figures["feet"]["slip_mm_max"], figures["touches"]["off_mm_max"]) > 5.0
     assert last == f"note: {figures['notes'][-1]}" and last.startswith("note: a bound gave way: ")
     rare = dataclasses.replace(danced, contact=danced.contact & (np.arange(30) < 5)[:, None])
     assert report(rare)["notes"][0].startswith("feet stand in 17 % of the frames")
