@@ -81,7 +81,7 @@ class InverseKinematicsSolution(eqx.Module):
         pick = (lambda a: np.asarray(a)) if index is None else (lambda a: np.asarray(a)[index])
         errors = f"{pick(self.position_error):.3g} m and {pick(self.orientation_error):.3g} rad off"
         if pick(self.converged):
-            return f"found by search {pick(self.seed)}: {errors}"
+            return f"found, {errors} (search {pick(self.seed)})"
         lines = [f"not found in {pick(self.steps)} steps; the best configuration is {errors}"]
         lines += [f"  {name}: {_miss(pick(residual))}" for name, residual in self.residual.items()]
         return "\n".join([*lines, *(f"  {reason}" for reason in self._reasons(pick))])
@@ -90,7 +90,7 @@ class InverseKinematicsSolution(eqx.Module):
         """Return the reasons that stop the robot, one line each."""
         beyond, at_limit = float(pick(self.beyond_reach)), pick(self.at_limit)
         if beyond > 0.0:
-            return [f"out of reach: {beyond:.3g} m further away than all links in one line"]
+            return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line"]
         sides = {-1: "lower", 1: "upper"}
         reasons = [f"{self.joints[i]} is at its {sides[int(at_limit[i])]} limit" for i in np.flatnonzero(at_limit)]
         if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
@@ -103,4 +103,4 @@ class InverseKinematicsSolution(eqx.Module):
 def _miss(residual: np.ndarray) -> str:
     """Return a residual as text."""
     numbers = " ".join(f"{value:+.3g}" for value in residual)
-    return f"off by {numbers}" + (" (x y z [m], rotation about x y z [rad])" if len(residual) == 6 else "")
+    return f"{numbers} from the target" + (" (x y z [m], rotation about x y z [rad])" if len(residual) == 6 else "")
