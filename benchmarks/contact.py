@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from osik_jax.retargeting import HumanMotion, find_roles, load_motion
+from osik_jax.retargeting import HumanMotion, load_motion
 from osik_jax.retargeting._person import read_person
+from osik_jax.retargeting._skeletons import find_roles
 
 
 def spoiled(motion: HumanMotion, noise: float, tilt: float, drift: float, seed: int) -> HumanMotion:

@@ -93,7 +93,7 @@ def _path(name: str, folder: Path) -> np.ndarray:
 def tile(row: Row, folder: Path) -> Image.Image:
     """The robot in the middle of its motion."""
     path = _path(row.name, folder)
-    look = viewer.read_look(file_of(row.name))
+    look = file_of(row.name)
     picture = viewer.hero_picture(
         folder / f"{row.name}.png", row.robot, [path[len(path) // 2]], look=look, labels=(row.name,), size=TILE
     )

@@ -23,7 +23,7 @@ import jax
 import numpy as np
 
 from osik_jax.runtime import configure_cpu
-from osik_jax.scaling import device_mesh, sharded
+from osik_jax.scaling import sharded
 
 from .command_line import listed
 from .descriptions import ROBOTS
@@ -47,7 +47,7 @@ HALF_A_MINUTE = 30.0
 
 def measure(given: Setting, scheme: str, devices: int, lanes: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
     """One row: so many devices, with so many lanes on each."""
-    mapped = partial(sharded, mesh=device_mesh(jax.devices()[:devices]), donate_argnums=4)
+    mapped = partial(sharded, mesh=jax.sharding.Mesh(jax.devices()[:devices], ("lanes",)), donate_argnums=4)
     step, arguments, first = batch_of(given, SCHEMES[scheme](), devices * lanes, mapped=mapped)
     *arguments, state = step.place(*arguments, first)
     solved: list[float] = []

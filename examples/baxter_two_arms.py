@@ -46,7 +46,7 @@ viewer.hero_picture(
     "baxter_two_arms.png",
     robot,
     [motion.q[310]],
-    look=viewer.read_look("baxter"),
+    look="baxter",
     shapes=[box],
     trails=[at[:, 0]],
     azimuth=35.0,

@@ -37,13 +37,13 @@ def lifting(frames=75, fps=30.0):
         parts |= dict(heel=ankle + np.array([-0.05, 0.0, -0.08]), toe=ankle + np.array([0.15, 0.0, -0.08]))
         points |= {f"{side}_{name}": track for name, track in parts.items()}
     poses, places = np.concatenate([box, turn.as_quat(scalar_first=True)], 1), np.stack(list(points.values()), 1)
-    touches = tuple(retargeting.Touch(f"{side}_wrist", "box", held) for side in ("left", "right"))
+    touches = tuple((f"{side}_wrist", "box", held) for side in ("left", "right"))
     return retargeting.HumanMotion("lift", fps, tuple(points), places, objects={"box": poses}, touches=touches)
 
 
 robot, motion = osik.load_robot("g1"), lifting()
 result = retargeting.retarget(robot, motion)
-figures, box = retargeting.report(result), result.objects["box"]  # figures are recomputed by MuJoCo
+figures, box = result.report(), result.objects["box"]  # figures are recomputed by MuJoCo
 print(f"wrists are {figures['touches']['off_mm_max']:.2f} mm at most off their place on the box")
 print(f"feet slip by {figures['feet']['slip_mm_max']:.3f} mm at most; notes: {figures['notes'] or 'none'}")
 
@@ -52,5 +52,5 @@ turns = Rotation.from_quat(box[:, 3:], scalar_first=True)
 viewer.hero_picture(
     "carry_a_box.png", robot, [result.q[k] for k in shown], labels=[f"{k / motion.fps:.1f} s" for k in shown],
     trails=[box[k, :3] + turns[k].apply(scale * HALF * EDGES) for k in shown],
-    look=viewer.read_look("g1"), azimuth=35.0, size=(1400, 520),
+    look="g1", azimuth=35.0, size=(1400, 520),
 )  # fmt: skip

@@ -31,7 +31,7 @@ def person(frames=61, fps=30.0):
 
 nao = osik.load_robot("nao")
 result = retargeting.retarget(nao, person())
-figures = retargeting.report(result)  # recomputed by MuJoCo from the configurations alone
+figures = result.report()  # recomputed by MuJoCo from the configurations alone
 print(f"{len(result.q)} frames")
 print(f"limbs are turned by {figures['tracking']['segment_angle_deg_mean']:.1f} degrees from the person's, on average")
 print(f"feet slip by {figures['feet']['slip_mm_max']:.4f} mm at most")

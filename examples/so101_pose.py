@@ -40,7 +40,7 @@ viewer.hero_picture(
     "so101_pose.png",
     arm,
     [whole.q, place.q, above.q, far.q],
-    look=viewer.read_look("so101"),
+    look="so101",
     shapes=[osik.CollisionShape.sphere(0.01, position)],
     labels=["whole pose", "position", "position and axis", "out of reach"],
     azimuth=50.0,

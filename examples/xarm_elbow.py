@@ -41,7 +41,7 @@ viewer.hero_picture(
     "xarm_elbow.png",
     arm,
     list(motions.q[:, -1]),
-    look=viewer.read_look("xarm7"),
+    look="xarm7",
     shapes=[osik.CollisionShape.sphere(0.03, hand)],
     labels=["elbow to the right", "in the middle", "elbow to the left"],
     azimuth=15.0,

@@ -29,12 +29,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import mujoco
 import numpy as np
 from IPython.display import HTML, Image, display
 from matplotlib.colors import LogNorm
 
 import osik_jax as osik
-from osik_jax.viewer import animate, hero_picture, mujoco_frame_pose, mujoco_poses, robot_com
+from osik_jax.viewer import animate, hero_picture
 
 osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)  # double precision: controllers want it
@@ -154,11 +155,15 @@ display(Image(strip))
 
 # %%
 hand, left, right, com = [], [], [], []
-for pose in mujoco_poses(robot, motion.q):
-    hand.append(mujoco_frame_pose(robot, pose, "l_gripper")[0])
-    left.append(mujoco_frame_pose(robot, pose, "l_sole")[0])
-    right.append(mujoco_frame_pose(robot, pose, "r_sole")[0])
-    com.append(robot_com(robot, pose))
+data = mujoco.MjData(robot.mj_model)
+for q in motion.q:
+    data.qpos[:] = robot.mujoco_qpos(q)
+    mujoco.mj_kinematics(robot.mj_model, data)
+    mujoco.mj_comPos(robot.mj_model, data)
+    hand.append(data.body("l_gripper").xpos.copy())
+    left.append(data.site("l_sole").xpos.copy())
+    right.append(data.site("r_sole").xpos.copy())
+    com.append(data.subtree_com[0].copy())
 distance = np.linalg.norm(np.array(hand) - np.asarray(target), axis=1)
 slip = max(np.abs(np.array(foot) - foot[0]).max() for foot in (left, right))
 room = np.array([float(standing.distance(point[:2])) for point in com[:: 1 + STEPS // 30]])

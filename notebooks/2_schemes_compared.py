@@ -36,7 +36,7 @@ import numpy as np
 from IPython.display import Image, Markdown, display
 
 import osik_jax as osik
-from osik_jax.viewer import hero_picture, mujoco_frame_pose, mujoco_poses
+from osik_jax.viewer import hero_picture
 
 osik.runtime.configure_cpu()  # small problems, one after another
 jax.config.update("jax_enable_x64", True)
@@ -175,7 +175,8 @@ paths = [results[situation, "weighted", True]["q"] for situation in SITUATIONS]
 targets = [
     [np.asarray(home) + goal, *([tasks["elbow"].target[0]] if elbow else [])] for goal, elbow, _ in SITUATIONS.values()
 ]
-trails = [[mujoco_frame_pose(arm, pose, "hand")[0] for pose in mujoco_poses(arm, q[:WAITING:10])] for q in paths]
+hand_at = jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])
+trails = [np.asarray(hand_at(q[:WAITING:10])) for q in paths]
 with tempfile.TemporaryDirectory() as folder:
     picture = hero_picture(
         Path(folder) / "arms.png",

@@ -31,7 +31,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax import demo
+from osik_jax.demo._nao import double_support, single_support  # the motions of `osik demo`
+from osik_jax.demo._physics import run_physics
 from osik_jax.solvers import Level, Status, solve_nullspace, solve_qp
 from osik_jax.viewer import hero_picture
 
@@ -40,7 +41,7 @@ jax.config.update("jax_enable_x64", True)  # double precision: controllers want 
 
 FAST = "OSIK_FAST" in os.environ  # the tests run this notebook with smaller sizes
 SCHEME = "null-space" if FAST else "hierarchical"  # what compiles fastest, what the text is about
-SCENES = {"waist": demo.double_support} if FAST else {"waist": demo.double_support, "one foot": demo.single_support}
+SCENES = {"waist": double_support} if FAST else {"waist": double_support, "one foot": single_support}
 DURATION, DT = (4.0, 0.01) if FAST else (8.0, 0.005)  # [s]
 SAMPLES = 50 if FAST else 300
 
@@ -68,7 +69,7 @@ plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False, "axes.tit
 
 # %%
 motions = {name: scene(DURATION) for name, scene in SCENES.items()}
-runs = {name: demo.run_physics(motion, SCHEME, dt=DT) for name, motion in motions.items()}
+runs = {name: run_physics(motion, SCHEME, dt=DT) for name, motion in motions.items()}
 for name, run in runs.items():
     print(f"{name}: {len(run.plan.q) - 1} steps, fell: {run.physics.fell is not None}")
     assert run.physics.fell is None

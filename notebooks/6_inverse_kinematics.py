@@ -31,12 +31,13 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import mujoco
 import numpy as np
 from IPython.display import Image, display
 
 import osik_jax as osik
 from osik_jax import reachability
-from osik_jax.viewer import hero_picture, mujoco_frame_pose, mujoco_poses, robot_com
+from osik_jax.viewer import hero_picture
 
 osik.runtime.configure_cpu()  # small problems, and batches on all cores
 jax.config.update("jax_enable_x64", True)  # double precision
@@ -79,10 +80,19 @@ assert found.converged and again.converged
 
 
 # %%
+def mujoco_data(robot, q):
+    """MuJoCo's data at a configuration."""
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:] = robot.mujoco_qpos(q)
+    mujoco.mj_kinematics(robot.mj_model, data)
+    mujoco.mj_comPos(robot.mj_model, data)
+    return data
+
+
 def hands(q):
     """By MuJoCo, positions (n, 3) and orientations (n, 3, 3) of the hand at configurations (n, 7)."""
-    poses = [mujoco_frame_pose(arm, data, "hand") for data in mujoco_poses(arm, np.atleast_2d(q))]
-    return np.array([p for p, _ in poses]), np.array([r for _, r in poses])
+    poses = [mujoco_data(arm, one).site("hand") for one in np.atleast_2d(q)]
+    return np.array([pose.xpos for pose in poses]), np.array([pose.xmat.reshape(3, 3) for pose in poses])
 
 
 looks_down = np.diag([1.0, -1.0, -1.0])  # the quaternion above as a matrix
@@ -308,11 +318,12 @@ for k, name in enumerate(wanted):
 assert stood.converged.all()
 
 # %%
-soles = {foot: mujoco_frame_pose(nao, next(mujoco_poses(nao, nao.q0)), foot)[0] for foot in feet}
-for data, own in zip(mujoco_poses(nao, np.asarray(stood.q)), range(len(wanted)), strict=True):
-    slip = max(np.linalg.norm(mujoco_frame_pose(nao, data, foot)[0] - soles[foot]) for foot in feet)
-    miss = max(np.linalg.norm(mujoco_frame_pose(nao, data, hand)[0] - targets[hand][own]) for hand in home)
-    inside = float(standing.distance(robot_com(nao, data)[:2]))
+before = mujoco_data(nao, nao.q0)
+for q, own in zip(stood.q, range(len(wanted)), strict=True):
+    data = mujoco_data(nao, q)
+    slip = max(np.linalg.norm(data.site(foot).xpos - before.site(foot).xpos) for foot in feet)
+    miss = max(np.linalg.norm(data.body(hand).xpos - targets[hand][own]) for hand in home)
+    inside = float(standing.distance(data.subtree_com[0][:2]))
     print(f"MuJoCo: feet moved {slip:.1e} m, hands {miss:.1e} m off, centre of mass {inside:+.3f} m inside")
     assert slip < 1e-3 and miss < 1e-3 and inside > -1e-3
 

@@ -118,7 +118,7 @@ print(f"{motion.name}: {motion.frames} frames, {len(motion.joint_names)} joints"
 # %%
 nao = osik.load_robot("nao")
 result = retargeting.retarget(nao, motion)
-figures = retargeting.report(result)  # recomputed by MuJoCo
+figures = result.report()  # recomputed by MuJoCo
 joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
 print(f"limbs are {tracking['segment_angle_deg_mean']:.1f} degrees off the person's on average")
 print(f"standing feet move {feet['slip_mm_max']:.3f} mm at most")
@@ -226,7 +226,7 @@ plt.show()
 # %%
 quick = replace(motion, name="quick", fps=3.0 * FPS).resampled(FPS)
 hurried = retargeting.retarget(nao, quick)
-hasty = retargeting.report(hurried)
+hasty = hurried.report()
 print(f"{'':24}{'as danced':>12}{'3 x faster':>12}")
 for name, part, key in (
     ("limbs off [deg]", "tracking", "segment_angle_deg_mean"),
@@ -250,7 +250,7 @@ rng = np.random.default_rng(0)
 frames = [live.step(None if f > 0 and rng.random() < 0.1 else p) for f, p in enumerate(motion.positions)]
 frames = [frame for frame in frames if frame is not None] + live.finish()
 streamed = np.array([frame.q for frame in frames])
-filled = sum(frame.status == retargeting.LiveStatus.FILLED for frame in frames)
+filled = sum(frame.status.name == "FILLED" for frame in frames)
 places = [nao.joint_qpos_index(name) for name in nao.joint_names]
 apart = np.degrees(np.abs(streamed - result.q)[:, places])
 print(f"{live.latency:.2f} s behind the person; {filled} frames were filled in")

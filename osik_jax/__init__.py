@@ -23,7 +23,6 @@ from .kinematics import com_jacobian as com_jacobian
 from .kinematics import difference as difference
 from .kinematics import forward_kinematics as forward_kinematics
 from .kinematics import frame_jacobian as frame_jacobian
-from .kinematics import frame_pose as frame_pose
 from .kinematics import integrate as integrate
 from .kinematics import mass_matrix as mass_matrix
 from .limits import AccelerationLimit as AccelerationLimit
@@ -71,6 +70,5 @@ from .tasks import Task as Task
 from .tasks import TaskRows as TaskRows
 from .tasks import WheelTask as WheelTask
 from .tasks import support_polygon as support_polygon
-from .tasks import task_rows as task_rows
 
 __version__ = _installed_version()

@@ -116,4 +116,4 @@ def tasks(add: Add) -> None:
     )
     add("no function", lambda: osik.FunctionTask(arm(), 3.0), T, "(robot, kinematics, q)")
     add("a task of one's own, its Jacobian too narrow", lambda: solve({"own": OddRows()}), V, "expected (m, 7)")
-    add("a task of one's own that returns nothing", lambda: solve({"own": NoRows()}), T, "task_rows")
+    add("a task of one's own that returns nothing", lambda: solve({"own": NoRows()}), T, "TaskRows.of")

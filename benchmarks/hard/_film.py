@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 import osik_jax as osik
-from osik_jax import viewer
 from osik_jax.viewer._animate import paint_over, write_gif
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._opengl import make_renderer
@@ -58,7 +57,7 @@ def _motion(solver: str, work: Workload, case: Case) -> Motion:
 def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[np.ndarray]:
     """Each with both robots, their target, who they are and how fast their fastest joints turn."""
     robot = standing(work)
-    shape = robot_parts(robot, look=viewer.read_look(file_of("g1")))
+    shape = robot_parts(robot, look=file_of("g1"))
     order = places(robot, work)
     paths = [_own(motion.path, order)[: STEPS + 1] for motion in found.values()]
     across = Camera((0.0, 0.0, 0.0), 1.0, AZIMUTH, 0.0, 1.0).axes[0]

@@ -93,5 +93,5 @@ if __name__ == "__main__":
     for _ in range(25):  # at most 5 cm a step along x
         env.step(torch.tensor([[1.0, 0.0, 0.0]], device=env.device).repeat(8, 1))
     q = jax.numpy.asarray(env.scene["robot"].data.joint_pos[0].cpu().numpy())
-    moved = osik.frame_pose(arm, osik.forward_kinematics(arm, q), "hand")[0] - tasks["hand"].target[0]
+    moved = osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0] - tasks["hand"].target[0]
     print("the hand moved by", moved.round(3).tolist(), "m in 0.5 s")

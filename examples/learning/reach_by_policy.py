@@ -38,7 +38,7 @@ def known(**options):
 
 
 def hand(data):
-    return osik.frame_pose(arm, osik.forward_kinematics(arm, data.qpos), "hand")[0]
+    return osik.forward_kinematics(arm, data.qpos).frame_pose(arm, "hand")[0]
 
 
 def reset(key):

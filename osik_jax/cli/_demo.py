@@ -78,8 +78,8 @@ class Demo:
 
 def _motion(command: Demo) -> Motion:
     """Return the motion that the options ask for."""
-    from ..demo import double_support, single_support
     from ..demo._file import file_motion
+    from ..demo._nao import double_support, single_support
     from ..viewer.live._source import RobotSource, source_look
 
     _check(command)

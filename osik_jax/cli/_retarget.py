@@ -132,7 +132,7 @@ def _reader(command: Retarget) -> Reader:
     if command.source is None:
         unit = None if command.unit is None else _number_or_name(command.unit)
         return Reader(unit=unit, up=command.up, trim=command.trim)
-    profile = None if command.source_profile is None else retargeting.load_profile(command.source_profile)
+    profile = None if command.source_profile is None else retargeting.Profile.load(command.source_profile)
     source = _robot_to_retarget(command.source)
     return Reader(source=source, profile=profile or find_profile(source), fps=command.source_fps)
 
@@ -155,7 +155,7 @@ def _fit(command: Retarget, file: Path) -> None:
             _robot_to_retarget(command.robot, command.base),
             Path(command.clip),
             file,
-            profile=None if command.profile is None else retargeting.load_profile(command.profile),
+            profile=None if command.profile is None else retargeting.Profile.load(command.profile),
             mapping=_mapping(command.mapping),
             acceleration=command.acceleration,
             reader=_reader(command),
@@ -171,7 +171,7 @@ def _retargeter(command: Retarget) -> Retargeter:
     """Return the retargeter of whole clips that the command describes."""
     from .. import retargeting
 
-    profile = None if command.profile is None else retargeting.load_profile(command.profile)
+    profile = None if command.profile is None else retargeting.Profile.load(command.profile)
     return retargeting.Retargeter(
         _robot_to_retarget(command.robot, command.base),
         profile=profile,
@@ -252,7 +252,7 @@ def _retarget_live(command: Retarget) -> None:
             raise OsikValueError("--smooth goes with whole clips, not with --live")
         if os.path.isdir(command.clip):
             raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
-        profile = None if command.profile is None else retargeting.load_profile(command.profile)
+        profile = None if command.profile is None else retargeting.Profile.load(command.profile)
         robot, mapping = _robot_to_retarget(command.robot, command.base), _mapping(command.mapping)
 
         def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
@@ -285,7 +285,7 @@ def _retarget_live(command: Retarget) -> None:
         f"the robot is {waiting + np.median(spent):.0f} ms behind: {ahead} frames of look-ahead are "
         f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
     )
-    lost = sum(frame.status is retargeting.LiveStatus.FEET_OFF for frame in frames)
+    lost = sum(frame.status.name == "FEET_OFF" for frame in frames)
     if lost:
         console.print(f"in {lost} of {len(frames)} frames limits did not let the feet hold (status feet_off)")
     _print_retargeted(console, figures, command)

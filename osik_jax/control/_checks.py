@@ -280,7 +280,7 @@ def check_rows(rows: Mapping[str, Any], tasks: Mapping[str, Task], robot: Robot)
     for name, own in rows.items():
         kind = type(tasks[name]).__name__
         if not isinstance(own, TaskRows):
-            raise OsikTypeError(f"tasks[{name!r}]: {kind}.rows returned {own!r}; it returns TaskRows, see task_rows")
+            raise OsikTypeError(f"tasks[{name!r}]: {kind}.rows returned {own!r}; it returns TaskRows, see TaskRows.of")
         shapes = {field: jnp.shape(getattr(own, field)) for field in ("error", "lower", "upper", "weight")}
         count, jacobian = shapes["error"], jnp.shape(own.jacobian)
         if len(count) != 1 or any(shape != count for shape in shapes.values()) or jacobian != (*count, robot.nv):

@@ -15,7 +15,7 @@ template <class In> struct Bounds {
   In lower{}, upper{};
 };
 
-// The bounds on the rate of row i, and its pull: tasks/_task.py, task_rows.
+// The bounds on the rate of row i, and its pull: tasks/_task.py, TaskRows.of.
 template <class Real, class In, class Out>
 OSIK_FN void ask(const Rows<Out>& to, const Bounds<In>& bounds, int i, Real error, Real forward, Real gain) {
   to.error[i] = error;

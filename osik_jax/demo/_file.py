@@ -43,7 +43,7 @@ def file_motion(
         frame: what moves; ``None``: the floating base, or the tip of a robot that is bolted down.
         support: frames on the ground; none: those of a floating robot that look like feet.
         duration: [s].
-        look: what the robot's URDF shows, from ``viewer.read_look``.
+        look: what the robot's URDF shows.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.

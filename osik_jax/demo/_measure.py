@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..robot import Robot
 from ..tasks._polygon import Polygon, hull
-from ..viewer import mujoco_frame_pose, mujoco_poses, robot_com
+from ..viewer._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from ._motion import Motion, Stance
 
 TOLERANCE = 1e-9

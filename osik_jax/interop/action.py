@@ -16,7 +16,7 @@ from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..control import solve
 from ..control._checks import check_setting, check_tasks, checked_limits
 from ..control._rollout import move
-from ..kinematics import forward_kinematics, frame_pose
+from ..kinematics import forward_kinematics
 from ..limits import Limit, Limits
 from ..numerics._arguments import as_array
 from ..robot import Robot
@@ -181,7 +181,7 @@ class TaskSpaceAction(eqx.Module):
         for name in self.commanded:
             task = self.tasks[name]
             assert isinstance(task, FrameTask)
-            p, R = task.target if kinematics is None else frame_pose(self.robot, kinematics, task.frame)
+            p, R = task.target if kinematics is None else kinematics.frame_pose(self.robot, task.frame)
             moves_position, moves_rotation = _moves(task)
             if moves_position:
                 p, first = p + motion[first : first + 3], first + 3

@@ -22,7 +22,7 @@ def kinematics_from(
 ) -> Kinematics:
     """Return the kinematics equivalent to another library's forward kinematics and Jacobians.
 
-    Tasks, limits and ``osik_jax.frame_pose`` take the result like that of ``forward_kinematics``; a control step is
+    Tasks and limits take the result like that of ``forward_kinematics``; a control step is
     ``scheme.solve(build_problem(robot, q, tasks, kinematics=kinematics))``. The axis of each dof is read from the
     Jacobian of the body that it moves first: a column ``[l; w]`` at the body's origin p is a translation along l if w
     is 0, and else a turn about the axis w through ``p + w x l``. Masses are the robot's own, so the centre of mass

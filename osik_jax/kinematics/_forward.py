@@ -49,7 +49,15 @@ class Kinematics(eqx.Module):
     backend: Backend = eqx.field(default="jax", static=True)
 
     def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """Return the position [m] and rotation (frame axes to world axes) of a body, link, site or geom.
+        """Return the pose of a body, link, site or geom, in the form of a task's target.
+
+        Args:
+            robot: the robot.
+            name: one of ``robot.frame_names``.
+
+        Returns:
+            The position of the frame's origin in the world [m], (3,), and the rotation from its axes to the world's,
+            (3, 3).
 
         Raises:
             KeyError: no such frame.
@@ -68,23 +76,6 @@ class Kinematics(eqx.Module):
         rotations = self.body_rotation[bodies]
         positions = self.body_position[bodies] + rotate(rotations, robot.frame_position[ids])
         return positions, compose(rotations, robot.frame_rotation[ids])
-
-
-def frame_pose(robot: Robot, kinematics: Kinematics, frame: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Return the pose of a body, link, site or geom, in the form of a task's target.
-
-    Args:
-        robot: the robot.
-        kinematics: ``forward_kinematics`` at the configuration.
-        frame: one of ``robot.frame_names``.
-
-    Returns:
-        The position of its origin in the world [m], (3,), and the rotation from its axes to the world's, (3, 3).
-
-    Raises:
-        KeyError: no such frame.
-    """
-    return kinematics.frame_pose(robot, frame)
 
 
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:

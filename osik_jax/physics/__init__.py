@@ -1,7 +1,5 @@
 """Closed loop in MuJoCo with dynamics, a floor and position servos; import it by name."""
 
-from ._loop import Integrated as Integrated
-from ._loop import Lookahead as Lookahead
 from ._loop import simulate as simulate
 from ._servo import Servo as Servo
 from ._simulation import Simulation as Simulation

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from functools import partial
@@ -26,55 +25,8 @@ from ..robot import Robot
 from ..schemes import Scheme
 from ._simulation import Simulation
 
-
-class Command(eqx.Module):
-    """Conversion of a step's velocity to a servo target."""
-
-    @abc.abstractmethod
-    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """Return the configuration to servo to until the next step.
-
-        Args:
-            robot: the robot.
-            last: the command of the step before; at first, where the robot stands. (nq,)
-            sensed: (nq,)
-            velocity: what the tasks ask for at the sensed configuration. (nv,)
-            dt: time of one step [s].
-        """
-
-
-class Integrated(Command):
-    """Servo target: the last command integrated by the velocity; the sensed configuration enters by the tasks alone.
-
-    Under load a servo deflects by effort over stiffness. The command moves on until the tasks are met: this is integral
-    action, and steady errors vanish. The tasks' gains must stay below those at which servos and contact oscillate: 3 to
-    10 / s for a standing robot, where the kinematic loop allows 20 / s and more.
-    """
-
-    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """Return the configuration to servo to until the next step, as ``simulate`` asks for it."""
-        return integrate(robot, last, velocity, dt)
-
-
-class Lookahead(Command):
-    """Servo target: the sensed configuration integrated by the velocity over a given time.
-
-    This is proportional control without memory. A steady error remains, as with a servo whose stiffness is multiplied
-    by gain times time. With a gain of 20 / s and 0.05 s, a servo holds its load as if the plan were its target. With
-    one step as the time the robot sinks.
-
-    Attributes:
-        time: [s].
-    """
-
-    time: Float[Array, ""]
-
-    def __init__(self, time: Array | float) -> None:
-        self.time = jnp.asarray(time, float)
-
-    def __call__(self, robot: Robot, last: Array, sensed: Array, velocity: Array, dt: Array | float) -> Array:
-        """Return the configuration to servo to until the next step, as ``simulate`` asks for it."""
-        return integrate(robot, sensed, velocity, self.time)
+Command = Callable[[Robot, Array, Array, Array, Any], Array]
+"""Function of robot, last command, sensed configuration, velocity and time step that returns the next servo target."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +53,7 @@ def simulate(
     dt: float = 0.005,
     steps: int,
     targets: Targets | None = None,
-    command: Command | None = None,
+    command: Command | float | None = None,
     before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
     """Run the loop from the simulation's present state, and stop if the robot falls.
@@ -118,8 +70,18 @@ def simulate(
         dt: control period [s], a whole number of the world's timesteps.
         steps: number of steps.
         targets: targets of some tasks at each step, by task name, as in ``rollout``.
-        command: ``Integrated()`` (the default), ``Lookahead(time)``, or an ``equinox.Module`` of yours that is called
-            with (robot, last command, sensed configuration, velocity, dt) and returns the configuration to servo to.
+        command: how a velocity becomes the configuration to servo to.
+
+            - None: the last command is integrated; the sensed configuration enters by the tasks alone. Under load a
+              servo deflects by effort over stiffness. The command moves on until the tasks are met: this is integral
+              action, and steady errors vanish. The tasks' gains must stay below those at which servos and contact
+              oscillate: 3 to 10 / s for a standing robot, where the kinematic loop allows 20 / s and more.
+            - A time [s]: the sensed configuration is integrated over it. This is proportional control without memory.
+              A steady error remains, as with a servo whose stiffness is multiplied by gain times time. With a gain of
+              20 / s and 0.05 s, a servo holds its load as if the plan were its target. With one step as the time the
+              robot sinks.
+            - A function (an ``equinox.Module``, if its numbers change) of robot, last command (nq,), sensed
+              configuration (nq,), velocity (nv,) and dt [s], which returns the configuration.
         before_step: called with the time [s] since the start and the simulation, to push the robot, say.
 
     Returns:
@@ -147,7 +109,8 @@ def simulate(
     numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
     leaves, treedef = jax.tree.flatten(structure)
     own = checked_limits(robot, limits)
-    program = partial(_control_step, robot, numbers, scheme, own, command or Integrated(), np.asarray(dt))
+    how = command if command is None or callable(command) else np.asarray(command, float)
+    program = partial(_control_step, robot, numbers, scheme, own, how, np.asarray(dt))
     step = partial(program, static=(tuple(leaves), treedef))
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
@@ -173,7 +136,7 @@ def _control_step(
     numbers: Any,
     scheme: Scheme | None,
     limits: tuple[Limit, ...] | None,
-    command: Command,
+    command: Command | Array | None,
     dt: Array,
     t: Array,
     last: Array,
@@ -189,7 +152,10 @@ def _control_step(
     velocity, warm_start = memory
     todo, kept = remembering((todo, limits), velocity, t > 0.0)
     solution = solve(robot, sensed, todo, scheme=scheme, limits=kept, dt=dt, warm_start=warm_start)
-    return command(robot, last, sensed, solution.velocity, dt), solution
+    if callable(command):
+        return command(robot, last, sensed, solution.velocity, dt), solution
+    start, time = (last, dt) if command is None else (sensed, command)
+    return integrate(robot, start, solution.velocity, time), solution
 
 
 def _cold_start(step: Callable[[Any], Solution], state: Any) -> Any:

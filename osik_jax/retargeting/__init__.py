@@ -1,25 +1,13 @@
 """Motion retargeting: a recorded human motion becomes a motion of a legged robot."""
 
-from ._fit import FitLoss as FitLoss
 from ._fit import fit as fit
 from ._goals import Weights as Weights
-from ._guess import describe_profile as describe_profile
-from ._guess import guess_profile as guess_profile
 from ._live import LiveRetargeter as LiveRetargeter
-from ._live import LiveStatus as LiveStatus
 from ._load import load_motion as load_motion
 from ._motion import HumanMotion as HumanMotion
-from ._motion import Touch as Touch
 from ._profile import Profile as Profile
-from ._profile_file import load_profile as load_profile
-from ._profile_file import save_profile as save_profile
-from ._report import report as report
 from ._retarget import Retargeter as Retargeter
 from ._retarget import retarget as retarget
 from ._retargeted import Retargeted as Retargeted
 from ._robot_motion import RobotMotion as RobotMotion
-from ._robot_motion import load_robot_motion as load_robot_motion
-from ._robot_motion import write_csv as write_csv
-from ._skeletons import find_roles as find_roles
 from ._source_motion import SourceMotion as SourceMotion
-from ._source_motion import load_source as load_source

@@ -247,20 +247,17 @@ class Build:
     def touches(self, person: Person) -> tuple[TouchGoal, ...]:
         """Return what the robot's joints hold, for a person (``seen``)."""
         out, scale = [], self.scale(person) if person.touches else 1.0
-        for touch in person.touches:
-            if touch.role not in self.points:
-                raise OsikValueError(f"the profile has no keypoint {touch.role}, which holds {touch.other}")
-            at = person.points[touch.role]
-            if touch.other in person.objects:
-                goal = self._in_world(person, held_point(person.objects[touch.other], at, touch.held), scale)
-                out.append(TouchGoal(ORIGIN, touch.role, goal, touch.held))
-            elif touch.other in self.points:
-                goal = scale * (at - person.points[touch.other])
-                out.append(TouchGoal(touch.other, touch.role, goal, touch.held))
+        for role, other, held in person.touches:
+            if role not in self.points:
+                raise OsikValueError(f"the profile has no keypoint {role}, which holds {other}")
+            at = person.points[role]
+            if other in person.objects:
+                goal = self._in_world(person, held_point(person.objects[other], at, held), scale)
+                out.append(TouchGoal(ORIGIN, role, goal, held))
+            elif other in self.points:
+                out.append(TouchGoal(other, role, scale * (at - person.points[other]), held))
             else:
-                raise OsikValueError(
-                    f"{touch.role} holds {touch.other}, which is no object of the clip and no keypoint"
-                )
+                raise OsikValueError(f"{role} holds {other}, which is no object of the clip and no keypoint")
         return tuple(out)
 
     def objects(self, person: Person) -> dict[str, Float[np.ndarray, "F 7"]]:

@@ -13,10 +13,7 @@ from ._fit import Fit, fit
 from ._load import Reader, clips_in
 from ._page import write_report
 from ._profile import Profile
-from ._profile_file import save_profile
-from ._report import report
 from ._retargeted import Retargeted
-from ._robot_motion import write_csv
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
@@ -55,7 +52,7 @@ def fit_to_file(
     held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]
     learned = [motion for motion in motions if all(motion is not other for other in held_out)]
     found = fit(robot, learned, held_out=held_out, profile=profile, mapping=mapping, acceleration=acceleration)
-    save_profile(found.profile, file)
+    found.profile.save(file)
     return found, len(learned), len(held_out)
 
 
@@ -63,9 +60,9 @@ def write_folder(
     result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False, look: Look | None = None
 ) -> dict[str, Any]:
     """Write motion (.npz and .csv), report, profile and optionally GIF and page (with ``look``); return the report."""
-    figures = {"clip": name, **report(result)}
+    figures = {"clip": name, **result.report()}
     write_motion(result, figures, out, page, look)
-    save_profile(result.profile, out / "profile.toml")
+    result.profile.save(out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
     return figures
@@ -76,7 +73,7 @@ def write_motion(
 ) -> None:
     """Write ``motion.npz``, ``motion.csv``, the page and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
-    write_csv(result.motion, out / "motion.csv")
+    result.motion.save_csv(out / "motion.csv")
     if page:
         write_report(result, figures, out / "motion.npz", out / "report.html", look=look)
     write_json(figures, out / "report.json")

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError, missing_extra
+from .._errors import OsikValueError, missing_extra, unknown_name
 from ..kinematics import difference
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
@@ -34,30 +34,11 @@ _WEIGHT, _SCALE, _PLACE = 1.0, 0.1, 1e-3
 """Parameter units: logarithm of a weight, logarithm of the scale, displacement of a keypoint [m]."""
 _MOST_WEIGHT, _MOST_SCALE, _MOST_PLACE = 3.0, 0.1, 0.02
 """Largest absolute change of each parameter, in the same quantities as the units."""
+LOSS = {"tracking": 1.0, "turning": 0.01, "slip": 1e4, "bounds": 1e-2, "acceleration": 2e-8}
+"""Weights of the loss, a sum of means over a clip's frames; ``fit`` says what they weigh."""
 _SETTLING, _FOLLOWING = 150, 40
 """Extra plan iterations after ``retarget``'s stop: before the first step, and in each later step from the plan before.
 """
-
-
-@dataclasses.dataclass(frozen=True)
-class FitLoss:
-    """Weights of the loss, a sum of means over a clip's frames.
-
-    Attributes:
-        tracking: weight of the squared angles between the person's and the robot's limbs [1/rad^2]. The robot's limbs
-            connect the keypoints of the given profile, so that tuning keypoints cannot change the measure itself.
-        turning: weight of the squared orientation errors of pelvis, chest and feet [1/rad^2].
-        slip: weight of the squared distance that contact points move per frame [1/m^2].
-        bounds: weight of the plan's violated bounds, which are squares with the profile's weights: height of contact
-            points, depth in the floor and in other shapes, and excess beyond joint ranges.
-        acceleration: weight of the squared joint accelerations [1/(rad/s^2)^2].
-    """
-
-    tracking: float = 1.0
-    turning: float = 0.01
-    slip: float = 1e4
-    bounds: float = 1e-2
-    acceleration: float = 2e-8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +85,7 @@ def fit(
     held_out: Sequence[HumanMotion] = (),
     profile: Profile | None = None,
     mapping: Mapping[str, str] | None = None,
-    loss: FitLoss | None = None,
+    loss: Mapping[str, float] | None = None,
     acceleration: float | Mapping[str, float] = ACCELERATION,
     steps: int = 20,
     max_iterations: int = 40,
@@ -123,7 +104,15 @@ def fit(
         held_out: clips that select the best step; if empty, the training clips do.
         profile: the profile to start from. None: as of ``retarget``.
         mapping: as of ``retarget``, the same for all clips.
-        loss: weights of the loss. None: ``FitLoss()``.
+        loss: weights of some terms of the loss, in place of their defaults.
+
+            - ``tracking`` (1): squared angles between the person's and the robot's limbs [1/rad^2]. The robot's limbs
+              connect the keypoints of the given profile, so that tuning keypoints cannot change the measure itself.
+            - ``turning`` (0.01): squared orientation errors of pelvis, chest and feet [1/rad^2].
+            - ``slip`` (1e4): squared distance that contact points move per frame [1/m^2].
+            - ``bounds`` (0.01): the plan's violated bounds, squares with the profile's weights: height of contact
+              points, depth in the floor and in other shapes, and excess beyond joint ranges.
+            - ``acceleration`` (2e-8): squared joint accelerations [1/(rad/s^2)^2].
         acceleration: as of ``retarget``.
         steps: number of steps of Adam.
         max_iterations: iterations of each plan as ``retarget`` computes it.
@@ -138,6 +127,7 @@ def fit(
 
     Raises:
         ImportError: optax is not installed (the extra ``tuning``).
+        KeyError: ``loss`` names another term.
         ValueError: no clips, no steps; else as of ``retarget``.
     """
     try:
@@ -148,8 +138,11 @@ def fit(
         raise OsikValueError("there are no clips to learn from")
     if not steps > 0:
         raise OsikValueError(f"steps is {steps}; it has to be more than 0")
+    for term in loss or ():
+        if term not in LOSS:
+            raise unknown_name("loss term", term, tuple(LOSS))
     own = Retargeter(robot, profile=profile, acceleration=acceleration, max_iterations=max_iterations)
-    setting = _Setting(own, FitLoss() if loss is None else loss)
+    setting = _Setting(own, LOSS | dict(loss or {}))
     train, others = setting.problems(motions, held_out, mapping)
     now = setting.origin()
     optimiser = optax.adam(_RATE)
@@ -188,8 +181,8 @@ def _relative(losses: Sequence[Sequence[float]]) -> Float[np.ndarray, " steps"]:
 class _Setting:
     """Robot, profile and loss shared by all clips of a fit."""
 
-    def __init__(self, own: Retargeter, terms: FitLoss):
-        self.own, self.terms = own, dataclasses.astuple(terms)
+    def __init__(self, own: Retargeter, terms: Mapping[str, float]):
+        self.own, self.terms = own, tuple(terms.values())
         self.body, self.build, self.weights = own._body, own._build, own.profile.weights
 
     def origin(self) -> _Parameters:
@@ -317,7 +310,7 @@ _value_and_slope = jax.jit(jax.value_and_grad(_loss))
 
 
 def _measured(given: _Given, q: Float[Array, "F nq"]) -> Float[Array, "5"]:
-    """Return the five terms that ``FitLoss`` weighs, in its order."""
+    """Return the five terms that ``LOSS`` weighs, in its order."""
     body, problem, weights, _ = given
     robot, goals = body.robot, problem.goals
     rows = jax.vmap(lambda x, goal: frame_rows(body, x, goal, weights, problem.bounds))(q, goals)

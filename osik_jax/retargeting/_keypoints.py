@@ -11,7 +11,7 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ._motion import CONTACT_POINTS, LARGEST, HumanMotion, Touch
+from ._motion import CONTACT_POINTS, LARGEST, HumanMotion
 from ._optitrack import is_optitrack, read_optitrack
 from ._rotations import continuous
 from ._smpl import arrays_to_read, is_smpl, read_smpl
@@ -25,7 +25,7 @@ def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> Hum
 
     ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
     ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right),
-    ``ground``, ``object.NAME`` (F, 7; position and w x y z) and ``touch.ROLE.NAME`` (F,; see ``Touch``). Nothing is
+    ``ground``, ``object.NAME`` (F, 7; position and w x y z) and ``touch.ROLE.NAME`` (F,). Nothing is
     unpickled.
 
     ``.csv``: a header line with ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
@@ -78,9 +78,9 @@ def _from_npz(path: Path) -> HumanMotion:
             ground=None if ground is None else float(_number(path, arrays, "ground")),
             objects={name[7:]: _numbers(path, arrays, name) for name in arrays if name.startswith("object.")},
             touches=tuple(
-                Touch(*name.split(".", 2)[1:], held=arrays[name].astype(bool))
-                for name in arrays
-                if name.startswith("touch.") and name.count(".") > 1
+                (parts[1], parts[2], held.astype(bool))
+                for name, held in arrays.items()
+                if len(parts := name.split(".", 2)) == 3 and parts[0] == "touch"
             ),
         )
     except ValueError as error:

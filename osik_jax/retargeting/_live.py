@@ -102,14 +102,14 @@ class LiveRetargeter(OnRobot):
     """Retargeter for a stream: each call takes a frame of the person and returns the robot's frame ``look_ahead`` ago.
 
     Limits of position, speed and acceleration hold in every frame for any input. Within them, standing feet stay at
-    their landing place to 1 um; ``LiveStatus.FEET_OFF`` reports frames in which the limits do not allow that. Otherwise
+    their landing place to 1 um; the status ``FEET_OFF`` reports frames in which the limits do not allow that. Otherwise
     the motion is as close to that of ``Retargeter`` as the look-ahead allows.
 
     Args:
-        robot: with limbs of a person, see ``guess_profile``; z up at home.
+        robot: with limbs of a person, see ``Profile.guess``; z up at home.
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
-        mapping: role to joint name of the stream, see ``find_roles``. None: by common names.
+        mapping: role to joint name of the stream. None: by common names.
         profile: as in ``Retargeter``.
         acceleration: as in ``Retargeter``.
         balance: as in ``Retargeter``.
@@ -182,7 +182,9 @@ class LiveRetargeter(OnRobot):
 
             - ``q``: configuration. (nq,)
             - ``contact``: whether left heel, left toe, right heel and right toe stand. (4,)
-            - ``status``: a ``LiveStatus``.
+            - ``status``: an ``IntEnum``. ``FOLLOWED`` (0): the robot follows the plan. ``HELD_BACK`` (1): a limit keeps
+                it off the plan. ``FILLED`` (2): missing joints are interpolated. ``LOST`` (3): the person is missing
+                from here on, and the robot comes to rest. ``FEET_OFF`` (4): limits do not let the feet hold.
             - ``off_plan``: largest distance of a joint from the plan because of a limit [rad or m].
             - ``feet_off``: largest distance of a contact point from its landing place or the floor, or of a sole below
                 the floor [m].

@@ -16,7 +16,7 @@ from ._keypoints import read_keypoints
 from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import find_profile, profile_text
-from ._source_motion import SourceMotion, load_source
+from ._source_motion import SourceMotion
 from ._up import Up, checked_up, find_rest_up, standing_up
 
 ENDINGS = (".bvh", ".amc", ".npz", ".csv")
@@ -65,8 +65,8 @@ class Reader:
         up: up axis of all files, as of ``load_motion``.
         trim: for BVH files, as of ``load_motion``.
         source: the robot whose motions the files hold; None: the files hold a person's motions.
-        profile: profile of ``source``, as of ``load_source``.
-        fps: frame rate of CSV files of ``source``, as of ``load_source``.
+        profile: profile of ``source``, as of ``SourceMotion.load``.
+        fps: frame rate of CSV files of ``source``, as of ``SourceMotion.load``.
     """
 
     unit: str | float | None = None
@@ -79,7 +79,7 @@ class Reader:
     def __call__(self, path: Path) -> HumanMotion | SourceMotion:
         """Read one clip; ``unit`` applies to BVH files only."""
         if self.source is not None:
-            return load_source(path, self.source, profile=self.profile, fps=self.fps)
+            return SourceMotion.load(path, self.source, profile=self.profile, fps=self.fps)
         unit = self.unit if path.suffix.lower() == ".bvh" else None
         return load_motion(path, unit=unit, up=self.up, trim=self.trim)
 

@@ -19,21 +19,8 @@ LARGEST = 1e6
 """Largest accepted coordinate [m]."""
 _FASTEST = 1e5
 """Largest accepted frame rate [1/s]."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Touch:
-    """A joint that holds an object or another joint.
-
-    Attributes:
-        role: the joint, such as ``left_wrist``.
-        other: an object of the clip, or the role of another joint.
-        held: whether it holds it. (F,)
-    """
-
-    role: str
-    other: str
-    held: Bool[np.ndarray, " F"]
+Touch = tuple[str, str, Bool[np.ndarray, " F"]]
+"""Role of a joint, the object or the role of the joint that it holds, and in which frames. (F,)"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +39,8 @@ class HumanMotion:
             left hind, left front, right hind and right front paw of an animal; None: detected. (F, 4)
         ground: height of the floor [m]; None: detected.
         objects: pose of each object: position [m] and quaternion w x y z. (F, 7) each
-        touches: joints that hold objects or each other; the robot keeps them together.
+        touches: joints that hold objects or each other; the robot keeps them together. Each has the role of the joint
+            (such as ``left_wrist``), an object or the role of another joint, and in which frames it holds it (F,).
 
     Raises:
         ValueError: shapes that do not agree, numbers that are not finite or over 1e6 m, quaternions that are not of
@@ -90,9 +78,9 @@ class HumanMotion:
             _check_array(f"objects[{name!r}]", poses, (frames, 7))
             if np.abs(np.linalg.norm(poses[:, 3:], axis=-1) - 1.0).max() > ROUNDED:
                 raise OsikValueError(f"the pose of {name} is its position and a unit quaternion w x y z")
-        for touch in self.touches:
-            if touch.held.shape != (frames,):
-                raise OsikValueError(f"held of {touch.role} has shape {touch.held.shape}, expected {(frames,)}")
+        for role, _, held in self.touches:
+            if held.shape != (frames,):
+                raise OsikValueError(f"held of {role} has shape {held.shape}, expected {(frames,)}")
         if self.ground is not None and not abs(self.ground) <= LARGEST:
             raise OsikValueError(f"ground is {self.ground}; it is a height in metres")
         if self.rotations is not None:
@@ -148,7 +136,7 @@ class HumanMotion:
         return dataclasses.replace(
             self,
             objects=objects,
-            touches=tuple(dataclasses.replace(touch, held=touch.held[nearer]) for touch in self.touches),
+            touches=tuple((role, other, held[nearer]) for role, other, held in self.touches),
             fps=float(fps),
             positions=low + part[:, None, None] * (high - low),
             rotations=rotations,

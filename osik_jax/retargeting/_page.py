@@ -63,7 +63,7 @@ def write_report(
         figures: its report.
         motion: the ``motion.npz`` that it was saved to.
         out: the page.
-        look: what the robot's URDF shows, from ``read_look``; None: the model's own shapes.
+        look: what the robot's URDF shows; None: the model's own shapes.
 
     Raises:
         ImportError: viser is not installed (the extra ``viewer``).

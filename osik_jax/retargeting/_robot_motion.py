@@ -57,6 +57,45 @@ class RobotMotion:
         if self.contact is not None and np.shape(self.contact) != (len(self.qpos), 4):
             raise OsikValueError(f"contact has shape {np.shape(self.contact)}, expected {(len(self.qpos), 4)}")
 
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike[str], *, joint_names: Sequence[str] | None = None, fps: float | None = None
+    ) -> RobotMotion:
+        """Read a robot's motion: ``motion.npz``, or a CSV without headings with the quaternion as x y z w.
+
+        Args:
+            path: the file, ``.npz`` or ``.csv``.
+            joint_names: joints of a CSV's columns; a ``.npz`` contains them.
+            fps: frame rate of a CSV [1/s]; a ``.npz`` contains it.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ValueError: the file is broken, or a CSV comes without ``joint_names`` and ``fps``.
+        """
+        source = Path(path)
+        if source.suffix.lower() != ".csv":
+            arrays = load_arrays(source)
+            missing = [name for name in ("fps", "qpos", "joint_names") if name not in arrays]
+            if missing:
+                raise OsikValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+            names = tuple(str(name) for name in arrays["joint_names"].ravel())
+            contact = None if "contact" not in arrays else arrays["contact"].astype(bool)
+            return cls(float(arrays["fps"]), names, arrays["qpos"].astype(float), contact)
+        if joint_names is None or fps is None:
+            raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
+        if not source.is_file():
+            raise FileNotFoundError(f"no such file: {source}")
+        lines = enumerate(source.read_text().splitlines(), 1)
+        rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line]
+        joints = len(joint_names)
+        fixed = bool(rows) and len(rows[0]) == joints
+        ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]
+        if ragged:
+            raise OsikValueError(f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + joints}")
+        values = np.array(rows).reshape(len(rows), -1)
+        base = [] if fixed else [0, 1, 2, 6, 3, 4, 5]
+        return cls(fps, tuple(joint_names), values[:, [*base, *range(len(base), values.shape[1])]])
+
     @property
     def is_free(self) -> bool:
         """Return whether ``qpos`` has the seven columns of a free joint, so that the base moves."""
@@ -77,6 +116,12 @@ class RobotMotion:
             qpos[:, 3:7] = slerp(low[:, 3:7], high[:, 3:7], part)
         contact = None if self.contact is None else self.contact[before + (part >= 0.5)]
         return RobotMotion(float(fps), self.joint_names, qpos, contact)
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the CSV layout of GMR and mjlab: position, quaternion x y z w, joints; no headings."""
+        base = [0, 1, 2, 4, 5, 6, 3] if self.is_free else []
+        columns = [*base, *range(len(base), self.qpos.shape[1])]
+        np.savetxt(path, self.qpos[:, columns], fmt="%.9g", delimiter=",")
 
 
 def joints_in_mujoco_order(robot: Robot) -> tuple[str, ...]:
@@ -102,49 +147,3 @@ def base_columns(robot: Robot) -> list[int]:
     """Return where the free joint's seven numbers are in a configuration of MuJoCo's model; none for a fixed base."""
     tree = robot.tree
     return [int(tree.full_qpos_address[base]) + k for base in tree.free_bases for k in range(7)]
-
-
-def load_robot_motion(
-    path: str | os.PathLike[str], *, joint_names: Sequence[str] | None = None, fps: float | None = None
-) -> RobotMotion:
-    """Read a robot's motion: ``motion.npz``, or a CSV without headings with the quaternion as x y z w.
-
-    Args:
-        path: the file, ``.npz`` or ``.csv``.
-        joint_names: joints of a CSV's columns; a ``.npz`` contains them.
-        fps: frame rate of a CSV [1/s]; a ``.npz`` contains it.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: the file is broken, or a CSV comes without ``joint_names`` and ``fps``.
-    """
-    source = Path(path)
-    if source.suffix.lower() != ".csv":
-        arrays = load_arrays(source)
-        missing = [name for name in ("fps", "qpos", "joint_names") if name not in arrays]
-        if missing:
-            raise OsikValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
-        names = tuple(str(name) for name in arrays["joint_names"].ravel())
-        contact = None if "contact" not in arrays else arrays["contact"].astype(bool)
-        return RobotMotion(float(arrays["fps"]), names, arrays["qpos"].astype(float), contact)
-    if joint_names is None or fps is None:
-        raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
-    if not source.is_file():
-        raise FileNotFoundError(f"no such file: {source}")
-    lines = enumerate(source.read_text().splitlines(), 1)
-    rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line]
-    joints = len(joint_names)
-    fixed = bool(rows) and len(rows[0]) == joints
-    ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]
-    if ragged:
-        raise OsikValueError(f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + joints}")
-    values = np.array(rows).reshape(len(rows), -1)
-    base = [] if fixed else [0, 1, 2, 6, 3, 4, 5]
-    return RobotMotion(fps, tuple(joint_names), values[:, [*base, *range(len(base), values.shape[1])]])
-
-
-def write_csv(motion: RobotMotion, path: str | os.PathLike[str]) -> None:
-    """Write the CSV layout of GMR and mjlab: position, quaternion x y z w, joints; no headings."""
-    base = [0, 1, 2, 4, 5, 6, 3] if motion.is_free else []
-    columns = [*base, *range(len(base), motion.qpos.shape[1])]
-    np.savetxt(path, motion.qpos[:, columns], fmt="%.9g", delimiter=",")

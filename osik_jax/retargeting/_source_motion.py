@@ -17,7 +17,7 @@ from ._person import Person, bone_length, palm_axes, path_of
 from ._places import find_places
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
-from ._robot_motion import RobotMotion, base_columns, joints_in_mujoco_order, load_robot_motion
+from ._robot_motion import RobotMotion, base_columns, joints_in_mujoco_order
 from ._roles import FINGER_REACHES, LIMBS, REACHES, SIDES
 
 
@@ -54,6 +54,26 @@ class SourceMotion:
         profile = find_profile(self.robot) if self.profile is None else self.profile
         check_profile(self.robot, profile)
         object.__setattr__(self, "profile", profile)
+
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike[str], robot: Robot, *, profile: Profile | None = None, fps: float | None = None
+    ) -> SourceMotion:
+        """Read a robot's motion, ``motion.npz`` or a CSV.
+
+        Args:
+            path: the file; a CSV has the robot's joints in MuJoCo's order.
+            robot: the robot that moves.
+            profile: its profile; None: a bundled one or a guess.
+            fps: frame rate of a CSV [1/s].
+
+        Raises:
+            FileNotFoundError, ValueError, KeyError: as of ``RobotMotion.load`` and ``SourceMotion``.
+        """
+        table = Path(path).suffix.lower() == ".csv"
+        names = joints_in_mujoco_order(robot) if table else None
+        motion = RobotMotion.load(path, joint_names=names, fps=fps if table else None)
+        return cls(robot, motion, profile, Path(path).stem)
 
     @property
     def fps(self) -> float:
@@ -119,23 +139,3 @@ class SourceMotion:
         qpos = np.tile(home, (self.frames, 1))
         qpos[:, columns] = self.motion.qpos
         return qpos
-
-
-def load_source(
-    path: str | os.PathLike[str], robot: Robot, *, profile: Profile | None = None, fps: float | None = None
-) -> SourceMotion:
-    """Read a motion of a robot, ``motion.npz`` or a CSV, for another robot to follow.
-
-    Args:
-        path: the file; a CSV has the robot's joints in MuJoCo's order.
-        robot: the robot that moves.
-        profile: as of ``SourceMotion``.
-        fps: frame rate of a CSV [1/s].
-
-    Raises:
-        FileNotFoundError, ValueError, KeyError: as of ``load_robot_motion`` and ``SourceMotion``.
-    """
-    table = Path(path).suffix.lower() == ".csv"
-    names = joints_in_mujoco_order(robot) if table else None
-    motion = load_robot_motion(path, joint_names=names, fps=fps if table else None)
-    return SourceMotion(robot, motion, profile, Path(path).stem)

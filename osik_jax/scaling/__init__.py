@@ -2,5 +2,4 @@
 
 from ._chunks import run_in_chunks as run_in_chunks
 from ._saved import load as load
-from ._sharded import device_mesh as device_mesh
 from ._sharded import sharded as sharded

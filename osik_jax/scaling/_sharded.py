@@ -19,16 +19,6 @@ _SHARED = -1
 """Marker in place of an axis: every device has the whole array."""
 
 
-def device_mesh(devices: Sequence[Any] | None = None) -> Mesh:
-    """Return a one-dimensional mesh of devices for ``sharded``, whose axis is called "lanes".
-
-    Args:
-        devices: some of ``jax.devices()``; default: all, those of other hosts too where ``jax.distributed`` joined
-            them.
-    """
-    return Mesh(np.array(jax.devices() if devices is None else list(devices)), ("lanes",))
-
-
 def sharded(
     function: Callable[..., Any],
     in_axes: Any = 0,
@@ -45,7 +35,8 @@ def sharded(
         function: of one lane; pure.
         in_axes: as ``jax.vmap`` takes it: one for all arguments or one for each, an axis, None, or a tree of them
             (``osik_jax.batch_axes``). What is None is copied to every device.
-        mesh: the devices; the batch is split over all of its axes. Default: ``device_mesh()``.
+        mesh: the devices, such as ``jax.sharding.Mesh(jax.devices()[:2], ("lanes",))``; the batch is split over all of
+            its axes. Default: all devices, those of other hosts too where ``jax.distributed`` joined them.
         donate_argnums: arguments whose memory the results may take, as in ``jax.jit``; they are lost to the caller.
 
     Returns:
@@ -58,8 +49,8 @@ def sharded(
     if not callable(function):
         raise OsikTypeError(f"{function!r} is no function")
     if mesh is not None and not isinstance(mesh, Mesh):
-        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as device_mesh(jax.devices()[:2])")
-    return ShardedFunction(function, in_axes, device_mesh() if mesh is None else mesh, donate_argnums)
+        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh of devices")
+    return ShardedFunction(function, in_axes, Mesh(jax.devices(), ("lanes",)) if mesh is None else mesh, donate_argnums)
 
 
 class ShardedFunction:

@@ -23,5 +23,4 @@ from ._posture import PostureTask as PostureTask
 from ._relative_frame import RelativeFrameTask as RelativeFrameTask
 from ._task import Task as Task
 from ._task import TaskRows as TaskRows
-from ._task import task_rows as task_rows
 from ._wheel import WheelTask as WheelTask

@@ -24,7 +24,7 @@ from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, equality_rows, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, equality_rows
 
 
 class ComTask(Task):
@@ -114,7 +114,7 @@ class ComTask(Task):
             return self._polygon_rows(self.polygon, point, jacobian, bound)
         axes = axis_numbers(self.axes)
         value = point[axes] if self.target is None else point[axes] - self.target
-        return task_rows(
+        return TaskRows.of(
             value,
             jacobian[axes],
             gain=self.gain,
@@ -129,7 +129,7 @@ class ComTask(Task):
         self, polygon: SupportPolygon, point: Array, jacobian: Array, bound: Callable[[Array], Array]
     ) -> TaskRows:
         value = jnp.matmul(polygon.normals, point[:2], precision="highest")
-        return task_rows(
+        return TaskRows.of(
             value,
             jnp.matmul(polygon.normals, jacobian[:2], precision="highest"),
             lower=jnp.full_like(value, -jnp.inf),

@@ -22,7 +22,7 @@ from ._pointing import across, unit
 from ._pose import option
 from ._rotation import dot
 from ._targets import Pose, PoseLike, as_pose
-from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, TaskRows, check_priority
 
 
 class ContactTask(PlaneTask):
@@ -140,7 +140,7 @@ class ContactTask(PlaneTask):
             return of_position + jacobian_curvature(tilts, jacobians[0, 3:])
 
         weight = jnp.broadcast_to(self.weight, error.shape)
-        return task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
+        return TaskRows.of(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
 
     def _place(self, point: Float[Array, "3"], axes: Float[Array, "3 3"]) -> Float[Array, "3"]:
         """Return the position along the plane relative to the anchor, and the height above the plane [m]."""

@@ -26,7 +26,7 @@ from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_weight
 from ._rotation import cross_matrix
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 _Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
 
@@ -115,7 +115,7 @@ class EqualityConstraintTask(Task):
         counts = np.array([len(own) for own, _ in parts])
         weight = jnp.broadcast_to(self.weight, counts.shape)[np.repeat(np.arange(len(counts)), counts)]
         bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
-        rows = task_rows(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
+        rows = TaskRows.of(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
         return replace(rows, closes_loop=True)
 
     @property

@@ -22,7 +22,7 @@ from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_vector, as_weight, check_bounds
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
 
@@ -117,7 +117,7 @@ class FunctionTask(Task):
             return jax.jvp(value, (kinematics, q), rates)
 
         x, jacobian = jax.vmap(along, in_axes=-1, out_axes=(None, -1))(rates)
-        return task_rows(
+        return TaskRows.of(
             x if self.target is None else x - self.target,
             jacobian,
             gain=self.gain,

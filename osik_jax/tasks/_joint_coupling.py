@@ -20,7 +20,7 @@ from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._rotation import dot
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 
 class JointCouplingTask(Task):
@@ -91,7 +91,7 @@ class JointCouplingTask(Task):
         del kinematics
         dofs = np.array([robot.tree.dof_address[joint] for joint in self.joints])
         value = self._value(robot, q)
-        return task_rows(
+        return TaskRows.of(
             value if self.target is None else value - self.target,
             jnp.zeros((1, robot.nv), self.ratios.dtype).at[0, dofs].set(self.ratios),
             gain=self.gain,

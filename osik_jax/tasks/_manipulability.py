@@ -21,7 +21,7 @@ from ..robot._tree import DOF_WIDTH, KinematicTree
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
 from ._pose import option, row_mask
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 
 class ManipulabilityTask(Task):
@@ -124,7 +124,7 @@ class ManipulabilityTask(Task):
         value, gradient = jax.value_and_grad(lambda step: self.value(robot, integrate(robot, q, step)))(standing)
         if self.target_velocity is None:
             return self._climb(robot, gradient)
-        return task_rows(
+        return TaskRows.of(
             (value if self.target is None else value - self.target)[None],
             gradient[None],
             gain=self.gain,
@@ -159,7 +159,7 @@ class ManipulabilityTask(Task):
         error = -gradient[dofs]
         identity = jnp.asarray(np.eye(robot.nv)[dofs], error.dtype)
         weight = jnp.broadcast_to(self.weight, error.shape)
-        return task_rows(error, identity, gain=self.gain, weight=weight, dofs=self.dofs)
+        return TaskRows.of(error, identity, gain=self.gain, weight=weight, dofs=self.dofs)
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)

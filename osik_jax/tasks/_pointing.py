@@ -21,7 +21,7 @@ from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_scalar, as_vector, concrete
 from ._rotation import dot
-from ._task import TaskRows, check_priority, task_rows
+from ._task import TaskRows, check_priority
 
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
@@ -102,7 +102,7 @@ class PointingTask(FramedTask):
         if self.half_angle is not None:
             derivative = dot(error, derivative)[None] / jnp.maximum(safe_norm(error), _TIP)
             error, upper = _rounded(jnp.sum(error**2))[None], _rounded(self.half_angle**2)[None]
-        return task_rows(
+        return TaskRows.of(
             error,
             dot(derivative, jacobian),
             gain=self.gain,

@@ -23,7 +23,7 @@ from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._targets import Pose, PoseLike, as_pose
-from ._task import TaskRows, check_priority, equality_rows, task_rows
+from ._task import TaskRows, check_priority, equality_rows
 from ._twist import pose_log, seen_from
 
 _ROWS = {
@@ -132,7 +132,7 @@ class PoseTask(FramedTask):
         parts, wrench = form(position, rotation, jacobian)
         chosen = [_chosen(kept, arrays) for kept, arrays in parts]
         error, rows, feedforward, weight = (jnp.concatenate(arrays) for arrays in zip(*chosen, strict=True))
-        return task_rows(
+        return TaskRows.of(
             error,
             rows,
             gain=self.gain,

@@ -21,7 +21,7 @@ from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 
 class PostureTask(Task):
@@ -105,7 +105,7 @@ class PostureTask(Task):
         else:
             error = self._difference(robot, self.target, q, dofs)
             jacobian, feedforward = self._turn(robot, error, jacobian)
-        return task_rows(
+        return TaskRows.of(
             error,
             jacobian,
             gain=self.gain,

@@ -73,6 +73,57 @@ class TaskRows(eqx.Module):
         if self.is_equality is None:
             self.is_equality = self.lower is self.upper
 
+    @classmethod
+    def of(
+        cls,
+        error: Float[Array, " m"],
+        jacobian: Float[Array, "m nv"],
+        *,
+        gain: Gain,
+        weight: Float[Array, " m"],
+        lower: Float[Array, " m"] | None = None,
+        upper: Float[Array, " m"] | None = None,
+        feedforward: Float[Array, " m"] | None = None,
+        dofs: tuple[int, ...] | None = None,
+        curvature: Callable[[Float[Array, " m"]], Float[Array, ""]] | None = None,
+    ) -> TaskRows:
+        """Return the rows of an equality task on ``error``, or of an inequality task if bounds are given.
+
+        Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
+        jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is
+        evaluated at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain.
+
+        Args:
+            error: of an equality, where the robot is less where it should be; of an inequality, the value itself, in
+                its own units, such as m or rad. (m,)
+            jacobian: derivative of ``error`` along v. (m, nv)
+            gain: [1/s], a number or an adaptive gain.
+            weight: of the squared residual of each row; 0 leaves the row out. (m,)
+            lower: lower bounds of ``error``, with ``upper``; -inf for none. (m,)
+            upper: upper bounds; inf for none. (m,)
+            feedforward: the target's own velocity, in units of ``error`` a second; default 0. (m,)
+            dofs: of rows that each ask for the velocity of one dof, which. (static)
+            curvature: maps the weighted pull ``weight gain e`` (m,) to the rows' bound ``curvature``. Default: the
+                pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
+        """
+        shift = jnp.zeros_like(error) if feedforward is None else feedforward
+        linear = dofs is not None or curvature is no_curvature
+        arms = jnp.zeros_like(jacobian[0]) if linear else levers(weight, jacobian)
+        curvature_of = curvature or (
+            no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian)
+        )
+        if lower is None or upper is None:
+            pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
+            wanted = shift - pull
+            return cls(
+                error, jacobian, wanted, wanted, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=True
+            )
+        outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
+        rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
+        low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
+        pull = rate * outside
+        return cls(error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=False)
+
     def squared_lengths(self) -> Float[Array, " m"]:
         """Return the squared length of each row of the Jacobian."""
         return short_sum(self.jacobian**2) if self.squares is None else self.squares
@@ -81,7 +132,7 @@ class TaskRows(eqx.Module):
 class Task(MadeForRobot, Replaceable):
     """Base of all tasks: an immutable pytree.
 
-    To make your own, subclass it, add fields and write ``rows`` (``task_rows``).
+    To make your own, subclass it, add fields and write ``rows`` (``TaskRows.of``).
 
     Attributes:
         priority: 1 is the most important; static.
@@ -177,56 +228,6 @@ def equality_rows(
     """Return the rows of an equality from their fields, as the compiled core computes them."""
     fields = error, jacobian, wanted, wanted, weight, curvature, pull, levers
     return TaskRows(*fields, is_equality=True, squares=squares)
-
-
-def task_rows(
-    error: Float[Array, " m"],
-    jacobian: Float[Array, "m nv"],
-    *,
-    gain: Gain,
-    weight: Float[Array, " m"],
-    lower: Float[Array, " m"] | None = None,
-    upper: Float[Array, " m"] | None = None,
-    feedforward: Float[Array, " m"] | None = None,
-    dofs: tuple[int, ...] | None = None,
-    curvature: Callable[[Float[Array, " m"]], Float[Array, ""]] | None = None,
-) -> TaskRows:
-    """Return the rows of an equality task on ``error``, or of an inequality task if bounds are given.
-
-    Equality: ``jacobian v = -gain(error) error + feedforward``. Inequality: ``gain (lower - error) + feedforward <=
-    jacobian v <= gain (upper - error) + feedforward``; infinite bounds stay infinite, and an adaptive gain is evaluated
-    at the distance of the value to the interval, 0 inside. Rows of weight 0 do not count for the gain.
-
-    Args:
-        error: of an equality, where the robot is less where it should be; of an inequality, the value itself, in its
-            own units, such as m or rad. (m,)
-        jacobian: derivative of ``error`` along v. (m, nv)
-        gain: [1/s], a number or an adaptive gain.
-        weight: of the squared residual of each row; 0 leaves the row out. (m,)
-        lower: lower bounds of ``error``, with ``upper``; -inf for none. (m,)
-        upper: upper bounds; inf for none. (m,)
-        feedforward: the target's own velocity, in units of ``error`` a second; default 0. (m,)
-        dofs: of rows that each ask for the velocity of one dof, which (``TaskRows``). (static)
-        curvature: maps the weighted pull ``weight gain e`` (m,) to the bound that ``TaskRows.curvature`` holds;
-            default: the pull's length times the size of the Jacobian, which is above what a chain of hinges can bend.
-    """
-    shift = jnp.zeros_like(error) if feedforward is None else feedforward
-    linear = dofs is not None or curvature is no_curvature
-    arms = jnp.zeros_like(jacobian[0]) if linear else levers(weight, jacobian)
-    curvature_of = curvature or (no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian))
-    if lower is None or upper is None:
-        pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
-        wanted = shift - pull
-        return TaskRows(
-            error, jacobian, wanted, wanted, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=True
-        )
-    outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
-    rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
-    low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
-    pull = rate * outside
-    return TaskRows(
-        error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=False
-    )
 
 
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:

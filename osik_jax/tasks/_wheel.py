@@ -17,7 +17,7 @@ from ._leaves import as_vector, as_weight, check_not_negative
 from ._plane import PlaneTask, as_normal, as_offset
 from ._pointing import as_direction, unit
 from ._rotation import dot
-from ._task import DEFAULT_GAIN, TaskRows, check_priority, task_rows
+from ._task import DEFAULT_GAIN, TaskRows, check_priority
 
 
 class WheelTask(PlaneTask):
@@ -110,7 +110,7 @@ class WheelTask(PlaneTask):
         def bound(pull: Float[Array, " m"]) -> Float[Array, ""]:
             return pose_curvature(dot(pull, directions), jnp.zeros(3, pull.dtype), moves)
 
-        return task_rows(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bound)
+        return TaskRows.of(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bound)
 
     @property
     def _weight_rows(self) -> int:

@@ -209,7 +209,7 @@ def check_loss(loss: Any) -> None:
 def check_mesh(mesh: Any) -> None:
     """Raise TypeError unless the mesh is a ``jax.sharding.Mesh`` or None."""
     if mesh is not None and not isinstance(mesh, Mesh):
-        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh, such as osik_jax.scaling.device_mesh()")
+        raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh of devices")
 
 
 def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:

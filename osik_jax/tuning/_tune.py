@@ -86,8 +86,8 @@ def tune(
         patience: stops after so many iterations without a better training loss; None: never.
         improvement: a share by which a loss has to be lower to be better, for ``patience``.
         chunk: scenarios that run at a time on a device. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
-        mesh: devices that the scenarios are split over, as ``osik_jax.scaling.device_mesh()`` makes one; each has all
-            parameters, and gradients are summed over them. Default: one device.
+        mesh: devices that the scenarios are split over, such as ``jax.sharding.Mesh(jax.devices(), ("lanes",))``. Each
+            has all parameters, and gradients are summed over them. Default: one device.
         resume: goes on from this result, or from a file that ``save`` wrote; the loss, the scenarios and the numbers
             that are not tuned may be others, the parameters and the optimiser may not.
         save: a .npz file, written after each iteration; where there are several processes, by the first.

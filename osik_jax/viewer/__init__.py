@@ -5,14 +5,9 @@ Not imported with the package, because it loads matplotlib.
 
 from ._animate import animate as animate
 from ._figures import hero_picture as hero_picture
-from ._look import read_look as read_look
-from ._mujoco import mujoco_frame_pose as mujoco_frame_pose
-from ._mujoco import mujoco_poses as mujoco_poses
-from ._mujoco import robot_com as robot_com
 from .live import Session as Session
 from .live import export_html as export_html
 from .live import load_session as load_session
 from .live import serve as serve
 from .live import serve_batch as serve_batch
 from .live import serve_reach as serve_reach
-from .live import serve_session as serve_session

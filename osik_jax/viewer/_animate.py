@@ -41,7 +41,7 @@ def animate(
     size: tuple[int, int] = (720, 405),
     renderer: RendererName = "auto",
     style: Style = "auto",
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
     curves: Values | None = None,
@@ -65,7 +65,7 @@ def animate(
         size: width and height [pixels].
         renderer: ``"mujoco"`` (OpenGL), ``"raycast"`` (CPU), or ``"auto"``: the first of them that works.
         style: ``"geoms"``, ``"sticks"``, or ``"auto"``: the look, else geoms, else sticks.
-        look: what the robot's URDF shows, from ``read_look``.
+        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
             centre of mass is drawn too, and a panel shows both from above.
         trails: frames whose paths are drawn.

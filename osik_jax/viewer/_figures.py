@@ -35,7 +35,7 @@ def hero_picture(
     labels: Sequence[str] = (),
     targets: Sequence[Float[np.ndarray, "k 3"]] = (),
     trails: Sequence[Float[np.ndarray, "n 3"]] = (),
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     spacing: float | None = None,
     size: tuple[int, int] = (1600, 720),
     azimuth: float = 20.0,
@@ -53,7 +53,7 @@ def hero_picture(
         labels: a line below each.
         targets: points of each that are marked with a cross, world axes [m]. Each (k, 3)
         trails: path of a point of each, drawn as a line, world axes [m]. Each (n, 3)
-        look: what the robot's URDF shows, from ``read_look``.
+        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide; 0: all in one place.
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].

@@ -60,6 +60,11 @@ class Look:
     missing: tuple[str, ...]
 
 
+def given_look(look: str | Path | Look | None) -> Look | None:
+    """Return the look of a URDF that is given by its file or name, and other looks as they are."""
+    return read_look(look) if isinstance(look, str | os.PathLike) else look
+
+
 def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.PathLike[str]] = ()) -> Look:
     """Return the visual shapes of a URDF with their meshes (DAE, STL, OBJ, MSH).
 

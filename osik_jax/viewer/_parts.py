@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -15,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from .._errors import OsikValueError
 from ..robot import Robot
-from ._look import Look
+from ._look import Look, given_look
 from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
@@ -142,19 +143,19 @@ class RobotParts:
         return position[index], rotation[index]
 
 
-def robot_parts(robot: Robot, *, style: Style = "auto", look: Look | None = None) -> RobotParts:
+def robot_parts(robot: Robot, *, style: Style = "auto", look: str | Path | Look | None = None) -> RobotParts:
     """Return the shapes of a robot for pictures.
 
     Args:
         robot: the robot.
         style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the look
             if there is one, else the geoms if most moving bodies have a visible one, else sticks.
-        look: shapes and colours of its links, as its URDF gives them.
+        look: shapes and colours of its links, as its URDF gives them, or that URDF.
 
     Raises:
         ValueError: ``style="geoms"`` of a model that has no visible geom, or a look of another robot.
     """
-    model, tips = robot.mj_model, _tips(robot)
+    model, tips, look = robot.mj_model, _tips(robot), given_look(look)
     if look is not None and style == "auto":
         bodies = _link_bodies(model, look)
         if _cover(model, bodies):

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax import demo
+from osik_jax.demo import _nao
 from osik_jax.demo._comparison import comparison
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import Figure, figures
@@ -30,7 +30,7 @@ DT = 0.005
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
     """A demonstration of half a second: its folder, report, motion and run."""
-    folder, motion = tmp_path_factory.mktemp("demo"), demo.double_support(0.5)
+    folder, motion = tmp_path_factory.mktemp("demo"), _nao.double_support(0.5)
     summary, _, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
     return folder, summary, motion, run
 
@@ -81,7 +81,7 @@ def test_the_polygon_shrinks_from_both_feet_to_one(nao):
     """At the ends it touches the polygon of both feet from outside; in the middle it is that of the left foot."""
     both = osik.support_polygon(nao, nao.q0, ("l_sole", "r_sole"), margin=0.01)
     foot = osik.support_polygon(nao, nao.q0, ("l_sole",), margin=0.01)
-    tasks = demo.single_support(8.0).tasks
+    tasks = _nao.single_support(8.0).tasks
 
     def polygon_at(t: float) -> osik.SupportPolygon:
         task = tasks(t)["com"]
@@ -100,7 +100,7 @@ def test_the_polygon_shrinks_from_both_feet_to_one(nao):
 
 def test_measurement_of_a_motion_made_by_hand(nao):
     """The whole robot slides and one knee goes past its limit: every number is known beforehand."""
-    motion = demo.double_support(1.0)
+    motion = _nao.double_support(1.0)
     q = np.tile(np.asarray(nao.q0), (11, 1))
     q[:, 0] += 0.001 * np.arange(11)
     knee, dof = nao.joint_qpos_index("LKneePitch"), nao.joint_dof_index("LKneePitch")
@@ -153,7 +153,7 @@ def check_requirements(motion, run, lifted=None):
 @pytest.mark.release
 def test_double_support_reaches_its_numbers():
     """A motion of 8 s at 200 Hz."""
-    motion = demo.double_support()
+    motion = _nao.double_support()
     run = run_scheme(motion, "hierarchical", dt=DT)
     assert len(run.q) == 1601
     check_requirements(motion, run)
@@ -165,7 +165,7 @@ def test_double_support_reaches_its_numbers():
 @pytest.mark.release
 def test_single_support_reaches_its_numbers():
     """A motion of 8 s at 200 Hz."""
-    motion = demo.single_support()
+    motion = _nao.single_support()
     run = run_scheme(motion, "hierarchical", dt=DT)
     check_requirements(motion, run, lifted=motion.stances[1].lifted)
     height = run.measurement.displacement["right_foot"][:, 2]

@@ -7,12 +7,12 @@ from example_files import example_file
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax import viewer
 from osik_jax.demo._estimate import estimate_seconds
 from osik_jax.demo._figures import figures
 from osik_jax.demo._file import file_motion
 from osik_jax.demo._run import TITLES, run_scheme
 from osik_jax.demo._sway import JointPath, strides, sway_of
+from osik_jax.viewer._look import read_look
 from osik_jax.viewer._outline import robot_outline
 
 LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>
@@ -125,7 +125,7 @@ def test_an_arm_rises_above_its_base_and_a_hanging_one_hangs():
 def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
     path = example_file("solo_description/robots/solo12.urdf")
-    robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
+    robot, look = osik.Robot.from_urdf(path, floating_base=True), read_look(path)
     motion = file_motion(robot, name="solo12", look=look)
     assert robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]

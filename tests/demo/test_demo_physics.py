@@ -10,13 +10,14 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from osik_jax import cli, demo
+from osik_jax import cli
+from osik_jax.demo import _nao
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import figures
 from osik_jax.demo._physics import measure_physics
 from osik_jax.demo._report import table
 from osik_jax.physics import Servo
-from osik_jax.viewer import mujoco_poses
+from osik_jax.viewer._mujoco import mujoco_poses
 
 DT = 0.005
 
@@ -24,7 +25,7 @@ DT = 0.005
 @pytest.fixture(scope="module")
 def lift(tmp_path_factory):
     """The single-support motion of 8 s at 200 Hz: its motion, folder, report and run."""
-    motion, folder = demo.single_support(), tmp_path_factory.mktemp("physics")
+    motion, folder = _nao.single_support(), tmp_path_factory.mktemp("physics")
     summary, _, runs = run_demo(motion, folder, schemes=("weighted",), dt=DT, physics=True, animation=False)
     return motion, folder, summary, runs[0]
 

@@ -65,7 +65,7 @@ def test_pressing_again_with_a_still_hand_moves_nothing(arm, rows, reachable):
 
 
 def hand(arm, q):
-    return osik.frame_pose(arm, osik.forward_kinematics(arm, q), "hand")
+    return osik.forward_kinematics(arm, q).frame_pose(arm, "hand")
 
 
 def moved(arm, tasks, clutch, q, pressed, device, steps):

@@ -65,7 +65,7 @@ def inputs(robot, tasks, count):
     rng = np.random.default_rng(3)
     q = np.asarray(robot.q0) + rng.uniform(-0.3, 0.3, (count, robot.nq))
     p = np.asarray(tasks["hand"].target[0]) + rng.uniform(-0.4, 0.4, (count, 3))
-    R = jax.vmap(lambda q: osik.frame_pose(robot, osik.forward_kinematics(robot, q), "hand")[1])(q[::-1])
+    R = jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_pose(robot, "hand")[1])(q[::-1])
     given = {"q": q, "hand.target[0]": p, "hand.target[1]": R}
     return {name: np.asarray(value, robot.q0.dtype) for name, value in given.items()}
 

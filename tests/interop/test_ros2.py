@@ -9,7 +9,7 @@ from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.interop.ros2 import Controller, Received, Settings
+from osik_jax.interop.ros2 import Controller, Settings
 from osik_jax.interop.ros2._settings import dds_name, read_settings, topic_of_frame
 
 PERIOD = 5_000_000
@@ -23,7 +23,7 @@ def header(time_ns, frame_id="world"):
 
 def state(time_ns, joints, stamp=None):
     message = Message(header=header(stamp or time_ns), name=list(joints), position=list(joints.values()))
-    return Received("state", "", time_ns, message)
+    return ("state", "", time_ns, message)
 
 
 def target(time_ns, frame, position, rotation=None, frame_id="world", stamp=None, quaternion=None):
@@ -32,7 +32,7 @@ def target(time_ns, frame, position, rotation=None, frame_id="world", stamp=None
     point = Message(x=position[0], y=position[1], z=position[2])
     pose = Message(position=point, orientation=Message(x=x, y=y, z=z, w=w))
     head = header(time_ns if stamp is None else stamp, frame_id)
-    return Received("target", frame, time_ns, Message(header=head, pose=pose))
+    return ("target", frame, time_ns, Message(header=head, pose=pose))
 
 
 class Run:
@@ -141,7 +141,7 @@ class TestNames:
         run = started(controller)
         before = run.memory
         broken = state(run.now, run.joints)
-        change(broken.message)
+        change(broken[-1])
         run.memory, output = controller.tick(run.memory, run.now + 1, [broken])
         np.testing.assert_array_equal(run.memory.measured, before.measured)
         assert output.level == 1 and reason in output.message and output.values["refused messages"] == "1"
@@ -317,7 +317,7 @@ def test_a_robot_on_feet_stands_where_it_stood_at_home_and_keeps_its_feet(nao):
 
 def test_a_clutch_moves_nothing_when_pressed_and_scales_motion(arm):
     run = Run(Controller(arm, Settings(clutch=True, clutch_scale=0.5)))
-    pressed = lambda now: Received("clutch", "hand", now, Message(data=True))  # noqa: E731
+    pressed = lambda now: ("clutch", "hand", now, Message(data=True))  # noqa: E731
     there = np.array([3.0, -2.0, 1.0])
     run.tick()
     start = run.pose("hand")[0]

@@ -167,7 +167,7 @@ def test_a_robot_in_another_process_follows_targets_by_name(session, arm):
     assert session.commands[-1].joint_names == [f"joint{number}" for number in range(1, 8)]
     assert session.states[-1].name == [f"joint{number}" for number in range(7, 0, -1)]
     last = dict(zip(session.states[-1].name, session.states[-1].position, strict=True))
-    hand = osik.frame_pose(arm, osik.forward_kinematics(arm, arm.configuration(last)), "hand")[0]
+    hand = osik.forward_kinematics(arm, arm.configuration(last)).frame_pose(arm, "hand")[0]
     np.testing.assert_allclose(np.asarray(hand)[[0, 2]], [0.45, 0.5], atol=0.05)
     assert np.ptp([m.points[0].positions[0] for m in session.commands]) > 0.2
 

@@ -12,9 +12,10 @@ from motion_files import FIGURE, Figure, dancer, with_first, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax import OsikWarning
-from osik_jax.retargeting import HumanMotion, RobotMotion, find_roles, load_motion, load_robot_motion, write_csv
+from osik_jax.retargeting import HumanMotion, RobotMotion, load_motion
 from osik_jax.retargeting._bvh import read_bvh
 from osik_jax.retargeting._person import measure
+from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._up import find_up
 
 _TO_Z_UP = {"x": (1, 2, 0), "y": (2, 0, 1), "z": (0, 1, 2)}
@@ -402,17 +403,17 @@ def test_a_robots_motion_comes_back_from_both_files(tmp_path):
     qpos = np.hstack([rng.normal(size=(4, 3)), Rotation.random(4, random_state=1).as_quat(scalar_first=True)])
     motion = RobotMotion(30.0, ("hip", "knee"), np.hstack([qpos, rng.normal(size=(4, 2))]))
     np.savez(tmp_path / "motion.npz", fps=motion.fps, joint_names=motion.joint_names, qpos=motion.qpos)
-    back = load_robot_motion(tmp_path / "motion.npz")
+    back = RobotMotion.load(tmp_path / "motion.npz")
     assert back.joint_names == motion.joint_names and (back.qpos == motion.qpos).all()
-    write_csv(motion, tmp_path / "motion.csv")
+    motion.save_csv(tmp_path / "motion.csv")
     first = np.loadtxt(tmp_path / "motion.csv", delimiter=",")[0]
     np.testing.assert_allclose(first[3:7], np.roll(motion.qpos[0, 3:7], -1), rtol=1e-8)
-    back = load_robot_motion(tmp_path / "motion.csv", joint_names=("hip", "knee"), fps=30.0)
+    back = RobotMotion.load(tmp_path / "motion.csv", joint_names=("hip", "knee"), fps=30.0)
     np.testing.assert_allclose(back.qpos, motion.qpos, rtol=1e-8)
     with pytest.raises(ValueError, match="say joint_names and fps"):
-        load_robot_motion(tmp_path / "motion.csv")
+        RobotMotion.load(tmp_path / "motion.csv")
     with pytest.raises(ValueError, match="line 1: 9 numbers, not 8"):
-        load_robot_motion(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
+        RobotMotion.load(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
     with pytest.raises(ValueError, match="not of unit length in frame 0"):
         RobotMotion(30.0, (), np.ones((1, 7)))
 

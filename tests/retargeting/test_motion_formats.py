@@ -5,7 +5,8 @@ import pytest
 from motion_files import dancer
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import find_roles, load_motion
+from osik_jax.retargeting import load_motion
+from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._smpl import _TREE
 
 TURN = Rotation.from_euler("x", 90, degrees=True)  # y up becomes z up

@@ -16,8 +16,9 @@ from motion_files import (
 )
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import HumanMotion, find_roles, load_motion
+from osik_jax.retargeting import HumanMotion, load_motion
 from osik_jax.retargeting._roles import NEEDED
+from osik_jax.retargeting._skeletons import find_roles
 
 NAMES = [name for name, _, _ in FIGURE]
 

@@ -24,17 +24,13 @@ from osik_jax.kinematics import forward_kinematics
 from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
+    Profile,
     Retargeter,
+    RobotMotion,
     _plan,
-    find_roles,
     fit,
-    guess_profile,
     load_motion,
-    load_profile,
-    load_robot_motion,
-    report,
     retarget,
-    save_profile,
 )
 from osik_jax.retargeting._balance import overhang
 from osik_jax.retargeting._banded import BandedSystem, has_kernel, solve_banded
@@ -42,7 +38,7 @@ from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
 from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
-from osik_jax.retargeting._fit import FitLoss, _Setting
+from osik_jax.retargeting._fit import LOSS, _Setting
 from osik_jax.retargeting._folder import _Lengths, retarget_folder
 from osik_jax.retargeting._link_shapes import shrunk
 from osik_jax.retargeting._notes import notes
@@ -50,6 +46,7 @@ from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
 from osik_jax.retargeting._profile_file import find_profile
 from osik_jax.retargeting._roles import NEEDED, SIDES
+from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._terms import Body, frame_rows
 from osik_jax.robot.loading import example_urdf
 
@@ -159,7 +156,7 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
 
 @pytest.mark.slow
 def test_nao_dances_with_its_feet_where_they_are(nao, danced):
-    figures = report(danced)
+    figures = danced.report()
     assert figures["feet"]["contact_share"] == 1.0
     assert figures["feet"]["slip_mm_max"] < 0.01
     assert figures["feet"]["float_mm_max"] < 0.01 and figures["feet"]["below_floor_mm_max"] < 0.01
@@ -221,10 +218,10 @@ def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, lea
             margins[-1].append(-edge_distance(data.subtree_com[0, :2], corners[:, :2]))
     without, within = map(min, margins)
     assert without < -0.01 and within > 0.01 - 5e-5
-    figures = report(kept)
+    figures = kept.report()
     assert figures["balance"]["double_support_frames"] == 30 and figures["balance"]["com_inside_share"] == 1.0
     assert figures["balance"]["com_margin_mm_min"] == pytest.approx(1e3 * within, abs=1e-6)
-    assert report(free)["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
+    assert free.report()["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
     assert figures["feet"]["slip_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
     assert figures["joints"]["jump_frames"] == 0 and figures["joints"]["beyond_range_max"] == 0.0
     # on one foot it is where it was
@@ -250,7 +247,7 @@ def test_limits_hold_exactly(nao, dance, danced):
     assert (q <= np.asarray(nao.position_upper)[dofs] + 1e-12).all()
     # met by leading: the plan keeps them by itself, and the feet stay
     assert tight.off_plan.max() < 1e-3
-    assert report(tight)["feet"]["slip_mm_max"] < 0.5
+    assert tight.report()["feet"]["slip_mm_max"] < 0.5
 
 
 def test_many_clips_give_what_each_gives_alone(nao, dance, danced, tmp_path):
@@ -314,7 +311,7 @@ def test_more_smoothness_is_less_acceleration_and_feet_stay(nao, dance, danced, 
     low, high, fast = (np.asarray(x)[dofs] for x in (nao.position_lower, nao.position_upper, nao.velocity_limit))
     for smoothness in (0.0, 0.03, 0.1):
         result = Retargeter(nao, smoothness=smoothness).retarget(noisy)
-        q, figures = result.motion.qpos[:, own], report(result)
+        q, figures = result.motion.qpos[:, own], result.report()
         speed, acceleration, jerk = (np.diff(q, n, axis=0) * FPS**n for n in (1, 2, 3))
         mean_squares.append([np.mean(acceleration**2), np.mean(jerk**2)])
         assert figures["feet"]["slip_mm_max"] < 0.1
@@ -360,7 +357,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     assert float(index[2][index[0].index("slip_mm_max")]) == summary["figures"]["dance"]["slip_mm_max"]
     slips = [json.loads((out / name / "report.json").read_text())["feet"]["slip_mm_max"] for name in ("dance", "short")]
     assert summary["worst"]["slip_mm_max"] == max(slips) < 0.1
-    np.testing.assert_allclose(load_robot_motion(out / "dance" / "motion.npz").qpos, danced.motion.qpos, atol=1e-5)
+    np.testing.assert_allclose(RobotMotion.load(out / "dance" / "motion.npz").qpos, danced.motion.qpos, atol=1e-5)
     # what is there is not made again, but where its file is another one now
     made = []
     monkeypatch.setattr(Retargeter, "_solved", lambda own, clips, *more: made.append(len(clips)) or [])
@@ -384,7 +381,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
 
 def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danced, tmp_path, capsys):
     """A hand that holds what moves by 18 m cannot follow it."""
-    assert report(danced)["notes"] == []
+    assert danced.report()["notes"] == []
     motion, many = load_motion(dance), tmp_path / "clips"
     box = np.linspace([-9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], motion.frames)
     held: Any = {"object.box": box, "touch.left_wrist.box": np.ones(motion.frames, bool)}
@@ -398,8 +395,8 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     assert max(figures["feet"]["slip_mm_max"], figures["touches"]["off_mm_max"]) > 5.0
     assert last == f"note: {figures['notes'][-1]}" and last.startswith("note: a bound gave way: ")
     rare = dataclasses.replace(danced, contact=danced.contact & (np.arange(30) < 5)[:, None])
-    assert report(rare)["notes"][0].startswith("feet stand in 17 % of the frames")
-    whole = report(danced)
+    assert rare.report()["notes"][0].startswith("feet stand in 17 % of the frames")
+    whole = danced.report()
     tipped = {**whole, "balance": {"com_margin_mm_min": -3.0}, "shapes": {"penetration_mm_max": 2.5}}
     assert notes(tipped) == ["a bound gave way: shapes overlap by 2.5 mm"]
     assert notes(tipped, 0.01)[1] == "a bound gave way: the centre of mass is 3.0 mm outside the feet"
@@ -433,7 +430,7 @@ def test_the_last_pass_keeps_limits_whatever_the_plan(nao):
 
 def test_files_come_back(danced, tmp_path):
     danced.save(tmp_path / "motion.npz")
-    back = load_robot_motion(tmp_path / "motion.npz")
+    back = RobotMotion.load(tmp_path / "motion.npz")
     np.testing.assert_array_equal(back.qpos, danced.motion.qpos)
     with np.load(tmp_path / "motion.npz", allow_pickle=False) as data:
         pictured = {"human", "human_names", "human_bones", "human_standing"}
@@ -452,17 +449,17 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     }  # fmt: skip
     figures = json.loads((out / "report.json").read_text())
     assert figures["clip"] == "dance" and figures["feet"]["slip_mm_max"] < 0.01
-    motion = load_robot_motion(out / "motion.npz")
-    table = load_robot_motion(out / "motion.csv", joint_names=motion.joint_names, fps=motion.fps)
+    motion = RobotMotion.load(out / "motion.npz")
+    table = RobotMotion.load(out / "motion.csv", joint_names=motion.joint_names, fps=motion.fps)
     np.testing.assert_allclose(table.qpos, motion.qpos, atol=1e-8)
-    assert load_profile(out / "profile.toml").keypoints == load_profile("nao").keypoints
+    assert Profile.load(out / "profile.toml").keypoints == Profile.load("nao").keypoints
 
 
 def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
     clip = write_bvh(tmp_path / "clip.bvh", with_first(2, dancer(30)))
     out = tmp_path / "out"
     assert cli.main(["retarget", str(clip), "--no-trim", "--no-animation", "--out", str(out)]) == 0
-    assert len(load_robot_motion(out / "motion.npz").qpos) == 32
+    assert len(RobotMotion.load(out / "motion.npz").qpos) == 32
 
 
 @pytest.mark.parametrize(
@@ -557,7 +554,7 @@ def test_a_robot_may_face_any_way_at_home(nao, degrees):
     q[:3] = turn.apply(q[:3])
     q[3:7] = (turn * Rotation.from_quat(q[3:7], scalar_first=True)).as_quat(scalar_first=True)
     turned = nao.with_home(q)
-    assert guess_profile(turned).keypoints == guess_profile(nao).keypoints
+    assert Profile.guess(turned).keypoints == Profile.guess(nao).keypoints
     ours, own = Retargeter(turned), Retargeter(nao)
     assert own.robot is nao
     np.testing.assert_allclose(ours.robot.q0[:3], nao.q0[:3], atol=1e-12)
@@ -575,7 +572,7 @@ def test_the_left_of_two_is_told_by_name():
 
 def test_feet_stay_where_limbs_pull_at_them(nao):
     """The legs of a person whose standing feet move apart pull for 90 frames; a step's slip adds up over all frames."""
-    figures = report(Retargeter(nao).retarget(sliding(90, 0.1)))
+    figures = Retargeter(nao).retarget(sliding(90, 0.1)).report()
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.01
     assert figures["tracking"]["segment_angle_deg_mean"] > 1.0  # so that they pull
 
@@ -604,7 +601,7 @@ def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(nao, 
 
 
 def test_a_guess_sees_the_same_robot(nao):
-    guess, own = guess_profile(nao), load_profile("nao")
+    guess, own = Profile.guess(nao), Profile.load("nao")
     assert find_profile(nao) == own
     same = {role for role in NEEDED if guess.keypoints[role][0] == own.keypoints[role][0]}
     assert same == set(NEEDED) - {"left_hip", "right_hip"}
@@ -616,7 +613,7 @@ def test_a_guess_sees_the_same_robot(nao):
 
 def test_a_g1_is_guessed_from_its_urdf():
     g1 = osik.Robot.from_urdf(example_urdf("g1"), floating_base=True)
-    guess, own = guess_profile(g1), load_profile("g1")
+    guess, own = Profile.guess(g1), Profile.load("g1")
     assert find_profile(g1) == own
     for side in ("left", "right"):
         # the URDF's balls of 5 mm at these places, 30 mm below the ankle
@@ -639,12 +636,12 @@ def test_a_g1_is_guessed_from_its_urdf():
 )
 def test_a_wrist_is_not_what_grips(urdf, wrist):
     robot = osik.Robot.from_urdf(example_urdf("g1").parents[2] / urdf, floating_base=True)
-    assert guess_profile(robot).keypoints["left_wrist"][0] == wrist
+    assert Profile.guess(robot).keypoints["left_wrist"][0] == wrist
 
 
 def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
     path = example_urdf("talos")
-    talos, own = osik.Robot.from_urdf(path, floating_base=True), load_profile("talos")
+    talos, own = osik.Robot.from_urdf(path, floating_base=True), Profile.load("talos")
     assert find_profile(talos) == own
     boxes = ElementTree.parse(path.with_name("talos_full_v2_box.urdf")).getroot()
     for side in SIDES:
@@ -653,7 +650,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
         corners = np.array([*own.feet[side].heel, *own.feet[side].toe])
         signs = np.array([[-1, 1, 0], [-1, -1, 0], [1, 1, 0], [1, -1, 0]])
         np.testing.assert_allclose(corners, 0.5 * signs * [length, width, 0.0])
-    made, guessed = (Build.of(talos, profile).points for profile in (own, guess_profile(talos)))
+    made, guessed = (Build.of(talos, profile).points for profile in (own, Profile.guess(talos)))
     for role in NEEDED:
         np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))  # what a fit may move it by
 
@@ -661,7 +658,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
 @pytest.mark.release
 def test_talos_dances_with_its_feet_where_they_are(dance):
     talos = osik.Robot.from_urdf(example_urdf("talos"), floating_base=True)
-    figures = report(retarget(talos, load_motion(dance)))
+    figures = retarget(talos, load_motion(dance)).report()
     assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.05
     assert figures["feet"]["float_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["speed_over_limit_max"] <= 1.0 + 1e-9
@@ -698,7 +695,7 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         turn = data.geom_xmat[geom].reshape(3, 3)
         vertices.append(model.mesh_vert[first : first + count] @ turn.T + data.geom_xpos[geom])
-    outside = np.maximum(outside_capsules(plain, guess_profile(plain).capsules, np.concatenate(vertices)), 0.0)
+    outside = np.maximum(outside_capsules(plain, Profile.guess(plain).capsules, np.concatenate(vertices)), 0.0)
     assert 1e3 * outside.mean() < {"g1": 0.3, "talos": 3.0}[name]
 
 
@@ -707,7 +704,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
     """The vertices of a G1's hands as they look; the hand is fixed to a wrist that is too light for a capsule."""
     path = example_urdf("g1")
     g1 = osik.Robot.from_urdf(path, floating_base=True)
-    profile, places = guess_profile(g1), home_kinematics(g1)
+    profile, places = Profile.guess(g1), home_kinematics(g1)
     for side in SIDES:
         raw = (path.parents[1] / f"meshes/{side}_{part}.STL").read_bytes()
         faces = np.frombuffer(raw[84:], np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]))
@@ -721,7 +718,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
 def test_links_without_a_size_get_no_capsule():
     path = example_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)
-    capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
+    capsules = {capsule.frame: capsule.radius for capsule in Profile.guess(icub).capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
 
 
@@ -739,7 +736,7 @@ def test_links_are_no_longer_than_between_their_joints(urdf, link, ends):
     places = home_kinematics(robot)
     first, last = (np.asarray(places.frame_pose(robot, frame)[0]) for frame in ends)
     along = (last - first) / np.linalg.norm(last - first)
-    capsules = [capsule for capsule in guess_profile(robot).capsules if capsule.frame == link]
+    capsules = [capsule for capsule in Profile.guess(robot).capsules if capsule.frame == link]
     position, rotation = (np.asarray(x) for x in places.frame_pose(robot, link))
     for c in capsules:
         at = (position + np.array([c.start, c.end]) @ rotation.T - first) @ along
@@ -757,7 +754,7 @@ def test_links_that_are_too_light_for_their_size_are_made_smaller():
 
 
 def test_limbs_that_are_straight_at_home_begin_bent(nao):
-    profile = load_profile("nao")
+    profile = Profile.load("nao")
     np.testing.assert_array_equal(Build.of(nao, profile).start, nao.q0)  # nothing is at an end of its range
     elbows = {side: nao.joint_qpos_index(f"{side}ElbowRoll") for side in "LR"}
     straight = np.array(nao.q0)
@@ -779,7 +776,7 @@ def test_robots_that_cannot_walk_are_refused():
     with pytest.raises(ValueError, match="floating_base=True"):
         Retargeter(arm)
     with pytest.raises(ValueError, match="bolted down"):
-        guess_profile(arm)
+        Profile.guess(arm)
 
 
 @pytest.mark.slow
@@ -806,9 +803,9 @@ def test_products_are_in_full_precision(nao, dance):
 
 
 def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
-    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.1)
-    save_profile(profile, tmp_path / "robot.toml")
-    assert load_profile(tmp_path / "robot.toml") == profile
+    profile = dataclasses.replace(Profile.load("g1"), scale=0.8, stretch=1.1)
+    profile.save(tmp_path / "robot.toml")
+    assert Profile.load(tmp_path / "robot.toml") == profile
     with pytest.raises(KeyError, match="no frame 'pelvis'"):
         Retargeter(nao, profile=profile)
     text = (tmp_path / "robot.toml").read_text()
@@ -825,7 +822,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         assert old in text
         (tmp_path / "broken.toml").write_text(text.replace(old, new))
         with pytest.raises(ValueError, match=message):
-            load_profile(tmp_path / "broken.toml")
+            Profile.load(tmp_path / "broken.toml")
 
 
 def test_a_fit_needs_clips_and_steps(nao, dance):
@@ -833,6 +830,8 @@ def test_a_fit_needs_clips_and_steps(nao, dance):
         fit(nao, [])
     with pytest.raises(ValueError, match="steps is 0"):
         fit(nao, [load_motion(dance)], steps=0)
+    with pytest.raises(KeyError, match="no loss term 'slop'; did you mean 'slip'"):
+        fit(nao, [load_motion(dance)], loss={"slop": 1.0})
 
 
 def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
@@ -847,9 +846,9 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
 @pytest.mark.release
 def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
     """By central differences, over plans that go on from the same one; what the gradient leaves out is small here."""
-    own = load_profile("nao")
+    own = Profile.load("nao")
     own = dataclasses.replace(own, weights=dataclasses.replace(own.weights, smooth=2.0))
-    setting = _Setting(Retargeter(nao, profile=own), FitLoss())
+    setting = _Setting(Retargeter(nao, profile=own), LOSS)
     (problem,), _ = setting.problems([load_motion(dance)], [], None)
     here, step = setting.origin(), 0.05
     _, slope, plan = setting.slope(here, problem, setting.plan(here, problem))
@@ -864,7 +863,7 @@ def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
 @pytest.mark.release
 def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(nao, dance, tmp_path, capsys):
     """From a profile that smooths too much; the file is what the command writes."""
-    start = load_profile("nao")
+    start = Profile.load("nao")
     start = dataclasses.replace(start, weights=dataclasses.replace(start.weights, smooth=2.0))
     motion = load_motion(dance)
     assert motion.rotations is not None
@@ -875,5 +874,5 @@ def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(na
     assert found.losses[found.step] < 0.95
     assert found.held_out[found.step] == found.held_out.min() < 0.95
     assert float(found.profile.weights.smooth) < 2.0
-    save_profile(found.profile, tmp_path / "robot.toml")
-    assert load_profile(tmp_path / "robot.toml") == found.profile
+    found.profile.save(tmp_path / "robot.toml")
+    assert Profile.load(tmp_path / "robot.toml") == found.profile

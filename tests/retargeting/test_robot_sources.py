@@ -9,17 +9,7 @@ from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.retargeting import (
-    Profile,
-    Retargeter,
-    RobotMotion,
-    SourceMotion,
-    load_motion,
-    load_robot_motion,
-    load_source,
-    report,
-    write_csv,
-)
+from osik_jax.retargeting import Profile, Retargeter, RobotMotion, SourceMotion, load_motion
 from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._load import Reader
 from osik_jax.retargeting._roles import HAND, LIMBS, NEEDED
@@ -43,13 +33,13 @@ def angle(a, b):
 @pytest.mark.release
 def test_a_robot_that_follows_itself_does_the_same(nao, danced):
     first, file, retargeter = danced
-    source = load_source(file, nao)
+    source = SourceMotion.load(file, nao)
     np.testing.assert_array_equal(source.person().contact, first.contact)
     again = retargeter.retarget(source)
     names = [nao.joint_qpos_index(name) for name in nao.joint_names]
     assert np.degrees(np.abs(again.q - first.q)[:, names]).mean() < 0.5
     assert np.abs(again.q - first.q)[:, :3].max() < 2e-3
-    figures = report(again)
+    figures = again.report()
     assert figures["tracking"]["segment_angle_deg_mean"] < 0.2
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
 
@@ -58,10 +48,10 @@ def test_a_robot_that_follows_itself_does_the_same(nao, danced):
 def test_a_motion_goes_to_another_robot_and_comes_back(nao, danced):
     g1 = osik.load_robot("g1")
     first, file, retargeter = danced
-    there = Retargeter(g1).retarget(load_source(file, nao))
+    there = Retargeter(g1).retarget(SourceMotion.load(file, nao))
     back = retargeter.retarget(SourceMotion(g1, dataclasses.replace(there.motion, contact=there.contact)))
     for result in (there, back):
-        figures = report(result)
+        figures = result.report()
         np.testing.assert_array_equal(result.contact, first.contact)
         assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
         assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
@@ -79,7 +69,7 @@ def test_robots_of_other_builds_lead_a_g1(tmp_path):
         danced = first.retarget(dance)
         source = SourceMotion(robot, dataclasses.replace(danced.motion, contact=danced.contact), first.profile)
         led = g1.retarget(source)
-        figures, joints = report(led), report(led)["joints"]
+        figures, joints = led.report(), led.report()["joints"]
         np.testing.assert_array_equal(led.contact, danced.contact)
         assert joints["beyond_range_max"] == 0.0 and joints["speed_over_limit_max"] <= 1.0 + 1e-6
         assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
@@ -99,7 +89,7 @@ def test_limbs_that_a_source_lacks_are_left_out(tmp_path):
     source = SourceMotion(short.robot, danced.motion, short.profile, "short")
     with pytest.warns(osik.OsikWarning, match="no left_wrist, right_wrist; .*left arm to the elbow"):
         led = whole.retarget(source)
-    figures = report(led)
+    figures = led.report()
     assert set(whole.profile.followed) - set(led.profile.followed) == {LIMBS[5], LIMBS[7]}
     assert figures["tracking"]["segment_angle_deg_mean"] < 1.0 and figures["feet"]["slip_mm_max"] < 0.1
     elbows = [whole.robot.joint_qpos_index(f"{side}_elbow") for side in ("left", "right")]
@@ -133,17 +123,17 @@ def test_feet_of_a_source_without_labels_are_found(nao, danced):
 
 def test_other_rates_and_tables(nao, danced, tmp_path):
     first, file, _ = danced
-    fast = load_source(file, nao).resampled(60.0)
+    fast = SourceMotion.load(file, nao).resampled(60.0)
     assert fast.frames == 2 * len(first.q) - 1
     np.testing.assert_allclose(fast.motion.qpos[::2], first.motion.qpos, atol=1e-12)
     table = file.with_name("motion.csv")
-    write_csv(first.motion, table)
-    np.testing.assert_allclose(load_source(table, nao, fps=30.0).motion.qpos, first.motion.qpos, atol=1e-8)
+    first.motion.save_csv(table)
+    np.testing.assert_allclose(SourceMotion.load(table, nao, fps=30.0).motion.qpos, first.motion.qpos, atol=1e-8)
     with pytest.raises(ValueError, match="a CSV holds numbers alone; say joint_names and fps"):
-        load_source(table, nao)
+        SourceMotion.load(table, nao)
     assert cli.main(["retarget", str(table), "--source", "nao", "--source-fps", "30", "--no-animation",
                      "--out", str(tmp_path / "out")]) == 0  # fmt: skip
-    assert len(load_robot_motion(tmp_path / "out" / "motion.npz").qpos) == len(first.q)
+    assert len(RobotMotion.load(tmp_path / "out" / "motion.npz").qpos) == len(first.q)
 
 
 def test_wrong_sources_are_told(nao, danced):

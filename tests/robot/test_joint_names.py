@@ -8,8 +8,8 @@ import pytest
 from refusals import refuses
 
 from benchmarks.data_file import read_csv
-from osik_jax.retargeting import find_roles
 from osik_jax.retargeting._roles import NEEDED
+from osik_jax.retargeting._skeletons import find_roles
 
 LEGS_AND_ARMS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 LEFT_RIGHT, CAPITAL, LETTER, SMALL = ("left", "right"), ("Left", "Right"), ("L", "R"), ("l", "r")

@@ -17,7 +17,7 @@ EIGHT = """
 import json
 import jax, jax.numpy as jnp, numpy as np
 import osik_jax as osik
-from osik_jax.scaling import device_mesh, sharded
+from osik_jax.scaling import sharded
 
 arm = osik.load_robot("arm7")
 limits = (osik.VelocityLimit(arm, velocity={'*': 0.4}),)
@@ -50,7 +50,7 @@ placed = mean.place(3.0, q[:16])
 out = mean(*placed)
 last = placed[1].addressable_shards[7].data.shape
 found["placed"] = [last, len(out.sharding.device_set), out.sharding.is_fully_replicated]
-two = sharded(mean.function, (None, 0), mesh=device_mesh(jax.devices()[:2]))(3.0, q[:16])
+two = sharded(mean.function, (None, 0), mesh=jax.sharding.Mesh(jax.devices()[:2], ("lanes",)))(3.0, q[:16])
 found["two"] = [largest(two, np.asarray(out)), len(two.sharding.device_set)]
 print(json.dumps(found))
 """

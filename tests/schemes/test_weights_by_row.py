@@ -141,7 +141,7 @@ class TestRows:
     def test_a_class_of_ones_own_has_them_too(self, arm):
         class Level(osik.Task):
             def rows(self, robot, kinematics, q):
-                return osik.task_rows(q[:2], jnp.eye(2, robot.nv), gain=self.gain, weight=self.weight)
+                return osik.TaskRows.of(q[:2], jnp.eye(2, robot.nv), gain=self.gain, weight=self.weight)
 
         np.testing.assert_array_equal(Level(weight=[1.0, 2.0]).weight, [1.0, 2.0])
         refuses(ValueError, "a scalar or a vector", Level, weight=np.ones((2, 2)))

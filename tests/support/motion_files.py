@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import HumanMotion, find_roles
+from osik_jax.retargeting import HumanMotion
 from osik_jax.retargeting._person import Person, directions, read_person
 from osik_jax.retargeting._roles import LIMBS
+from osik_jax.retargeting._skeletons import find_roles
 
 FIGURE = (
     ("Hips", -1, (0.0, 0.0, 0.0)),

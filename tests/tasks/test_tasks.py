@@ -179,7 +179,7 @@ class HeightTask(osik.Task):
     def rows(self, robot, kinematics, q):
         p, _ = kinematics.frame_pose(robot, self.body)
         jacobian = osik.frame_jacobian(robot, kinematics, self.body)[2:3]
-        return osik.task_rows(p[2:] - self.height, jacobian, gain=self.gain, weight=self.weight[None])
+        return osik.TaskRows.of(p[2:] - self.height, jacobian, gain=self.gain, weight=self.weight[None])
 
 
 def test_an_own_task(arm):

@@ -18,7 +18,6 @@ import jax, jax.numpy as jnp, numpy as np, optax
 {first}
 import osik_jax as osik
 from osik_jax import tuning
-from osik_jax.scaling import device_mesh
 
 arm = osik.load_robot("arm7")
 tasks = {{"hand": osik.FrameTask(arm, "hand", rows="position")}}
@@ -45,7 +44,7 @@ EIGHT = (
     JOB.format(first="")
     + """
 found = {"devices": len(jax.devices())}
-for name, mesh in (("one", None), ("eight", device_mesh())):
+for name, mesh in (("one", None), ("eight", jax.sharding.Mesh(jax.devices(), ("lanes",)))):
     before = tuning._tune._step._cache_size()
     found[name] = history(mesh)
     found[name]["compiled"] = tuning._tune._step._cache_size() - before
@@ -57,7 +56,7 @@ print(json.dumps(found))
 TWO_HOSTS = (
     JOB.format(first='port, process = sys.argv[1:]\njax.distributed.initialize(f"localhost:{port}", 2, int(process))')
     + """
-print(json.dumps({"devices": len(jax.devices()), **history(device_mesh())}))
+print(json.dumps({"devices": len(jax.devices()), **history(jax.sharding.Mesh(jax.devices(), ("lanes",)))}))
 """
 )
 

@@ -20,7 +20,7 @@ from osik_jax.cli._retarget import Retarget
 from osik_jax.viewer import export_html, serve_reach
 from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer.live._default import default_session
-from osik_jax.viewer.live._page import LiveView, serve_session
+from osik_jax.viewer.live._page import LiveView
 from osik_jax.viewer.live._reach import ReachView
 from osik_jax.viewer.live._source import RobotSource
 
@@ -63,7 +63,7 @@ def visit() -> Iterator[Visit]:
 def view() -> Iterator[LiveView]:
     polygon = osik.support_polygon(ROBOT, ROBOT.q0, FEET, margin=0.01)
     session = default_session(ROBOT, feet=FEET, polygon=polygon, source=RobotSource("nao"))
-    with serve_session(session, port=0) as view:
+    with session.serve(port=0) as view:
         assert view.loop.wait_until_ready(120.0)
         yield view
 

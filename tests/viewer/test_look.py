@@ -15,6 +15,7 @@ import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.robot.loading._collada import read_collada
 from osik_jax.robot.loading._meshes import read_mesh
+from osik_jax.viewer._look import read_look
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raster import Rasterizer, draw_triangles
@@ -98,7 +99,7 @@ def test_stl_and_obj_hold_the_same_box(tmp_path):
 def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
     written(tmp_path / "meshes" / "box.obj", CUBE_OBJ)
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://any_name/meshes/box.obj"))
-    robot, look = osik.Robot.from_urdf(path, floating_base=False), viewer.read_look(path)
+    robot, look = osik.Robot.from_urdf(path, floating_base=False), read_look(path)
     assert look.missing == () and [shape.link for shape in look.shapes] == ["base", "upper"]
     shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, [0.5]))
     assert shape.style == "look"
@@ -115,7 +116,7 @@ def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
 
 def test_collision_shapes_stand_in_for_meshes_that_are_gone(tmp_path):
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://gone/box.stl"))
-    look = viewer.read_look(path)
+    look = read_look(path)
     assert look.missing == ("package://gone/box.stl",)
     assert [shape.kind for shape in look.shapes] == [mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX]
 
@@ -135,7 +136,7 @@ def test_the_icubs_meshes_are_turned():
     """All of them say that y is up, and mean it: left as they are, its joints are 6 cm away from them."""
     path = example_file("robots/icub.urdf")
     robot = osik.Robot.from_urdf(path, floating_base=True)
-    away = from_joints(robot, viewer.read_look(path))
+    away = from_joints(robot, read_look(path))
     assert len(away) > 30 and away.mean() < 0.02
 
 
@@ -146,7 +147,7 @@ def test_y_up_is_followed_where_that_brings_meshes_to_joints(tmp_path, elbow):
     blade = blade.replace("100 0 0</translate>", "0 0 0</translate>").replace("0 0 1 50 0 0 0 1", "0 0 1 0 0 0 0 1")
     written(tmp_path / "meshes" / "blade.dae", blade)
     text = ARM.format(mesh="meshes/blade.dae").replace("0.1 0.1 0.1", "1 1 1").replace("0 0 0.2", elbow)
-    look = viewer.read_look(written(tmp_path / "arm.urdf", text))
+    look = read_look(written(tmp_path / "arm.urdf", text))
     (mesh,) = (shape.mesh[0] for shape in look.shapes if shape.mesh is not None)
     end = np.array([float(x) for x in elbow.split()])
     assert (mesh @ end).max() == pytest.approx(1.0) and (mesh @ end).min() == pytest.approx(0.0, abs=1e-12)
@@ -174,7 +175,7 @@ def test_triangles_cover_what_they_cover():
 
 def test_drawn_triangles_look_like_cast_rays():
     path = example_file("hyq_description/robots/hyq_no_sensors.urdf")
-    robot, look = osik.Robot.from_urdf(path, floating_base=True), viewer.read_look(path)
+    robot, look = osik.Robot.from_urdf(path, floating_base=True), read_look(path)
     shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, robot.q0))
     size, floor = (180, 140), float(lowest_points(shape, data).min())
     camera = frame_camera(shape.corners(data), size, 30.0, 12.0)
@@ -203,7 +204,7 @@ def test_no_instant_is_cut_and_no_head_is_under_the_title(tmp_path):
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="none.stl").replace("0.1 0.2 0.3", "1.6 0.2 0.3"))
     robot = osik.Robot.from_urdf(path, floating_base=False)
     q = np.linspace(-0.4, 0.4, 9)[:, None]
-    picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144), look=viewer.read_look(path))
+    picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144), look=path)
     film = viewer.animate(tmp_path / "f.gif", robot, q, dt=0.1, size=(240, 136), renderer="raycast", caption="a title")
     pictures = [np.asarray(Image.open(picture).convert("RGB"), float)]
     with Image.open(film) as frames:

@@ -16,7 +16,7 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import viewer
-from osik_jax.viewer import _animate, _opengl
+from osik_jax.viewer import _animate, _mujoco, _opengl
 from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
@@ -104,12 +104,12 @@ def test_faces_close_and_point_outward(shapes, geom, volume):
 def test_nao_com_and_frames_are_mujocos(nao):
     configurations = random_configurations(nao, 3)
     forward = jax.jit(lambda q: osik.forward_kinematics(nao, q))
-    for q, data in zip(configurations, viewer.mujoco_poses(nao, configurations), strict=True):
+    for q, data in zip(configurations, _mujoco.mujoco_poses(nao, configurations), strict=True):
         reference = mujoco_at(nao, q)
-        np.testing.assert_allclose(viewer.robot_com(nao, data), reference.subtree_com[1], atol=1e-12)
+        np.testing.assert_allclose(_mujoco.robot_com(nao, data), reference.subtree_com[1], atol=1e-12)
         kinematics = forward(q)
         for name in ("torso", "l_sole", "r_sole_corner_2", "l_gripper"):
-            p, R = viewer.mujoco_frame_pose(nao, data, name)
+            p, R = _mujoco.mujoco_frame_pose(nao, data, name)
             p_ours, R_ours = kinematics.frame_pose(nao, name)
             np.testing.assert_allclose(p, p_ours, atol=1e-12)
             np.testing.assert_allclose(R, R_ours, atol=1e-12)
@@ -123,10 +123,10 @@ def test_frame_of_a_fused_link_follows_its_body():
     <limit lower="-2" upper="2" velocity="1" effort="1"/></joint>
     <joint name="f" type="fixed"><parent link="arm"/><child link="tool"/><origin xyz="0.5 0 0"/></joint></robot>"""
     robot = osik.Robot.from_urdf(urdf, floating_base=False)
-    data = next(viewer.mujoco_poses(robot, robot.configuration({"j": 0.5})))
-    p, _ = viewer.mujoco_frame_pose(robot, data, "tool")
+    data = next(_mujoco.mujoco_poses(robot, robot.configuration({"j": 0.5})))
+    p, _ = _mujoco.mujoco_frame_pose(robot, data, "tool")
     np.testing.assert_allclose(p, [0.5 * np.cos(0.5), 0.5 * np.sin(0.5), 0.0], atol=1e-12)
-    refuses(KeyError, "tool", viewer.mujoco_frame_pose, robot, data, "tol")
+    refuses(KeyError, "tool", _mujoco.mujoco_frame_pose, robot, data, "tol")
 
 
 def test_sticks_where_there_is_no_geom():

@@ -1,5 +1,4 @@
 """ROS 2 topics without ROS: a robot's controller as a function of messages. ``.dds`` speaks DDS and reads bags."""
 
 from ._controller import Controller as Controller
-from ._controller import Received as Received
 from ._settings import Settings as Settings

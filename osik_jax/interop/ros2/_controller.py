@@ -24,16 +24,9 @@ _SHOWN_NS = 1_000_000_000
 
 
 class Received(NamedTuple):
-    """Received message.
+    """Received message; ``Controller.tick`` says what the fields are."""
 
-    Attributes:
-        kind: kind of the message.
-        frame: the frame of a target or clutch; empty for joint states.
-        time_ns: when it was received, by the clock of stamps [ns].
-        message: JointState, PoseStamped or Bool, of any library: its attributes are read.
-    """
-
-    kind: Literal["state", "target", "clutch"]
+    kind: str
     frame: str
     time_ns: int
     message: Any
@@ -160,15 +153,20 @@ class Controller:
         count = len(self.joints.names)
         return Memory(np.full(count, np.nan), np.full(count, _NEVER), {"": np.full(count, _NEVER)})
 
-    def tick(self, memory: Memory, now_ns: int, received: Sequence[Received]) -> tuple[Memory, Output]:
+    def tick(self, memory: Memory, now_ns: int, received: Sequence[tuple[str, str, int, Any]]) -> tuple[Memory, Output]:
         """Return the memory and the output after one period.
 
         Args:
             memory: that of the last period.
             now_ns: time now, by the clock of stamps [ns].
-            received: the messages since the last period, in the order in which they came.
+            received: the messages since the last period, in the order in which they came. Each is a tuple of
+
+                - its kind: ``"state"``, ``"target"`` or ``"clutch"``;
+                - the frame of a target or clutch, empty for joint states;
+                - when it was received, by the clock of stamps [ns];
+                - the JointState, PoseStamped or Bool, of any library: its attributes are read.
         """
-        for item in received:
+        for item in map(Received._make, received):
             try:
                 memory = self._take(memory, item)
             except Refused as reason:

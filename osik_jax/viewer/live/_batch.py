@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -18,7 +19,7 @@ from ...robot import Robot
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import FrameTask, Task
-from .._look import Look
+from .._look import Look, given_look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -203,7 +204,7 @@ def serve_batch(
     limits: Limits | None = None,
     dt: float = 0.005,
     q0: Float[Array, "B nq"] | Float[Array, " nq"] | None = None,
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -241,6 +242,6 @@ def serve_batch(
         scheme = scheme_for(next(iter(tasks.values())), robot.q0.dtype)
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
-    return BatchView(robot, controllers, q0s, dt=dt, look=look, host=host, port=port, title="osik-jax").opened(
-        open_browser
-    )
+    return BatchView(
+        robot, controllers, q0s, dt=dt, look=given_look(look), host=host, port=port, title="osik-jax"
+    ).opened(open_browser)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikValueError
 from ...control import Trajectory
 from ...robot import Robot
-from .._look import Look
+from .._look import Look, given_look
 from ._playback import Cast, Motion
 from ._server import close_server, open_server
 
@@ -27,7 +27,7 @@ def export_html(
     path: str | os.PathLike[str],
     *,
     dt: float | None = None,
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     title: str = "osik-jax",
 ) -> Path:
     """Write a motion as one self-contained page with time slider, speeds and a mouse-controlled camera.
@@ -40,7 +40,7 @@ def export_html(
         trajectory: of ``rollout``, or configurations (T, nq), or several of them by name, side by side.
         path: of the page.
         dt: time between configurations [s]; default: that of the trajectory, or 0.005.
-        look: what the robot's URDF shows, from ``read_look``; default: the model's own shapes.
+        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         title: of the page.
 
     Returns:
@@ -50,7 +50,7 @@ def export_html(
         ImportError: viser is not installed (the extra ``viewer``).
         ValueError: configurations of another robot, or none.
     """
-    return write_page(robot, _motion(robot, trajectory, dt), Path(path), look=look, title=title)
+    return write_page(robot, _motion(robot, trajectory, dt), Path(path), look=given_look(look), title=title)
 
 
 def write_page(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...control._checks import check_setting, check_tasks, checked_limits
+from ...control._checks import checked_limits
 from ...limits import Limits
 from ...robot import Robot
 from ...schemes import Scheme
@@ -150,7 +151,7 @@ def serve(
     limits: Limits | None = None,
     dt: float = 0.005,
     q0: Float[Array, " nq"] | None = None,
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     source: RobotSource | str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -168,7 +169,7 @@ def serve(
         limits: as in ``osik_jax.solve``.
         dt: time of a step, and period of the loop [s].
         q0: configuration at the start [m, rad]; default: ``robot.q0``. (nq,)
-        look: shapes of the robot, from ``read_look``; default: those of the model.
+        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         source: name or file of the robot, which sessions then keep.
         host: address to listen at; 127.0.0.1 is this machine alone.
         port: TCP port; 0 for any that is free.
@@ -201,31 +202,7 @@ def serve(
         q=np.asarray(start),
         source=RobotSource(source) if isinstance(source, str) else source,
     )
-    return serve_session(session, look=look, host=host, port=port, open_browser=open_browser)
-
-
-def serve_session(
-    session: Session,
-    *,
-    look: Look | None = None,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    open_browser: bool = False,
-) -> LiveView:
-    """Run and show a session.
-
-    Arguments that are not named here, and exceptions, are those of ``serve``.
-
-    Args:
-        session: from a view or from ``load_session``.
-
-    Returns:
-        The view.
-    """
-    check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
-    check_tasks(session.tasks, session.robot)
-    checked_limits(session.robot, session.limits)
-    return LiveView(session, look=look, host=host, port=port, title="osik-jax").opened(open_browser)
+    return session.serve(look=look, host=host, port=port, open_browser=open_browser)
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import mujoco
@@ -13,7 +14,7 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 from ...reachability._map import ReachabilityMap
 from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
 from ...robot import Robot
-from .._look import Look
+from .._look import Look, given_look
 from .._mujoco import mujoco_poses
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes
@@ -239,7 +240,7 @@ def serve_reach(
     robot: Robot,
     found: ReachabilityMap,
     *,
-    look: Look | None = None,
+    look: str | Path | Look | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -267,7 +268,7 @@ def serve_reach(
         ValueError: the map is of another robot.
     """
     check_map(robot, found)
-    return ReachView(robot, found, look=look, host=host, port=port, title=f"Reach of {found.frame}").opened(
+    return ReachView(robot, found, look=given_look(look), host=host, port=port, title=f"Reach of {found.frame}").opened(
         open_browser
     )
 
