@@ -7,14 +7,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..batching._structure import is_number
+from ..batching._structure import Static, put_together, taken_apart
 from ..control import Solution, solve
 from ..control._checks import check_targets, checked_limits
 from ..control._rollout import remembering
@@ -106,12 +105,11 @@ def simulate(
         raise OsikValueError(f"steps is {steps}; there has to be one step at least")
     check_targets(tasks, targets, steps)
     robot = simulation.world.robot
-    numbers, structure = eqx.partition(tasks if callable(tasks) else dict(tasks), is_number)
-    leaves, treedef = jax.tree.flatten(structure)
+    numbers, static = taken_apart(tasks if callable(tasks) else dict(tasks))
     own = checked_limits(robot, limits)
     how = command if command is None or callable(command) else np.asarray(command, float)
     program = partial(_control_step, robot, numbers, scheme, own, how, np.asarray(dt))
-    step = partial(program, static=(tuple(leaves), treedef))
+    step = partial(program, static=static)
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
     memory = _cold_start(lambda state: step(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
@@ -144,10 +142,10 @@ def _control_step(
     memory: tuple[Any, Any],
     target: Targets | None,
     *,
-    static: tuple[tuple[Any, ...], Any],
+    static: Static,
 ) -> tuple[Array, Solution]:
     """Return command and solution of a step: its pure part."""
-    tasks: Any = eqx.combine(numbers, jax.tree.unflatten(static[1], static[0]))
+    tasks: Any = put_together(numbers, static)
     todo: Any = tasks(t) if callable(tasks) else aim(tasks, target)
     velocity, warm_start = memory
     todo, kept = remembering((todo, limits), velocity, t > 0.0)

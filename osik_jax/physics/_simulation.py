@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
-from ..robot._tree import FREE, QPOS_WIDTH
+from ..robot._tree import FREE
 from ._world import World, frame_pose
 
 FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6
@@ -31,7 +31,7 @@ class Simulation:
         self.world = world
         self.data = mujoco.MjData(world.model)
         tree = world.robot.tree
-        self._sensed = _entries(tree.independent, tree.full_qpos_address, tree.joint_types)
+        self._sensed = tree.own_qpos
         self._targets = np.array([tree.qpos_address[tree.joint(name)] for name in world.servos], int)
         self._points = [g for foot in world.feet for g in world.contact_geoms(foot)]
         self.reset(world.robot.q0 if q is None else q)
@@ -155,8 +155,3 @@ class Simulation:
             elif first is not None:
                 out[first] -= force
         return out
-
-
-def _entries(joints: tuple[int, ...], address: np.ndarray, kinds: tuple[int, ...]) -> np.ndarray:
-    """Return the indices of q's entries in MuJoCo's qpos."""
-    return np.concatenate([address[j] + np.arange(QPOS_WIDTH[kinds[j]]) for j in joints]).astype(int)

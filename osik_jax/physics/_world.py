@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +18,7 @@ from ..robot import Robot
 from ..robot._feet import with_corners
 from ..robot._own_masses import own_masses
 from ..robot._tree import BALL, FREE
+from ..robot.loading._mjmodel import element_names
 from ._servo import Servo as Servo
 from ._servo import add_servo, choose_servos
 
@@ -209,8 +211,11 @@ def frame_pose(
 
 def _model_body(robot: Robot, body: int) -> int:
     """Return MuJoCo's number of a body of the tree."""
-    names = [_body_name(robot.mj_model, b) for b in range(robot.mj_model.nbody)]
-    return names.index(robot.tree.body_names[body])
+    return _body_names(robot.mj_model).index(robot.tree.body_names[body])
+
+
+def _body_names(model: mujoco.MjModel) -> tuple[str, ...]:
+    return element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -> None:
@@ -222,16 +227,13 @@ def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -
     spec.option.impratio = 100.0  # feet that stick do not creep
 
 
-def _body_name(model: mujoco.MjModel, body: int) -> str:
-    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body{body}"
-
-
 def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBody]:
     """Return the bodies of a compiled model with their inertias and joints, in the same order."""
-    bodies = [spec.worldbody]
+    bodies, names = [spec.worldbody], _body_names(model)
+    joints = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
     for b in range(1, model.nbody):
         body = bodies[model.body_parentid[b]].add_body(
-            name=_body_name(model, b),
+            name=names[b],
             pos=model.body_pos[b],
             quat=model.body_quat[b],
             mass=model.body_mass[b],
@@ -241,7 +243,7 @@ def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBo
             explicitinertial=True,
         )
         for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
-            body.add_joint(**_joint(model, j))
+            body.add_joint(name=joints[j], **_joint(model, j))
         for g in range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b]):
             _add_shape(body, model, g)
         bodies.append(body)
@@ -256,9 +258,9 @@ def _add_shape(body: mujoco.MjsBody, model: mujoco.MjModel, g: int) -> None:
         body.add_geom(**look, rgba=model.geom_rgba[g], group=model.geom_group[g], contype=0, conaffinity=0, mass=0.0)
 
 
-def _joint(model: mujoco.MjModel, j: int) -> dict:
+def _joint(model: mujoco.MjModel, j: int) -> dict[str, Any]:
     kind = mujoco.mjtJoint(int(model.jnt_type[j]))
-    out = dict(name=_joint_name(model, j), type=kind, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
+    out: dict[str, Any] = dict(type=kind, align=mujoco.mjtAlignFree.mjALIGNFREE_FALSE)
     if kind == mujoco.mjtJoint.mjJNT_FREE:
         return out
     limited = mujoco.mjtLimited.mjLIMITED_TRUE if model.jnt_limited[j] else mujoco.mjtLimited.mjLIMITED_FALSE
@@ -266,10 +268,6 @@ def _joint(model: mujoco.MjModel, j: int) -> dict:
     if kind != mujoco.mjtJoint.mjJNT_BALL:
         out["ref"] = model.qpos0[model.jnt_qposadr[j]]
     return out
-
-
-def _joint_name(model: mujoco.MjModel, j: int) -> str:
-    return mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, j) or f"joint{j}"
 
 
 def _add_floor(spec: mujoco.MjSpec, height: float, friction: float) -> None:

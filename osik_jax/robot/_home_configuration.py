@@ -71,11 +71,7 @@ def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
         number = int(home)
     else:
         raise unknown_name("keyframe", home, tuple(names))
-    q = np.zeros(robot.nq)
-    for joint, start in robot.tree.qpos_address.items():
-        full, width = robot.tree.full_qpos_address[joint], QPOS_WIDTH[robot.tree.joint_types[joint]]
-        q[start : start + width] = model.key_qpos[number, full : full + width]
-    return q
+    return model.key_qpos[number][robot.tree.own_qpos]
 
 
 def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:

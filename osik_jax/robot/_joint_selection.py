@@ -74,9 +74,7 @@ def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
 
 def dof_names(robot: Robot) -> list[str]:
     """Return the joint name of each entry of v, for messages. (nv,)."""
-    return [
-        robot.tree.joint_names[j] for j in robot.tree.independent for _ in range(DOF_WIDTH[robot.tree.joint_types[j]])
-    ]
+    return [robot.tree.joint_names[j] for j in robot.tree.dof_joint[robot.tree.own_dofs]]
 
 
 def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str) -> Float[Array, " nv"]:

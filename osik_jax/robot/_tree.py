@@ -181,6 +181,17 @@ class KinematicTree:
         """Return the index of each joint in the MuJoCo model's qvel, then one past the end."""
         return np.cumsum([0, *(DOF_WIDTH[t] for t in self.joint_types)])
 
+    @cached_arrays
+    def own_qpos(self) -> np.ndarray:
+        """Return the index in the MuJoCo model's qpos of each entry of q. (nq,)."""
+        joints = np.repeat(np.arange(len(self.joint_types)), [QPOS_WIDTH[t] for t in self.joint_types])
+        return np.flatnonzero(np.isin(joints, self.independent))
+
+    @cached_arrays
+    def own_dofs(self) -> np.ndarray:
+        """Return the index in the MuJoCo model's qvel of each entry of v. (nv,)."""
+        return np.flatnonzero(np.isin(self.dof_joint, self.independent))
+
     @cached_property
     def qpos_address(self) -> dict[int, int]:
         """Return the index in q of each independent joint."""
@@ -214,10 +225,7 @@ class KinematicTree:
         """Return ``(index, coefficient)``: full qpos = coefficient * q[index] + offset (coefficient 0 where locked)."""
         n = int(self.full_qpos_address[-1])
         index, coefficient = np.zeros(n, int), np.zeros(n)
-        for joint, start in self.qpos_address.items():
-            full, width = self.full_qpos_address[joint], QPOS_WIDTH[self.joint_types[joint]]
-            index[full : full + width] = np.arange(start, start + width)
-            coefficient[full : full + width] = 1.0
+        index[self.own_qpos], coefficient[self.own_qpos] = np.arange(self.nq), 1.0
         for follower, leader, multiplier in self.followers:
             index[self.full_qpos_address[follower]] = self.qpos_address[leader]
             coefficient[self.full_qpos_address[follower]] = multiplier
@@ -229,14 +237,7 @@ class KinematicTree:
 
         The first pair takes each independent joint's own columns; each further pair adds one follower to its leader.
         """
-        own = (
-            np.concatenate(
-                [np.arange(self.full_dof_address[j], self.full_dof_address[j + 1]) for j in self.independent]
-            ).astype(int)
-            if self.independent
-            else np.zeros(0, int)
-        )
-        terms = [(own, np.ones(self.nv))]
+        terms = [(self.own_dofs, np.ones(self.nv))]
         for follower, leader, multiplier in self.followers:
             dof = self.dof_address[leader]
             free = next((term for term in terms[1:] if term[1][dof] == 0.0), None)

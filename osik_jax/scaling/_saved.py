@@ -15,7 +15,7 @@ import numpy as np
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError
 from ..batching._names import leaf_names
-from ._chunk_file import Block, DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
+from ._chunk_file import DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
 from ._fingerprint import identifier
 
 FORMAT = 2
@@ -156,21 +156,8 @@ class Saved:
         lanes = np.concatenate([np.arange(*block) for blocks, _ in read for block in blocks])
         if not np.array_equal(np.sort(lanes), np.arange(own)):
             raise DamagedFile(self.folder / parts[0].file_name, f"and its like do not have each of {own} lanes once")
-        whole: dict[str, np.ndarray] = {}
-        for blocks, arrays in read:
-            for name, array in arrays.items():
-                _fill(whole, name, array, blocks, own)
-        return {name: array[start:stop] for name, array in whole.items()}
-
-
-def _fill(whole: dict[str, np.ndarray], name: str, array: np.ndarray, blocks: list[Block], own: int) -> None:
-    """Copy the rows of an array to their places in the result."""
-    if name not in whole:
-        whole[name] = np.zeros((own, *array.shape[1:]), array.dtype)
-    row = 0
-    for first, last in blocks:
-        whole[name][first:last] = array[row : row + last - first]
-        row += last - first
+        wanted = np.argsort(lanes)[start:stop]
+        return {name: np.concatenate([arrays[name] for _, arrays in read])[wanted] for name in names}
 
 
 def load(folder: str | os.PathLike[str], *, like: Any = None) -> Saved:

@@ -50,8 +50,7 @@ class Problem(eqx.Module):
 
     def one(self, vector: Float[Array, " p"], scenario: Scenarios) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """Return the loss of one scenario, and whether it can be kept."""
-        value, kept = scenario_loss(self.loss, self.space.apply(self.loop, vector), scenario)
-        return value, kept
+        return scenario_loss(self.loss, self.space.apply(self.loop, vector), scenario)
 
     def value(self, vector: Float[Array, " p"], scenarios: Scenarios, chunk: int) -> Evaluation:
         """Return losses at a vector of parameters."""

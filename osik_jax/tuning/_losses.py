@@ -16,7 +16,7 @@ from .._errors import unknown_name
 from ..control import Trajectory
 from ..kinematics import center_of_mass, forward_kinematics
 from ..robot._joint_selection import scalar_layout
-from ..robot._tree import DOF_WIDTH, FREE
+from ..robot._tree import FREE
 from ..tasks import ComTask, SupportPolygon, Task
 from ._loop import Loop
 
@@ -132,9 +132,7 @@ class Effort(Loss):
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
         """Return the mean squared speed."""
         tree = loop.robot.tree
-        driven = np.concatenate(
-            [np.full(DOF_WIDTH[tree.joint_types[j]], tree.joint_types[j] != FREE) for j in tree.independent]
-        )
+        driven = np.array(tree.joint_types)[tree.dof_joint[tree.own_dofs]] != FREE
         return jnp.mean(jnp.sum(jnp.where(driven, trajectory.solution.velocity, 0.0) ** 2, -1))
 
 

@@ -74,23 +74,13 @@ def _fields(name: str) -> list[tuple[str, str]]:
 for _name in _DEFINITIONS:
     _TYPES[_name] = _made(_name)
 
-Bool: Any = _TYPES["std_msgs/Bool"]
-DiagnosticArray: Any = _TYPES["diagnostic_msgs/DiagnosticArray"]
-DiagnosticStatus: Any = _TYPES["diagnostic_msgs/DiagnosticStatus"]
-Duration: Any = _TYPES["builtin_interfaces/Duration"]
-Float64MultiArray: Any = _TYPES["std_msgs/Float64MultiArray"]
-Header: Any = _TYPES["std_msgs/Header"]
-JointState: Any = _TYPES["sensor_msgs/JointState"]
-JointTrajectory: Any = _TYPES["trajectory_msgs/JointTrajectory"]
-JointTrajectoryPoint: Any = _TYPES["trajectory_msgs/JointTrajectoryPoint"]
-KeyValue: Any = _TYPES["diagnostic_msgs/KeyValue"]
-MultiArrayDimension: Any = _TYPES["std_msgs/MultiArrayDimension"]
-MultiArrayLayout: Any = _TYPES["std_msgs/MultiArrayLayout"]
-Point: Any = _TYPES["geometry_msgs/Point"]
-Pose: Any = _TYPES["geometry_msgs/Pose"]
-PoseStamped: Any = _TYPES["geometry_msgs/PoseStamped"]
-Quaternion: Any = _TYPES["geometry_msgs/Quaternion"]
-Time: Any = _TYPES["builtin_interfaces/Time"]
+
+def __getattr__(name: str) -> Any:
+    """Return the class of a message type by its name without the package, such as ``JointState``."""
+    for full, kind in _TYPES.items():
+        if full.rpartition("/")[2] == name:
+            return kind
+    raise AttributeError(name)
 
 
 def ros_name(kind: Any) -> str:

@@ -52,23 +52,23 @@ class Endpoints:
         self._domain = Domain(number, _LOOPBACK) if only else None
         self._participant = DomainParticipant(number)
 
-    def reader(self, topic: str, kind: Any, *, reliable: bool, depth: int = 10) -> DataReader:
+    def reader(self, topic: str, kind: Any, *, reliable: bool) -> DataReader:
         """Return a subscription; one that is not reliable accepts reliable and best-effort publishers."""
-        return DataReader(self._participant, self._topic(topic, kind), qos=_qos(reliable, depth))
+        return DataReader(self._participant, self._topic(topic, kind), qos=_qos(reliable))
 
     def writer(self, topic: str, kind: Any) -> DataWriter:
         """Return a reliable publisher that keeps 10 messages, as by default in ROS 2."""
-        return DataWriter(self._participant, self._topic(topic, kind), qos=_qos(True, 10))
+        return DataWriter(self._participant, self._topic(topic, kind), qos=_qos(True))
 
     def _topic(self, topic: str, kind: Any) -> Topic:
         return Topic(self._participant, dds_name(topic), kind)
 
 
-def _qos(reliable: bool, depth: int) -> Qos:
+def _qos(reliable: bool) -> Qos:
     return Qos(
         _RELIABLE if reliable else _BEST_EFFORT,
         Policy.Durability.Volatile,
-        Policy.History.KeepLast(depth),
+        Policy.History.KeepLast(10),
         Policy.DataRepresentation(use_cdrv0_representation=True),  # ROS 2 knows no other
     )
 
@@ -89,22 +89,18 @@ class Node:
         self.periods = self.missed = self.unread = self.unsent = 0
         self._diagnostics_ns, self._told = 0, ("", -1)
         self._sources: list[tuple[Any, str, str, DataReader]] = []
-        self._read(
-            "state", "", topics.joint_states, endpoints.reader(topics.joint_states, msg.JointState, reliable=False)
-        )
+        self._read("state", "", topics.joint_states, msg.JointState, reliable=False)
         for frame in controller.frames:
             name = topic_of_frame(topics.targets, frame)
-            reader = endpoints.reader(name, msg.PoseStamped, reliable=settings.reliable_targets)
-            self._read("target", frame, name, reader)
+            self._read("target", frame, name, msg.PoseStamped, reliable=settings.reliable_targets)
             if settings.clutch:
-                name = topic_of_frame(topics.clutch, frame)
-                self._read("clutch", frame, name, endpoints.reader(name, msg.Bool, reliable=True))
+                self._read("clutch", frame, topic_of_frame(topics.clutch, frame), msg.Bool, reliable=True)
         self.command_topic = command_topic(settings)
         self._commands = endpoints.writer(self.command_topic, command_type(settings))
         self._diagnostics = endpoints.writer(topics.diagnostics, msg.DiagnosticArray)
 
-    def _read(self, kind: Any, frame: str, topic: str, reader: DataReader) -> None:
-        self._sources.append((kind, frame, topic, reader))
+    def _read(self, kind: Any, frame: str, topic: str, message: Any, *, reliable: bool) -> None:
+        self._sources.append((kind, frame, topic, self._endpoints.reader(topic, message, reliable=reliable)))
 
     def run(self, stop: threading.Event) -> None:
         """Run periods at the controller's rate until ``stop`` is set.

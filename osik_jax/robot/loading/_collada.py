@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError
 
@@ -193,10 +194,8 @@ def _translation(shift: np.ndarray) -> Float[np.ndarray, "4 4"]:
 
 def _rotation(axis_angle: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """Return the rotation about an axis by an angle [deg]."""
-    x, y, z = axis_angle[:3] / np.linalg.norm(axis_angle[:3])
-    angle = np.deg2rad(axis_angle[3])
-    cross, out = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), np.eye(4)
-    out[:3, :3] += np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
+    axis, out = axis_angle[:3] / np.linalg.norm(axis_angle[:3]), np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(axis_angle[3] * axis, degrees=True).as_matrix()
     return out
 
 

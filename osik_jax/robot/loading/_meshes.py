@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Float, Int
 from ..._errors import OsikValueError
 from .._tree import UnreadMesh
 from ._collada import Triangles, read_collada
+from ._mjmodel import rotation_matrix
 from ._packages import Packages
 
 SUFFIXES = (".dae", ".stl", ".obj", ".msh")
@@ -86,11 +88,23 @@ def _text_stl(path: Path) -> Triangles:
 
 
 def _by_mujoco(path: Path) -> Triangles:
-    """Return the triangles of a file that MuJoCo reads, moved back from the mesh's own centre and axes."""
+    return Triangles(*shell(name="mesh", file=str(path.absolute())), None)
+
+
+def shell(**mesh: Any) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "m 3"]]:
+    """Return vertices and triangles as MuJoCo reads them, moved back from the mesh's own centre and axes.
+
+    The mesh may be open or flat. The arguments are those of ``MjSpec.add_mesh``.
+    """
+    open_surface = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    model = compiled_mesh(mesh | {"inertia": open_surface}, collides=False)
+    return model.mesh_vert @ rotation_matrix(model.mesh_quat[0]).T + model.mesh_pos[0], model.mesh_face.copy()
+
+
+def compiled_mesh(mesh: dict[str, Any], *, collides: bool) -> mujoco.MjModel:
+    """Return a model of one mesh; one that collides gets its hull, which a flat mesh has not."""
     spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="mesh", file=str(path.absolute()))
-    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others want a closed surface
-    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0)
-    model, turn = spec.compile(), np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.mesh_quat[0])
-    return Triangles(model.mesh_vert @ turn.reshape(3, 3).T + model.mesh_pos[0], model.mesh_face.copy(), None)
+    spec.add_mesh(**mesh)
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    spec.worldbody.add_geom(type=kind, meshname=mesh["name"], contype=int(collides), conaffinity=int(collides))
+    return spec.compile()

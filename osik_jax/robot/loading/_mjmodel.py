@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from .._balls import with_balls_inside
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
 from .._plausible import warn_of_fast_joints
-from .._tree import BALL, DOF_WIDTH, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, UnreadMesh
+from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
     as_mapping,
@@ -151,13 +151,14 @@ def from_mjmodel(
 def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
     """Return the names of a model's bodies, joints or geoms; one without a name is called by its kind and number."""
     given = [mujoco.mj_id2name(model, kind, k) for k in range(count)]
-    out = []
-    for k, name in enumerate(given):
-        free = f"{prefix}{k}"
-        while free in given:
-            free += "_"
-        out.append(name or free)
-    return tuple(out)
+    return tuple(name or free_name(f"{prefix}{k}", given) for k, name in enumerate(given))
+
+
+def free_name(name: str, taken: Collection[str]) -> str:
+    """Return the name, followed by as many underscores as make it differ from those taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def equality_end_sites(model: mujoco.MjModel) -> set[int]:
@@ -285,10 +286,7 @@ def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
     """Return the names of the collision meshes; one without a name is called by its number, as in ``element_names``."""
     out: list[str] = []
     for number, placed in enumerate(meshes, len(taken)):
-        name = placed.name or f"geom{number}"
-        while name in taken or name in out:
-            name += "_"
-        out.append(name)
+        out.append(free_name(placed.name or f"geom{number}", (*taken, *out)))
     return out
 
 
@@ -393,7 +391,7 @@ def _rate_limits(tree: KinematicTree, followers: list[Follower], rates: np.ndarr
 
 def _over_dofs(tree: KinematicTree, values: np.ndarray) -> np.ndarray:
     """Return the values of joints, repeated for each entry of v of the independent joints."""
-    return np.repeat(values[list(tree.independent)], [DOF_WIDTH[tree.joint_types[j]] for j in tree.independent])
+    return values[tree.dof_joint[tree.own_dofs]]
 
 
 def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: PositionLimits) -> None:
@@ -423,20 +421,19 @@ def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0
     if not model.nkey:
         return
     key = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, 0) or "0"
+    changed = np.abs(qpos[tree.own_qpos] - q0) > _KEY_ROUNDING
     for joint, start in tree.qpos_address.items():
-        full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]
-        if width in (1, 4) and np.abs(qpos[full : full + width] - q0[start : start + width]).max() > _KEY_ROUNDING:
+        kind = tree.joint_types[joint]
+        if kind != FREE and changed[start : start + QPOS_WIDTH[kind]].any():
             name = tree.joint_names[joint]
             yield LoadNote("keyframe", key, f"{name} is outside its range there, and at its end in q0")
 
 
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return the independent entries of a full qpos, joints brought inside their limits."""
-    q = np.zeros(tree.nq)
+    q = qpos[tree.own_qpos]
     for joint, start in tree.qpos_address.items():
-        full, width = tree.full_qpos_address[joint], QPOS_WIDTH[tree.joint_types[joint]]
-        q[start : start + width] = qpos[full : full + width]
-        if width == 1:
+        if tree.joint_types[joint] in (HINGE, SLIDE):
             dof = tree.dof_address[joint]
             q[start] = np.clip(q[start], lower[dof], upper[dof])
     return np.asarray(with_balls_inside(tree, jnp.asarray(q), jnp.asarray(upper)))

@@ -22,6 +22,7 @@ from ._mjmodel import (
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
     NamedMesh,
+    free_name,
     from_mjmodel,
     quaternion,
 )
@@ -126,10 +127,7 @@ def _freed_from_world(urdf: Urdf) -> Urdf:
 
 
 def _base_name(urdf: Urdf) -> str:
-    name = FLOATING_BASE
-    while any(joint.name == name for joint in urdf.joints):
-        name += "_"
-    return name
+    return free_name(FLOATING_BASE, [joint.name for joint in urdf.joints])
 
 
 def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:

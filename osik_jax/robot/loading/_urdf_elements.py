@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError
 from .._load_report import LoadNote
@@ -206,28 +207,12 @@ def _origin(element: ElementTree.Element, where: str) -> Pose:
         return IDENTITY
     position = _numbers(_text(origin, "xyz", "0 0 0"), 3, f"{where}, origin xyz")
     if "quat_xyzw" in origin.attrib:
-        x, y, z, w = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
-        return Pose(position, _from_quaternion(np.array([w, x, y, z]), where))
-    return Pose(position, _from_angles(*_numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")))
-
-
-def _from_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
-    length = np.linalg.norm(quaternion)
-    if length == 0.0:
-        raise OsikValueError(f"{where}: the quaternion is zero")
-    w, *xyz = quaternion / length
-    x, y, z = xyz
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
-
-
-def _from_angles(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Return the rotation about the fixed axes x, then y, then z [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    return about_z @ about_y @ about_x
+        quaternion = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
+        if not quaternion.any():
+            raise OsikValueError(f"{where}: the quaternion is zero")
+        return Pose(position, Rotation.from_quat(quaternion).as_matrix())
+    angles = _numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")
+    return Pose(position, Rotation.from_euler("xyz", angles).as_matrix())
 
 
 def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: list[LoadNote]) -> Link:

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
 from .._load_report import LoadNote
-from ._meshes import SUFFIXES, is_read_by_mujoco, joined, read_mesh
+from ._meshes import SUFFIXES, compiled_mesh, is_read_by_mujoco, joined, read_mesh, shell
 from ._packages import Packages
 from ._urdf_elements import Shape, Urdf
 
@@ -79,7 +78,7 @@ def _repaired(path: Path, made: dict[str, Any]) -> tuple[dict[str, Any] | None, 
     form: dict[str, Any] | None = None
     try:
         form = made | _source(path)
-        _compiled(form)
+        compiled_mesh(form, collides=True)
     except ValueError as error:
         reason = " ".join(str(error).partition("\n")[0].removeprefix("Error: ").removeprefix(f"{path}: ").split())
     else:
@@ -87,27 +86,12 @@ def _repaired(path: Path, made: dict[str, Any]) -> tuple[dict[str, Any] | None, 
     if form is None:
         return None, f"is left out: {reason}"
     try:
-        unit = {**form, "scale": (1.0, 1.0, 1.0), "inertia": mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL}
-        shell = _compiled(unit, with_hull=False)
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, shell.mesh_quat[0])
-        points = shell.mesh_vert @ turn.reshape(3, 3).T + shell.mesh_pos[0]
+        points, _ = shell(**{**form, "scale": (1.0, 1.0, 1.0)})
         thick = dict(name=form["name"], uservert=thickened(points * np.array(form["scale"])).ravel())
-        _compiled(thick)
+        compiled_mesh(thick, collides=True)
     except ValueError:
         return None, f"is left out: {reason}"
     return thick, f"is flat, and {1e3 * _THICKNESS:g} mm thick here"
-
-
-def _compiled(form: dict[str, Any], *, with_hull: bool = True) -> mujoco.MjModel:
-    """Return the mesh alone; by default with its hull, which a model of a URDF has too, but not a flat mesh."""
-    spec = mujoco.MjSpec()
-    spec.add_mesh(**form)
-    collides = int(with_hull)
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"], contype=collides, conaffinity=collides
-    )
-    return spec.compile()
 
 
 def thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

@@ -60,14 +60,14 @@ def _joint_notes(element: ElementTree.Element, joint: Joint) -> Iterator[LoadNot
 def _limit_notes(limit: ElementTree.Element | None, joint: Joint) -> Iterator[LoadNote]:
     if limit is None:
         return
-    if number_of(limit, "jerk"):
+    if number_of(limit.get("jerk")):
         yield LoadNote("limit jerk", joint.name, "not kept: no limit bounds jerks")
-    up, down = number_of(limit, "acceleration"), number_of(limit, "deceleration")
+    up, down = number_of(limit.get("acceleration")), number_of(limit.get("deceleration"))
     if down and down != up:
         yield LoadNote(
             "limit deceleration", joint.name, f"{joint.acceleration:g}, the lesser of the two, holds for both"
         )
-    ends = [number_of(limit, name) or 0.0 for name in ("lower", "upper")]
+    ends = [number_of(limit.get(name)) or 0.0 for name in ("lower", "upper")]
     if joint.kind == "continuous" and ends[0] < ends[1] and max(map(abs, ends)) < _UNREAD:
         yield LoadNote("limit", joint.name, f"a continuous joint has no range: [{ends[0]:g}, {ends[1]:g}] is not kept")
 
@@ -75,16 +75,16 @@ def _limit_notes(limit: ElementTree.Element | None, joint: Joint) -> Iterator[Lo
 def _safety_notes(safety: ElementTree.Element | None, joint: Joint) -> Iterator[LoadNote]:
     if safety is None:
         return
-    soft = [number_of(safety, f"soft_{name}_limit") for name in ("lower", "upper")]
+    soft = [number_of(safety.get(f"soft_{name}_limit")) for name in ("lower", "upper")]
     if (soft[0] is not None and soft[0] > joint.lower) or (soft[1] is not None and soft[1] < joint.upper):
         shown = ", ".join("-" if value is None else f"{value:g}" for value in soft)
         yield LoadNote("safety_controller", joint.name, f"the range of <limit> holds, and not the soft one [{shown}]")
 
 
-def number_of(element: ElementTree.Element, name: str) -> float | None:
-    """Return a finite number that an attribute holds, else None."""
+def number_of(text: str | None) -> float | None:
+    """Return the finite number that a text holds, else None."""
     try:
-        value = float(element.get(name, ""))
+        value = float(text or "")
     except ValueError:
         return None
     return value if math.isfinite(value) else None
@@ -122,18 +122,10 @@ def _control_notes(element: ElementTree.Element, joints: Mapping[str, Joint]) ->
         if joint.mimic is None and any(p.get("name") == "mimic" for p in part.iter("param")):
             yield LoadNote("ros2_control mimic", joint.name, "only <mimic> in a <joint> makes a follower")
         for interface in part.iter("command_interface"):
-            ends = {p.get("name"): float_of(p.text) for p in interface.iter("param")}
+            ends = {p.get("name"): number_of(p.text) for p in interface.iter("param")}
             least, most = ends.get("min"), ends.get("max")
             own = {"position": (joint.lower, joint.upper), "velocity": (-joint.speed, joint.speed)}
             lower, upper = own.get(interface.get("name", ""), (math.inf, -math.inf))
             if (least is not None and least > lower) or (most is not None and most < upper):
                 kind = f"ros2_control {interface.get('name')}"
                 yield LoadNote(kind, joint.name, f"<limit> holds, and not min {least}, max {most}")
-
-
-def float_of(text: str | None) -> float | None:
-    """Return a number in a text, else None."""
-    try:
-        return float(text or "")
-    except ValueError:
-        return None

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError
+from .._describe import model_name
 from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree
 from ._equalities import KINDS, Ends, constraint_ends, constraint_names, is_in_tree
@@ -20,6 +21,7 @@ from ._mjmodel import (
     EQUALITY_END_PREFIX,
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
+    free_name,
     quaternion,
     rotation_matrix,
 )
@@ -53,7 +55,7 @@ def to_mjcf(robot: RobotModel) -> str:
             f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
             "jax.tree.map(lambda leaf: leaf[0], robots)"
         )
-    root = ElementTree.Element("mujoco", model=_model_name(robot))
+    root = ElementTree.Element("mujoco", model=model_name(robot) or "robot")
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", balanceinertia="true")
     bodies = [ElementTree.SubElement(root, "worldbody")]
     for body in range(1, len(robot.tree.body_names)):
@@ -68,11 +70,6 @@ def to_mjcf(robot: RobotModel) -> str:
     _add_home(robot, ElementTree.SubElement(root, "keyframe"))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
-
-
-def _model_name(robot: RobotModel) -> str:
-    """Return the model's name, which MuJoCo keeps at the start of all names."""
-    return robot.mj_model.names.partition(b"\0")[0].decode() or "robot"
 
 
 def _text(values: ArrayLike) -> str:
@@ -143,9 +140,7 @@ def _motion(robot: RobotModel, place: _JointPlace) -> Pose:
     moved = float(values[0]) - _reference(robot, place.joint)
     if kind == SLIDE:
         return Pose(moved * place.axis, np.eye(3))
-    turn = np.zeros(4)
-    mujoco.mju_axisAngle2Quat(turn, place.axis, moved)
-    return _about(place.anchor, rotation_matrix(turn))
+    return _about(place.anchor, Rotation.from_rotvec(moved * place.axis).as_matrix())
 
 
 def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:
@@ -342,16 +337,10 @@ def _end_sites(robot: RobotModel, bodies: list[ElementTree.Element], ends: Ends,
     turns = first.rotation @ ends.relative @ second.rotation.T, np.eye(3)  # of a weld the two are to agree
     made = []
     for k, pose, anchor, turn in zip(numbers, (first, second), ends.anchors, turns, strict=True):
-        made.append(_free_name(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}", robot.tree.frame_names))
+        made.append(free_name(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}", robot.tree.frame_names))
         position = pose.position + pose.rotation @ anchor
         _put(bodies[robot.tree.frame_bodies[k]], "site", name=made[-1], pos=position, quat=quaternion(turn))
     return made
-
-
-def _free_name(name: str, taken: Sequence[str]) -> str:
-    while name in taken:
-        name += "_"
-    return name
 
 
 def _add_home(robot: RobotModel, element: ElementTree.Element) -> None:
