@@ -12,7 +12,7 @@ from ._robots import read_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Column, Table
+    from rich.table import Table
 
     from ..robot import Robot
 
@@ -41,12 +41,8 @@ class Info:
             raise CommandError("osik info needs a robot, as in osik info nao, or --system")
         robot = read_robot(self.robot, self.base)
         base = "floating base" if robot.floating_base else "bolted down"
-        mass = (
-            float(robot.body_mass[robot.tree.is_own].sum())
-            if len(robot.tree.robots) <= 1
-            else float(robot.body_mass.sum())
-        )
-        size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {mass:.3f} kg"
+        own = robot.body_mass[robot.tree.is_own] if len(robot.tree.robots) <= 1 else robot.body_mass
+        size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {float(own.sum()):.3f} kg"
         console.print(f"[bold]{self.robot}[/bold]: {size}")
         console.print(_joint_table(robot))
         for follower, (leader, multiplier) in robot.mimic_joints.items():
@@ -94,16 +90,12 @@ def _print_report(console: Console, robot: Robot) -> None:
 def _joint_table(robot: Robot) -> Table:
     from rich.table import Table
 
-    table = Table("joint", *(_right(name) for name in ("in q", "in v", "lower", "upper", "top speed")))
+    table = Table("joint")
+    for name in ("in q", "in v", "lower", "upper", "top speed"):
+        table.add_column(name, justify="right")
     for name in robot.joint_names:
         dof = robot.joint_dof_index(name)
         limits = (robot.position_lower[dof], robot.position_upper[dof], robot.velocity_limit[dof])
         numbers = (f"{float(value):.4f}".rstrip("0").rstrip(".") for value in limits)
         table.add_row(name, str(robot.joint_qpos_index(name)), str(dof), *numbers)
     return table
-
-
-def _right(header: str) -> Column:
-    from rich.table import Column
-
-    return Column(header, justify="right")

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
 
 from ._messages import CommandError, told, writing
 from ._robots import read_robot
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from ..reachability._map import ReachabilityMap
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +62,6 @@ class Reach:
         from rich.console import Console
 
         from .. import reachability
-        from ..reachability._report import summary_table
 
         chunks = self.unfinished
         if chunks.exists() and not self.resume:
@@ -83,6 +89,24 @@ class Reach:
             written.append(str(picture))
         shutil.rmtree(chunks, ignore_errors=True)
         console = Console()
-        console.print(summary_table(found))
+        console.print(_summary(found))
         console.print(f"written: {', '.join(written)}", markup=False, highlight=False)
         return 0
+
+
+def _summary(found: ReachabilityMap) -> Table:
+    """Return a table of the reached share of the grid, and of the best positions for turning and moving the frame."""
+    from rich.table import Table
+
+    share, some = found.share, found.reached.any(-1)
+    table = Table(show_header=False)
+    table.add_row("positions", f"{share.size} ({' x '.join(str(n) for n in share.shape)})")
+    table.add_row("proven out of reach", str(int((found.beyond_reach > 0.0).sum())))
+    table.add_row("reached in some orientation", str(int(some.sum())))
+    table.add_row(f"reached in all {len(found.rotations)} orientations", str(int((share == 1.0).sum())))
+    if some.any():
+        table.add_row("orientations reached there, on average", f"{100.0 * share[some].mean():.1f} %")
+        best = np.unravel_index(np.nanargmax(found.manipulability), share.shape)
+        place = " ".join(f"{value:.3f}" for value in found.positions[best])
+        table.add_row("best manipulability", f"{found.manipulability[best]:.4g} at {place}")
+    return table

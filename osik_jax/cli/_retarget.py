@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from ..retargeting import Retargeter
+    from ..retargeting import Profile, Retargeter
     from ..retargeting._load import Reader
     from ..robot import Robot
 
@@ -125,23 +125,21 @@ class Retarget:
 
 def _reader(command: Retarget) -> Reader:
     """Return the function that reads a clip as the command says."""
-    from .. import retargeting
     from ..retargeting._load import Reader
     from ..retargeting._profile_file import find_profile
 
     if command.source is None:
         unit = None if command.unit is None else _number_or_name(command.unit)
         return Reader(unit=unit, up=command.up, trim=command.trim)
-    profile = None if command.source_profile is None else retargeting.Profile.load(command.source_profile)
     source = _robot_to_retarget(command.source)
-    return Reader(source=source, profile=profile or find_profile(source), fps=command.source_fps)
+    profile = _profile(command.source_profile) or find_profile(source)
+    return Reader(source=source, profile=profile, fps=command.source_fps)
 
 
 def _fit(command: Retarget, file: Path) -> None:
     """Write a profile found by a folder's clips."""
     from rich.console import Console
 
-    from .. import retargeting
     from ..retargeting._command import fit_to_file
 
     with told():
@@ -155,7 +153,7 @@ def _fit(command: Retarget, file: Path) -> None:
             _robot_to_retarget(command.robot, command.base),
             Path(command.clip),
             file,
-            profile=None if command.profile is None else retargeting.Profile.load(command.profile),
+            profile=_profile(command.profile),
             mapping=_mapping(command.mapping),
             acceleration=command.acceleration,
             reader=_reader(command),
@@ -171,10 +169,9 @@ def _retargeter(command: Retarget) -> Retargeter:
     """Return the retargeter of whole clips that the command describes."""
     from .. import retargeting
 
-    profile = None if command.profile is None else retargeting.Profile.load(command.profile)
     return retargeting.Retargeter(
         _robot_to_retarget(command.robot, command.base),
-        profile=profile,
+        profile=_profile(command.profile),
         acceleration=command.acceleration,
         smoothness=command.smooth,
         balance=command.balance,
@@ -252,7 +249,7 @@ def _retarget_live(command: Retarget) -> None:
             raise OsikValueError("--smooth goes with whole clips, not with --live")
         if os.path.isdir(command.clip):
             raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
-        profile = None if command.profile is None else retargeting.Profile.load(command.profile)
+        profile = _profile(command.profile)
         robot, mapping = _robot_to_retarget(command.robot, command.base), _mapping(command.mapping)
 
         def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
@@ -319,11 +316,17 @@ def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
     return read_robot(source, "auto" if source in ROBOTS else base)
 
 
+def _profile(file: str | None) -> Profile | None:
+    from ..retargeting import Profile
+
+    return None if file is None else Profile.load(file)
+
+
 def _page(command: Retarget) -> dict[str, Any]:
     """Return whether a page is written, and what the robot's URDF shows; the extra has to be installed."""
     if not command.report:
         return {}
-    from ..viewer.live._needs import import_viser
+    from ..viewer.live._server import import_viser
     from ..viewer.live._source import RobotSource, source_look
 
     import_viser()

@@ -19,10 +19,6 @@ FLOATING = {"auto": None, "floating": True, "fixed": False}
 def read_robot(source: str, base: str = "auto") -> Robot:
     """Return a robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by what is in it.
 
-    Args:
-        source: name or path.
-        base: ``"floating"``, ``"fixed"``, or ``"auto"``.
-
     Raises:
         CommandError: no such file, or what is in it is broken.
     """

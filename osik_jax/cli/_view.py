@@ -44,13 +44,14 @@ class View:
 
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends."""
-        from ..viewer.live import _open
+        from ..viewer.live import _open, _server
         from ..viewer.live._source import RobotSource
 
         with told():
             if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):
                 raise CommandError("--html goes with a motion.npz")
-            _open.check(self.host, 0 if self.html is not None else self.port)
+            _server.import_viser()
+            _server.check_port(self.host, 0 if self.html is not None else self.port)
             source = RobotSource(self.robot, FLOATING[self.base])
             if self.file is not None and self.file.suffix == ".json":
                 view = _open.open_session(self.file, host=self.host, port=self.port)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,7 @@ from ..robot import Robot
 from ..tasks._manipulability import volume
 
 
-class Frame(NamedTuple):
+class Frame(eqx.Module):
     """Frame whose kinematic chain has hinge and slide joints only.
 
     Attributes:
@@ -31,29 +32,44 @@ class Frame(NamedTuple):
     """
 
     robot: Robot
-    name: str
+    name: str = eqx.field(static=True)
     settings: Settings
 
-    def sampled_positions(self, count: int) -> Float[np.ndarray, "count 3"]:
+    @eqx.filter_jit
+    def sampled_positions(self, count: int) -> Float[Array, "count 3"]:
         """Return the frame's positions [m] at configurations that fill the joints' ranges evenly."""
-        return np.asarray(_sampled(self.robot, self.settings, jnp.arange(count, dtype=jnp.int32), route=self._route))
+        number = jnp.arange(count, dtype=jnp.int32)
+        angles = self._search.begin(number, None).T  # pyright: ignore[reportArgumentType]
+        return chain_kinematics(self._search.chain, angles).position[0].T
 
-    def beyond_reach(self, positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    @eqx.filter_jit
+    def beyond_reach(self, positions: Float[Array, "n 3"]) -> Float[Array, " n"]:
         """Return a lower bound on the distance from each position to the workspace [m]; 0 where it may be inside."""
-        given = jnp.asarray(positions, self.robot.q0.dtype)
-        return np.asarray(_beyond(self.robot, self.settings, given, route=self._route))
+        turns: Any = jnp.broadcast_to(jnp.eye(3, dtype=positions.dtype), (len(positions), 1, 3, 3))
+        return self._route.beyond(self._search, Goal(positions[:, None], turns))
 
-    def manipulability(self, q: Float[Array, "n nq"]) -> Float[np.ndarray, " n"]:
-        """Return Yoshikawa's index of configurations, for the motions that this number of joints can make."""
-        return np.asarray(_manipulability(self.robot, self.settings, q, route=self._route))
+    @eqx.filter_jit
+    def manipulability(self, q: Float[Array, "n nq"]) -> Float[Array, " n"]:
+        """Return Yoshikawa's index sqrt(det(J J')) of configurations, or sqrt(det(J' J)) if J has fewer columns."""
+        chain = self._search.chain
+        angles = q.T[np.array(chain.layout.dofs, int)]
+        matrix = jnp.moveaxis(jacobian(chain, chain_kinematics(chain, angles))[0], -1, 0)
+        rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)
+        return jax.vmap(partial(volume, log=False))(rows)
 
-    def links(self) -> Float[np.ndarray, "k 3"]:
+    @eqx.filter_jit
+    def links(self) -> Float[Array, "k 3"]:
         """Return the positions at home of the joints of the frame's chain, and of the frame [m]."""
-        return np.asarray(_links(self.robot, self.settings, route=self._route))
+        placed = chain_kinematics(self._search.chain, self._search.first[:, None])
+        return jnp.concatenate([placed.anchor[..., 0], placed.position[..., 0]])
 
     @property
     def _route(self) -> ChainRoute:
         return ChainRoute((self.name,), ((True,) * 6,))
+
+    @property
+    def _search(self) -> ChainSearch:
+        return self._route.search(self.robot, self.settings, warm=False, near=False)
 
 
 def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int) -> Frame:
@@ -71,35 +87,3 @@ def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int
         )
     lower, upper = joint_box(robot, None if limits is None else tuple(limits))
     return Frame(robot, name, Settings(robot.q0, lower, upper, key, jnp.ones(2, robot.q0.dtype), 1))
-
-
-def _search(robot: Robot, settings: Settings, route: ChainRoute) -> ChainSearch:
-    return route.search(robot, settings, warm=False, near=False)
-
-
-@partial(jax.jit, static_argnames="route")
-def _sampled(robot: Robot, settings: Settings, number: Array, *, route: ChainRoute) -> Array:
-    search = _search(robot, settings, route)
-    return chain_kinematics(search.chain, search.begin(number, None).T).position[0].T  # pyright: ignore[reportArgumentType]
-
-
-@partial(jax.jit, static_argnames="route")
-def _beyond(robot: Robot, settings: Settings, positions: Array, *, route: ChainRoute) -> Array:
-    turns: Any = jnp.broadcast_to(jnp.eye(3, dtype=positions.dtype), (len(positions), 1, 3, 3))
-    return route.beyond(_search(robot, settings, route), Goal(positions[:, None], turns))
-
-
-@partial(jax.jit, static_argnames="route")
-def _manipulability(robot: Robot, settings: Settings, q: Array, *, route: ChainRoute) -> Array:
-    """Return sqrt(det(J J')) for each configuration, or sqrt(det(J' J)) if J has fewer columns than rows."""
-    chain = _search(robot, settings, route).chain
-    matrix = jnp.moveaxis(jacobian(chain, chain_kinematics(chain, q.T[np.array(chain.layout.dofs, int)]))[0], -1, 0)
-    rows = matrix if matrix.shape[1] <= matrix.shape[2] else jnp.swapaxes(matrix, 1, 2)
-    return jax.vmap(partial(volume, log=False))(rows)
-
-
-@partial(jax.jit, static_argnames="route")
-def _links(robot: Robot, settings: Settings, *, route: ChainRoute) -> Array:
-    search = _search(robot, settings, route)
-    placed = chain_kinematics(search.chain, search.first[:, None])
-    return jnp.concatenate([placed.anchor[..., 0], placed.position[..., 0]])

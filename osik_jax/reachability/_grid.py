@@ -34,7 +34,7 @@ def around(frame: Frame, positions: int) -> Grid:
         ValueError: ``positions`` is no positive number.
     """
     check_count("positions", positions)
-    places = frame.sampled_positions(_SAMPLES)
+    places = np.asarray(frame.sampled_positions(_SAMPLES))
     low, high = places.min(0), places.max(0)
     longest = float((high - low).max())
     margin = np.where(high - low > _FLAT * longest, _MARGIN * longest, 0.0)

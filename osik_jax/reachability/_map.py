@@ -36,6 +36,11 @@ class ReachabilityMap:
     links: Float[np.ndarray, "k 3"]
 
     @property
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the coordinates of the positions along x, y and z [m]."""
+        return self.x, self.y, self.z
+
+    @property
     def share(self) -> Float[np.ndarray, "nx ny nz"]:
         """Return the share of the orientations that are reached at each position."""
         return self.reached.mean(-1)
@@ -43,7 +48,7 @@ class ReachabilityMap:
     @property
     def positions(self) -> Float[np.ndarray, "nx ny nz 3"]:
         """Return the positions [m]."""
-        return np.stack(np.meshgrid(self.x, self.y, self.z, indexing="ij"), -1)
+        return np.stack(np.meshgrid(*self.axes, indexing="ij"), -1)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a ``.npz`` with an array for each attribute, under its name only when complete.
@@ -68,10 +73,9 @@ class ReachabilityMap:
         Raises:
             ValueError: ``at`` is no point.
         """
-        from ._picture import Field, draw_slices
+        from ._picture import draw_slices
 
-        field = Field((self.x, self.y, self.z), self.share, self.beyond_reach, self.links)
-        return draw_slices(field, self.frame, len(self.rotations), at)
+        return draw_slices(self, at)
 
 
 def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:

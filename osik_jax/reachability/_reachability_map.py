@@ -103,7 +103,7 @@ def reachability_map(
     axes = around(own, grid) if isinstance(grid, int | np.integer) else checked_grid(grid)
     rotations = _rotations(robot, frame, orientations)
     positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    beyond = own.beyond_reach(positions)
+    beyond = np.asarray(own.beyond_reach(jnp.asarray(positions, robot.q0.dtype)))
     near = np.flatnonzero(beyond <= 0.0)
     tolerances = dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
     settings = dict(limits=limits, seeds=seeds, key=key, **tolerances)
@@ -123,7 +123,7 @@ def reachability_map(
         beyond_reach=beyond.reshape(shape),
         manipulability=spread(found["manipulability"], np.nan),
         q=spread(found["q"], np.nan),
-        links=own.links(),
+        links=np.asarray(own.links()),
     )
 
 
@@ -178,7 +178,7 @@ def _reached(frame: Frame, positions: np.ndarray, rotations: np.ndarray, setting
     poses = np.repeat(positions, number, 0), np.tile(rotations, (count, 1, 1))
     found = inverse_kinematics(frame.robot, {frame.name: poses}, restarts=0, closest=False, **settings)
     reached = np.asarray(found.converged).reshape(count, number)
-    index = np.where(reached, frame.manipulability(found.q).reshape(count, number), -1.0)
+    index = np.where(reached, np.asarray(frame.manipulability(found.q)).reshape(count, number), -1.0)
     best, some = index.argmax(1), np.any(reached, 1)
     q = np.asarray(found.q).reshape(count, number, -1)[np.arange(count), best]
     return {

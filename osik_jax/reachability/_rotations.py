@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..kinematics._rigid import rotation_matrix
-from ..numerics._arguments import check_count
 
 _FIRST = np.sqrt(2.0)
 _SECOND = 1.533751168755204288118041413
@@ -16,18 +15,11 @@ evenly."""
 
 
 def spread_rotations(count: int) -> Float[np.ndarray, "count 3 3"]:
-    """Return ``count`` evenly spread rotations; the same ones every time.
+    """Return evenly spread rotations, one or more; the same ones every time.
 
     They lie on a spiral around the unit quaternions, at constant density (M. Alexa, "Super-Fibonacci spirals: fast,
     low-discrepancy sampling of SO(3)", CVPR 2022). Sets of different sizes share no rotation.
-
-    Args:
-        count: number of rotations.
-
-    Raises:
-        ValueError: count is no positive integer.
     """
-    check_count("count", count)
     along = np.arange(count) + 0.5
     inner, outer = np.sqrt(along / count), np.sqrt(1.0 - along / count)
     alpha, beta = 2.0 * np.pi * along / _FIRST, 2.0 * np.pi * along / _SECOND

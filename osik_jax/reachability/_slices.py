@@ -62,18 +62,9 @@ def _edges(axis: Float[np.ndarray, " n"], width: float) -> Float[np.ndarray, " n
     return np.concatenate([[2.0 * axis[0] - ends[0]], between, [2.0 * axis[-1] - ends[1]]])
 
 
-def slice_colors(
-    share: Float[np.ndarray, "nx ny nz"], beyond_reach: Float[np.ndarray, "nx ny nz"], across: int, index: int
-) -> UInt8[np.ndarray, "n m 4"]:
-    """Return the cells of a slice, red green blue alpha, by the two axes left; clear where proven out of reach.
-
-    Args:
-        share, beyond_reach: of a ``ReachabilityMap``.
-        across: the axis across the slice.
-        index: that of the slice along it.
-    """
+def slice_colors(share: Float[np.ndarray, "n m"], beyond_reach: Float[np.ndarray, "n m"]) -> UInt8[np.ndarray, "n m 4"]:
+    """Return red, green, blue and alpha of the cells of a slice; clear where proven out of reach."""
     from matplotlib.colors import to_rgba
 
-    share, beyond = (np.take(field, index, across) for field in (share, beyond_reach > 0.0))
     colors = np.where((share > 0.0)[..., None], share_colors()(share), to_rgba(NOTHING))
-    return np.round(255.0 * np.where((beyond & (share == 0.0))[..., None], 0.0, colors)).astype(np.uint8)
+    return np.round(255.0 * np.where(((beyond_reach > 0.0) & (share == 0.0))[..., None], 0.0, colors)).astype(np.uint8)

@@ -183,18 +183,16 @@ _REMEDY = "Give source= as the name or file that the robot was loaded from"
 
 def _are_close(one: Any, other: Any) -> bool:
     """Return whether two trees have the same structure, and arrays that differ by roundoff."""
-    a, b = (jax.tree.flatten(tree) for tree in (one, other))
-    if a[1] != b[1] or any(np.shape(x) != np.shape(y) for x, y in zip(a[0], b[0], strict=True)):
-        return False
-    for x, y in zip(*(map(np.asarray, leaves) for leaves in (a[0], b[0])), strict=True):
-        if not np.issubdtype(x.dtype, np.floating):
-            same = np.array_equal(x, y)
-        else:
-            largest = np.abs(x[np.isfinite(x)]).max(initial=1e-3)
-            same = np.allclose(x, y, rtol=0.0, atol=_ACCURACY[jnp.dtype(x.dtype)] * largest, equal_nan=True)
-        if not same:
-            return False
-    return True
+    same = jax.tree.structure(one) == jax.tree.structure(other)
+    return same and all(map(_arrays_are_close, jax.tree.leaves(one), jax.tree.leaves(other)))
+
+
+def _arrays_are_close(one: Any, other: Any) -> bool:
+    x, y = np.asarray(one), np.asarray(other)
+    if x.shape != y.shape or not np.issubdtype(x.dtype, np.floating):
+        return np.array_equal(x, y)
+    largest = np.abs(x[np.isfinite(x)]).max(initial=1e-3)
+    return np.allclose(x, y, rtol=0.0, atol=_ACCURACY[jnp.dtype(x.dtype)] * largest, equal_nan=True)
 
 
 def _quietly_loaded(described: Mapping[str, Any]) -> Robot:

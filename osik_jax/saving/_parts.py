@@ -49,7 +49,7 @@ def encode(value: Any, where: str, tree: KinematicTree) -> Any:
     if isinstance(value, Mapping):
         pairs = [[encode(key, where, tree), encode(one, f"{where}[{key!r}]", tree)] for key, one in value.items()]
         return {"mapping": pairs}
-    if (names := _field_names(value)) is not None:
+    if (names := _field_names(type(value))) is not None:
         fields = {name: _field(name, getattr(value, name), f"{where}.{name}", tree) for name in names}
         return {"class": _name(type(value), where), "fields": fields}
     if isinstance(value, tuple | list | frozenset):
@@ -60,11 +60,11 @@ def encode(value: Any, where: str, tree: KinematicTree) -> Any:
     )
 
 
-def _field_names(value: Any) -> list[str] | None:
-    """Return the names of the fields of a dataclass or named tuple, None for anything else."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return [field.name for field in dataclasses.fields(value)]
-    return list(value._fields) if isinstance(value, tuple) and hasattr(value, "_fields") else None  # pyright: ignore
+def _field_names(cls: type) -> tuple[str, ...] | None:
+    """Return the names of the fields of a dataclass or named tuple, None for other classes."""
+    if dataclasses.is_dataclass(cls):
+        return tuple(field.name for field in dataclasses.fields(cls))
+    return getattr(cls, "_fields", None) if issubclass(cls, tuple) else None
 
 
 def _field(name: str, value: Any, where: str, tree: KinematicTree) -> Any:
@@ -105,9 +105,9 @@ def decode(data: Any, tree: KinematicTree) -> Any:
 
 def _made(cls: Any, fields: dict[str, Any]) -> Any:
     """Return an object of a class with these fields, without its constructor."""
-    known = getattr(cls, "_fields", ()) if issubclass(cls, tuple) else [f.name for f in dataclasses.fields(cls)]
     if cls is NoLimits:
         return no_limits
+    known = _field_names(cls) or ()
     if set(known) != set(fields):
         raise OsikValueError(f"a {cls.__name__} of this version has the fields {sorted(known)}, not {sorted(fields)}")
     if issubclass(cls, tuple):

@@ -69,8 +69,9 @@ def hero_picture(
         [np.asarray(points, float) + shift for points, shift in zip(own, shifts, strict=False)]
         for own in (targets, trails)
     )
-    fixed = fixed_parts(shapes)
-    seen = [np.concatenate([points, fixed.corners()]) + shift for points, shift in zip(corners, shifts, strict=True)]
+    fixed = fixed_parts(robot, shapes)
+    boxes = fixed.corners(sources[0])
+    seen = [np.concatenate([points, boxes]) + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
     camera = frame_camera(np.concatenate([*seen, *crosses, *paths]), size, azimuth, elevation, window, lens=_LONG_LENS)
     stage = Stage([shape] * len(sources) + [fixed] * len(sources), camera, floor=floor)

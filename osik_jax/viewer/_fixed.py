@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
 from .._errors import OsikValueError
 from ..collision import CollisionShape
 from ..collision._geometry import Kind
-from ._parts import Part
+from ..robot import Robot
+from ._parts import Part, RobotParts
 
 _GEOMS = {
     Kind.SEGMENT: mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -22,32 +21,8 @@ _GEOMS = {
 _COLOR = np.array([0.95, 0.61, 0.22, 1.0])
 
 
-@dataclasses.dataclass(frozen=True)
-class FixedParts:
-    """Shapes fixed to the world, with the part of ``RobotParts``' interface that a ``Stage`` uses.
-
-    Attributes:
-        parts: the shapes.
-        positions: of their centres in the world [m]. (parts, 3)
-        rotations: from their axes to the world's. (parts, 3, 3)
-    """
-
-    parts: tuple[Part, ...]
-    positions: Float[np.ndarray, "parts 3"]
-    rotations: Float[np.ndarray, "parts 3 3"]
-
-    def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
-        """Return positions [m] and rotations in the world; they do not depend on ``data``."""
-        return self.positions, self.rotations
-
-    def corners(self) -> Float[np.ndarray, "points 3"]:
-        """Return the corners of boxes about the shapes, in the world [m]."""
-        own = np.array([part.corners for part in self.parts]).reshape(-1, 8, 3)
-        return (np.einsum("pij,pkj->pki", self.rotations, own) + self.positions[:, None]).reshape(-1, 3)
-
-
-def fixed_parts(shapes: Iterable[CollisionShape]) -> FixedParts:
-    """Return the drawable parts of shapes of the world.
+def fixed_parts(robot: Robot, shapes: Iterable[CollisionShape]) -> RobotParts:
+    """Return shapes of the world as parts that the world's body carries.
 
     Raises:
         ValueError: a shape on a frame of the robot, a half-space or a convex hull.
@@ -59,11 +34,10 @@ def fixed_parts(shapes: Iterable[CollisionShape]) -> FixedParts:
                 f"a {shape.kind.name.lower()} on frame {shape.frame!r} is not drawn; shapes are spheres, capsules, "
                 "boxes and cylinders of the world"
             )
-    return FixedParts(
-        tuple(Part(k, _kind(shape), np.asarray(shape.size, float), _COLOR) for k, shape in enumerate(shapes)),
-        np.array([shape.position for shape in shapes], float).reshape(-1, 3),
-        np.array([shape.rotation for shape in shapes], float).reshape(-1, 3, 3),
-    )
+    parts = tuple(Part(k, _kind(shape), np.asarray(shape.size, float), _COLOR) for k, shape in enumerate(shapes))
+    positions = np.array([shape.position for shape in shapes], float).reshape(-1, 3)
+    rotations = np.array([shape.rotation for shape in shapes], float).reshape(-1, 3, 3)
+    return RobotParts(robot.mj_model, "look", parts, np.zeros(len(parts), int), (positions, rotations))
 
 
 def _kind(shape: CollisionShape) -> mujoco.mjtGeom:

@@ -126,7 +126,8 @@ class _Reader:
 
     def _link(self, link: Link, *, visual: bool) -> list[LinkShape]:
         """Return a link's visual shapes, or its collision shapes if a visual shape cannot be read."""
-        wanted = [shape for shape in link.shapes if shape.visual == visual and not _is_transparent(shape)]
+        opaque = [shape for shape in link.shapes if shape.color is None or shape.color[3] > 0.0]
+        wanted = [shape for shape in opaque if shape.visual == visual]
         readable = all(shape.kind != "mesh" or self._triangles(shape) for shape in wanted)
         if readable or not visual:
             return [part for shape in wanted for part in self._shape(link.name, shape)]
@@ -167,7 +168,3 @@ class _Reader:
                 if (folder / rest).is_file():
                     return folder / rest
             raise
-
-
-def _is_transparent(shape: Shape) -> bool:
-    return shape.color is not None and shape.color[3] <= 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -25,24 +25,11 @@ _failures: list[str] = []
 """Reason why OpenGL does not work here, kept because MuJoCo 4.0 aborts the process at a second failure."""
 
 
-@runtime_checkable
-class Renderer(Protocol):
-    """Interface of renderers of a stage."""
-
-    def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """Return a picture of the stage; ``under`` is painted on the floor."""
-        ...
-
-
 class GlRenderer:
     """MuJoCo's renderer with the camera and picture size of the ray caster."""
 
     def __init__(self, stage: Stage, camera: Camera, size: tuple[int, int]) -> None:
-        """Open a GL context.
-
-        Raises:
-            RuntimeError: OpenGL does not work here.
-        """
+        """Open a GL context; raise RuntimeError where OpenGL does not work."""
         if _failures:
             raise RuntimeError(_failures[0])
         try:
@@ -73,7 +60,9 @@ class GlRenderer:
         return self._renderer.render()
 
 
-def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float) -> Renderer:
+def make_renderer(
+    name: RendererName, stage: Stage, camera: Camera, size: tuple[int, int], *, floor: float
+) -> GlRenderer | RayCaster:
     """Return MuJoCo's renderer (``"mujoco"``), a CPU renderer (``"raycast"``), or the first that works (``"auto"``).
 
     On the CPU rays are cast, unless there are meshes of so many triangles that drawing those is faster.
@@ -92,10 +81,6 @@ def make_renderer(name: RendererName, stage: Stage, camera: Camera, size: tuple[
 
 
 def check_opengl() -> None:
-    """Raise an error unless MuJoCo's renderer can draw an empty scene.
-
-    Raises:
-        RuntimeError: OpenGL does not work here.
-    """
+    """Raise RuntimeError unless MuJoCo's renderer can draw an empty scene."""
     camera = Camera((0.0, 0.0, 0.0), 1.0, 0.0, 0.0, 1.0)
     GlRenderer(Stage((), camera, floor=0.0), camera, (16, 16))

@@ -32,13 +32,7 @@ class Outline(NamedTuple):
 
 
 def robot_outline(robot: Robot, q: ArrayLike, look: Look | None = None) -> Outline:
-    """Return the dimensions of a robot at one configuration.
-
-    Args:
-        robot: the robot.
-        q: configuration. (nq,)
-        look: what its URDF shows.
-    """
+    """Return the dimensions of a robot at a configuration, (nq,)."""
     shape = robot_parts(robot, look=look)
     data = next(mujoco_poses(robot, q))
     heights = lowest_points(shape, data)

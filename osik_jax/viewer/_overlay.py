@@ -33,16 +33,10 @@ class Canvas:
         self.figure = Figure(figsize=(size[0] / dpi, size[1] / dpi), dpi=dpi)
         self.figure.patch.set_alpha(0.0)
         self._canvas = FigureCanvasAgg(self.figure)
-        self.page = self._page()
+        self.page = self.figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, size[0]), ylim=(size[1], 0))
+        self.page.set_axis_off()
         self._moving: list[Artist] = []
         self._still = None
-
-    def _page(self) -> Axes:
-        axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        axes.set_axis_off()
-        axes.set_xlim(0, self.size[0])
-        axes.set_ylim(self.size[1], 0)
-        return axes
 
     def title(self, x: float, y: float, words: str, fontsize: float) -> None:
         """Write a bold line starting at (x, y), shrunk if it would leave the picture."""
@@ -50,10 +44,11 @@ class Canvas:
         width = text.get_window_extent(self._canvas.get_renderer()).width
         text.set_fontsize(fontsize * min(1.0, (self.size[0] - 2.0 * x) / max(width, 1.0)))
 
-    def moving(self, artist: Artist) -> None:
-        """Mark an artist as one that changes between pictures."""
-        artist.set_animated(True)
-        self._moving.append(artist)
+    def moving(self, *artists: Artist) -> None:
+        """Mark artists as such that change between pictures."""
+        for artist in artists:
+            artist.set_animated(True)
+            self._moving.append(artist)
 
     def picture(self) -> np.ndarray:
         """Return the picture as RGBA with straight alpha. (height, width, 4), uint8."""
@@ -89,8 +84,7 @@ class ComMark:
         (self._foot,) = canvas.page.plot([], [], "o", ms=6.5, mfc="white", mec=ORANGE, mew=2.0)
         (self._ball,) = canvas.page.plot([], [], "o", ms=10, mfc=ORANGE, mec="white", mew=1.6)
         if moving:
-            for artist in (self._line, self._foot, self._ball):
-                canvas.moving(artist)
+            canvas.moving(self._line, self._foot, self._ball)
 
     def place(self, com: Float[np.ndarray, "3"]) -> None:
         """Move the mark to a centre of mass [m]."""
@@ -128,30 +122,24 @@ class PlanPanel:
         com: Float[np.ndarray, "frames 3"],
     ) -> None:
         """Draw the static part; lengths in mm."""
-        self._com, self._support = 1e3 * com, [1e3 * vertices for vertices in support]
+        self._com, self._support = 1e3 * com[:, :2], [1e3 * vertices for vertices in support]
         axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
-        points = np.concatenate([self._com[:, :2], *self._support])
+        points = np.concatenate([self._com, *self._support])
         # space around polygon and path inside the panel
         room = 0.06 * np.ptp(points, axis=0).max()
         low, high = points.min(0) - room, points.max(0) + room
         axes.set_aspect("equal", adjustable="box", anchor="W")
         axes.set_xlim(high[1], low[1])
         axes.set_ylim(low[0], high[0])
-        self._patch = Polygon(self._flip(self._support[0]), facecolor=to_rgba(GREEN, 0.18), edgecolor=GREEN, lw=1.4)
+        self._patch = Polygon(self._support[0][:, ::-1], facecolor=to_rgba(GREEN, 0.18), edgecolor=GREEN, lw=1.4)
         axes.add_patch(self._patch)
-        canvas.moving(self._patch)
         (self._path,) = axes.plot([], [], color=ORANGE, lw=1.3, alpha=0.8)
         (self._dot,) = axes.plot([], [], "o", ms=6.5, mfc=ORANGE, mec="white", mew=1.2)
-        canvas.moving(self._path)
-        canvas.moving(self._dot)
-
-    @staticmethod
-    def _flip(vertices: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
-        return vertices[:, ::-1]
+        canvas.moving(self._patch, self._path, self._dot)
 
     def place(self, frame: int) -> None:
         """Move the dot to a frame."""
-        self._patch.set_xy(self._flip(self._support[min(frame, len(self._support) - 1)]))
+        self._patch.set_xy(self._support[min(frame, len(self._support) - 1)][:, ::-1])
         self._path.set_data(self._com[: frame + 1, 1], self._com[: frame + 1, 0])
         self._dot.set_data([self._com[frame, 1]], [self._com[frame, 0]])
 
@@ -182,8 +170,7 @@ class CurvePanel:
         for name, color in zip(curves, _CURVE_COLORS, strict=False):
             (line,) = axes.plot([], [], color=color, lw=1.9, label=name)
             (dot,) = axes.plot([], [], "o", ms=5, color=color)
-            canvas.moving(line)
-            canvas.moving(dot)
+            canvas.moving(line, dot)
             self._lines.append((line, dot))
         axes.legend(
             fontsize=7, frameon=False, loc="upper right", ncols=2, labelcolor=INK, handlelength=1.4, borderaxespad=0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -16,23 +16,15 @@ from scipy.spatial import ConvexHull, QhullError
 
 from .._errors import OsikValueError
 from ..robot import Robot
+from ..robot.loading._mjmodel import rotation_matrix
 from ._look import Look, given_look
 from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
 
 _GEOM = mujoco.mjtGeom
-_DRAWN = [
-    int(kind)
-    for kind in (
-        _GEOM.mjGEOM_SPHERE,
-        _GEOM.mjGEOM_CAPSULE,
-        _GEOM.mjGEOM_ELLIPSOID,
-        _GEOM.mjGEOM_CYLINDER,
-        _GEOM.mjGEOM_BOX,
-        _GEOM.mjGEOM_MESH,
-    )
-]
+_DRAWN = range(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_MESH) + 1)
+"""Geom types that are drawn: sphere, capsule, ellipsoid, cylinder, box and mesh."""
 _PLAIN = np.array([0.80, 0.82, 0.86, 1.0])
 _STICK = np.array([0.42, 0.49, 0.60, 1.0])
 _JOINT = np.array([0.93, 0.50, 0.13, 1.0])
@@ -46,7 +38,7 @@ class Part:
     """One shape of a robot.
 
     Attributes:
-        index: of the geom, the link or the stick that it is.
+        index: of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``.
         kind: MuJoCo's geom type.
         size: MuJoCo's geom sizes [m]. (3,)
         color: red, green, blue, alpha. (4,)
@@ -62,11 +54,8 @@ class Part:
     @functools.cached_property
     def corners(self) -> Float[np.ndarray, "8 3"]:
         """Return the corners of the part's bounding box, in the part's frame [m]."""
-        if self.mesh is None:
-            low, high = -self._half_edges(), self._half_edges()
-        else:
-            low, high = self.mesh[0].min(0), self.mesh[0].max(0)
-        return np.array(list(itertools.product(*zip(low, high, strict=True))))
+        ends = [(-self.reach(-axis), self.reach(axis)) for axis in np.eye(3)]
+        return np.array(list(itertools.product(*ends)))
 
     @functools.cached_property
     def hull(self) -> Float[np.ndarray, "k 3"]:
@@ -77,17 +66,22 @@ class Part:
         except (QhullError, ValueError):  # flat, or hardly any points
             return vertices
 
-    def _half_edges(self) -> Float[np.ndarray, "3"]:
+    def reach(self, way: Float[np.ndarray, "3"]) -> float:
+        """Return the largest coordinate of the part along a unit vector, from the part's origin [m]."""
+        if self.mesh is not None:
+            return float((self.hull @ way).max())
         radius, length, _ = self.size
         match self.kind:
             case _GEOM.mjGEOM_SPHERE:
-                return np.full(3, radius)
+                return float(radius)
             case _GEOM.mjGEOM_CAPSULE:
-                return np.array([radius, radius, radius + length])
+                return float(radius + length * abs(way[2]))
             case _GEOM.mjGEOM_CYLINDER:
-                return np.array([radius, radius, length])
+                return float(radius * np.hypot(way[0], way[1]) + length * abs(way[2]))
+            case _GEOM.mjGEOM_ELLIPSOID:
+                return float(np.linalg.norm(self.size * way))
             case _:
-                return np.asarray(self.size, float)
+                return float(np.abs(way) @ self.size)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,49 +92,33 @@ class RobotParts:
         model: the MuJoCo model.
         style: ``"look"``, ``"geoms"`` or ``"sticks"``.
         parts: the shapes.
-        tips: of sticks: bodies without children, and of each the farthest named point in its frame [m].
-        anchors: of a look: the body of each part, and the part's position and rotation in it.
+        bodies: MuJoCo's index of the body that carries each part. (parts,)
+        anchors: position [m] and rotation of each part in its body; of sticks, which change with the configuration, the
+            bodies without children, and of each the farthest named point in its frame [m].
     """
 
     model: mujoco.MjModel
     style: Literal["look", "geoms", "sticks"]
     parts: tuple[Part, ...]
-    tips: tuple[np.ndarray, np.ndarray]
-    anchors: tuple[np.ndarray, np.ndarray, np.ndarray] = (np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-
-    @property
-    def bodies(self) -> Int[np.ndarray, " parts"]:
-        """Return MuJoCo's index of the body that carries each part."""
-        index = np.array([part.index for part in self.parts], int)
-        match self.style:
-            case "look":
-                return self.anchors[0]
-            case "geoms":
-                return self.model.geom_bodyid[index]
-            case _:
-                ends = np.concatenate([np.arange(self.model.nbody), self.model.body_parentid, self.tips[0]])
-                return ends[index]
+    bodies: Int[np.ndarray, " parts"]
+    anchors: tuple[np.ndarray, np.ndarray]
 
     def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
         """Return the corners of the parts' bounding boxes in the world [m], which a camera must show."""
         position, rotation = self.poses(data)
-        own = np.array([part.corners for part in self.parts])
+        own = np.array([part.corners for part in self.parts]).reshape(-1, 8, 3)
         return (np.einsum("pij,pkj->pki", rotation, own) + position[:, None]).reshape(-1, 3)
 
     def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
         """Return positions [m] and rotations of the parts in the world, from ``data`` after ``mj_kinematics``."""
-        if self.style == "look":
-            bodies, shift, turn = self.anchors
-            frames = data.xmat.reshape(-1, 3, 3)[bodies]
-            return data.xpos[bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
-        if self.style == "geoms":
-            position, rotation = data.geom_xpos, data.geom_xmat.reshape(-1, 3, 3)
-        else:
-            start, end = _stick_ends(data, self.model.body_parentid, self.tips)
+        frames = data.xmat.reshape(-1, 3, 3)
+        if self.style == "sticks":
+            start, end = _stick_ends(data, self.model.body_parentid, self.anchors)
+            index = [part.index for part in self.parts]
             position = np.concatenate([data.xpos, 0.5 * (start + end)])
-            rotation = np.concatenate([data.xmat.reshape(-1, 3, 3), _link_frames(end - start)])
-        index = [part.index for part in self.parts]
-        return position[index], rotation[index]
+            return position[index], np.concatenate([frames, _link_frames(end - start)])[index]
+        (shift, turn), frames = self.anchors, frames[self.bodies]
+        return data.xpos[self.bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
 
 
 def robot_parts(robot: Robot, *, style: Style = "auto", look: str | Path | Look | None = None) -> RobotParts:
@@ -155,17 +133,19 @@ def robot_parts(robot: Robot, *, style: Style = "auto", look: str | Path | Look 
     Raises:
         ValueError: ``style="geoms"`` of a model that has no visible geom, or a look of another robot.
     """
-    model, tips, look = robot.mj_model, _tips(robot), given_look(look)
+    model, look = robot.mj_model, given_look(look)
     if look is not None and style == "auto":
         bodies = _link_bodies(model, look)
         if _cover(model, bodies):
-            return _look_parts(model, look, bodies, tips)
-    geoms = () if style == "sticks" else tuple(_geom_part(model, g) for g in _visible_geoms(model))
-    if geoms and (style == "geoms" or _cover(model, [model.geom_bodyid[part.index] for part in geoms])):
-        return RobotParts(model, "geoms", geoms, tips)
+            return _look_parts(model, look, bodies)
+    geoms = [] if style == "sticks" else _visible_geoms(model)
+    if geoms and (style == "geoms" or _cover(model, model.geom_bodyid[geoms])):
+        turns = np.array([rotation_matrix(model.geom_quat[geom]) for geom in geoms])
+        parts = tuple(_geom_part(model, geom) for geom in geoms)
+        return RobotParts(model, "geoms", parts, model.geom_bodyid[geoms], (model.geom_pos[geoms], turns))
     if style == "geoms":
         raise OsikValueError("the model has no geom to draw; use style='sticks'")
-    return RobotParts(model, "sticks", _sticks(robot, tips), tips)
+    return _sticks(robot)
 
 
 def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
@@ -177,18 +157,16 @@ def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
     return [bodies[shape.link] for shape in look.shapes]
 
 
-def _look_parts(
-    model: mujoco.MjModel, look: Look, bodies: list[int], tips: tuple[np.ndarray, np.ndarray]
-) -> RobotParts:
+def _look_parts(model: mujoco.MjModel, look: Look, bodies: list[int]) -> RobotParts:
     parts = tuple(
         Part(k, shape.kind, shape.size, _PLAIN if shape.color is None else np.asarray(shape.color), shape.mesh)
         for k, shape in enumerate(look.shapes)
     )
     places = np.array([s.position for s in look.shapes]), np.array([s.rotation for s in look.shapes])
-    return RobotParts(model, "look", parts, tips, (np.array(bodies), *places))
+    return RobotParts(model, "look", parts, np.array(bodies), places)
 
 
-def _cover(model: mujoco.MjModel, bodies: Sequence[int]) -> bool:
+def _cover(model: mujoco.MjModel, bodies: Iterable[int]) -> bool:
     """Return whether two thirds of the moving bodies carry a shape, themselves or through a fixed body.
 
     A body that only joins another to its own place, such as one of three that make a ball joint, does not count.
@@ -224,9 +202,9 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> np.ndarray:
     return _PLAIN if np.allclose(color, _MUJOCO_DEFAULT) else color
 
 
-def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ...]:
+def _sticks(robot: Robot) -> RobotParts:
     """Return dots on bodies with joints, and sticks from each body to its parent and to its tip."""
-    model, data = robot.mj_model, next(mujoco_poses(robot, np.asarray(robot.q0)))
+    model, tips, data = robot.mj_model, _tips(robot), next(mujoco_poses(robot, np.asarray(robot.q0)))
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
     length[: model.nbody][model.body_parentid == 0] = 0.0
@@ -234,13 +212,15 @@ def _sticks(robot: Robot, tips: tuple[np.ndarray, np.ndarray]) -> tuple[Part, ..
     # thin beside typical links and beside the whole robot, also if one of both sizes is unusual
     radius = min(0.13 * float(np.median(length[length > 1e-6])), 0.02 * extent) if np.any(length > 1e-6) else 0.02
     dots = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
-    return (
+    parts = (
         *(Part(body, _GEOM.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), _JOINT) for body in dots),
         *(
             Part(model.nbody + link, _GEOM.mjGEOM_CAPSULE, np.array([0.55 * radius, 0.5 * length[link], 0.0]), _STICK)
             for link in np.flatnonzero(length > 1e-6)
         ),
     )
+    ends = np.concatenate([np.arange(model.nbody), model.body_parentid, tips[0]])
+    return RobotParts(model, "sticks", parts, ends[[part.index for part in parts]], tips)
 
 
 def _tips(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -266,9 +246,8 @@ def _stick_ends(
 
 def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "links 3 3"]:
     """Return rotations whose z axis points along each link. (k, 3, 3)."""
-    length = np.linalg.norm(along, axis=-1, keepdims=True)
-    z = np.where(length > 0.0, along / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
-    # any axis that is not nearly parallel to z makes a well-conditioned cross product
-    x = np.cross(np.where(np.abs(z[:, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]), z)
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], -1)
+    frames, quaternion = np.empty((len(along), 9)), np.empty(4)
+    for frame, way in zip(frames, along, strict=True):
+        mujoco.mju_quatZ2Vec(quaternion, way)
+        mujoco.mju_quat2Mat(frame, quaternion)
+    return frames.reshape(-1, 3, 3)

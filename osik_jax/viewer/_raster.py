@@ -7,6 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.linalg import null_space
 
 from ._parts import Part
 from ._raycast import Image, RayCaster, light
@@ -104,7 +105,7 @@ class Rasterizer(RayCaster):
 
     def _look_from_lamp(self, corners: np.ndarray) -> _Lamp:
         """Return the depth buffer of the lamp."""
-        axes = Camera((0.0, 0.0, 0.0), 1.0, *_angles(TO_LAMP), 1.0).axes
+        axes = np.concatenate([null_space(TO_LAMP[None]).T, -TO_LAMP[None]])
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         away = np.sum(normals * (corners[:, 0] - self._lamp), -1) > 0.0
         right, up, depth = np.moveaxis((corners[~(away & self._closed)] - self._lamp) @ axes.T, -1, 0)
@@ -129,11 +130,6 @@ class Rasterizer(RayCaster):
             inside = ((corner + shift >= 0) & (corner + shift < self._shadow_size)).all(-1)
             hidden += np.prod(np.where(shift, part, 1.0 - part), -1) * (behind & inside)
         return 1.0 - hidden
-
-
-def _angles(way: Float[np.ndarray, "3"]) -> tuple[float, float]:
-    """Return azimuth and elevation of a unit vector [deg]."""
-    return float(np.rad2deg(np.arctan2(way[1], way[0]))), float(np.rad2deg(np.arcsin(way[2])))
 
 
 def _surface(part: Part) -> _Surface:

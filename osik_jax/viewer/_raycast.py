@@ -15,7 +15,6 @@ from ._stage import TO_LAMP, Camera, Stage
 Image = Float[np.ndarray, "height width 3"]
 """Picture with red, green and blue from 0 to 1. (height, width, 3)."""
 
-_WHITE = 1.0
 _TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
 _SHADOW_MAP = 112
 _BLOCK = 8
@@ -179,7 +178,7 @@ class RayCaster:
         tile = np.floor(point / _round_length(0.2 * self.camera.height)).astype(int).sum(-1) % 2
         distance = np.linalg.norm(point - np.asarray(self.camera.center[:2]), axis=-1) / self.camera.height
         fade = np.clip(distance / 2.2, 0.0, 1.0)[:, None]
-        return _TILES[tile] + fade * (_WHITE - _TILES[tile])
+        return _TILES[tile] + fade * (1.0 - _TILES[tile])
 
 
 def light(

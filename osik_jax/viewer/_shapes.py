@@ -5,7 +5,6 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
 
 from ._parts import Part, RobotParts
 
@@ -13,7 +12,6 @@ Quads = Float[np.ndarray, "faces 4 3"]
 """Corners of quads; a triangle is a quad whose last two corners coincide."""
 
 _GEOM = mujoco.mjtGeom
-_MESH_FACES = 600
 
 
 def revolve(profile: Float[np.ndarray, "k 2"], segments: int) -> Quads:
@@ -77,21 +75,8 @@ def box(half_sizes: Float[np.ndarray, "3"], detail: int) -> Quads:
     return np.concatenate(faces) * np.asarray(half_sizes)
 
 
-def mesh(vertices: Float[np.ndarray, "k 3"], faces: np.ndarray) -> Quads:
-    """Return a triangle mesh, or its convex hull if it has too many faces."""
-    if len(faces) > _MESH_FACES:
-        hull = ConvexHull(vertices[:: max(1, len(vertices) // 2000)])
-        corners = hull.points[hull.simplices]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        inward = np.sum(normals * hull.equations[:, :3], -1) < 0.0
-        corners[inward] = corners[inward][:, ::-1]
-    else:
-        corners = vertices[faces]
-    return np.concatenate([corners, corners[:, 2:]], 1)
-
-
 def part_surface(part: Part, detail: int) -> Quads:
-    """Return the surface of one part in its own frame."""
+    """Return the surface of a part that is no mesh, in its own frame."""
     size = part.size
     match part.kind:
         case _GEOM.mjGEOM_SPHERE:
@@ -105,39 +90,11 @@ def part_surface(part: Part, detail: int) -> Quads:
         case _GEOM.mjGEOM_BOX:
             return box(size, detail)
         case _:
-            return np.zeros((0, 4, 3)) if part.mesh is None else mesh(*part.mesh)
-
-
-def robot_surface(shape: RobotParts, data: mujoco.MjData, detail: int) -> tuple[Quads, Float[np.ndarray, "faces 4"]]:
-    """Return the faces of a robot in the world [m], and their colours."""
-    surfaces = [part_surface(part, detail) for part in shape.parts]
-    placed = [
-        quads @ rotation.T + position for quads, position, rotation in zip(surfaces, *shape.poses(data), strict=True)
-    ]
-    colors = np.repeat([part.color for part in shape.parts], [len(quads) for quads in surfaces], axis=0)
-    return np.concatenate(placed), colors
+            return np.zeros((0, 4, 3))
 
 
 def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
     """Return the height of each part's lowest point in the world [m]; exact for meshes, boxes and round shapes."""
     position, rotation = shape.poses(data)
     down = -rotation[:, 2]  # in each part's frame
-    return position[:, 2] - np.array([_reach(part, way) for part, way in zip(shape.parts, down, strict=True)])
-
-
-def _reach(part: Part, way: Float[np.ndarray, "3"]) -> float:
-    """Return the largest coordinate of the part along a unit vector, from the part's origin [m]."""
-    if part.mesh is not None:
-        return float((part.hull @ way).max())
-    radius, length, _ = part.size
-    match part.kind:
-        case _GEOM.mjGEOM_SPHERE:
-            return float(radius)
-        case _GEOM.mjGEOM_CAPSULE:
-            return float(radius + length * abs(way[2]))
-        case _GEOM.mjGEOM_CYLINDER:
-            return float(radius * np.hypot(way[0], way[1]) + length * abs(way[2]))
-        case _GEOM.mjGEOM_ELLIPSOID:
-            return float(np.linalg.norm(part.size * way))
-        case _:
-            return float(np.abs(way) @ part.size)
+    return position[:, 2] - np.array([part.reach(way) for part, way in zip(shape.parts, down, strict=True)])

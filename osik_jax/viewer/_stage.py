@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ._fixed import FixedParts
 from ._parts import Part, RobotParts
 
 FLOOR_GROUP = 5
@@ -135,17 +134,14 @@ class Stage:
         colors: of each geom but the floor, red, green and blue. (geoms, 3)
     """
 
-    def __init__(self, robots: Sequence[RobotParts | FixedParts], camera: Camera, *, floor: float) -> None:
+    def __init__(self, robots: Sequence[RobotParts], camera: Camera, *, floor: float) -> None:
         """Build the model; ``floor`` is the height of the floor [m]."""
-        spec = mujoco.MjSpec()
-        for robot in robots:
-            for part in robot.parts:
-                _add_part(spec, part)
-        _add_surroundings(spec, camera, floor)
         self._robots = tuple(robots)
-        self.model = spec.compile()
-        self.model.vis.global_.fovy = camera.view_angle
         self.parts = tuple(part for robot in robots for part in robot.parts)
+        spec = _surroundings(camera, floor)
+        for part in self.parts:
+            _add_part(spec, part)
+        self.model = spec.compile()
         self.colors = np.array([part.color[:3] for part in self.parts]).reshape(-1, 3)
 
     def pose(
@@ -178,52 +174,30 @@ def _add_part(spec: mujoco.MjSpec, part: Part) -> None:
     body.add_geom(type=part.kind, meshname=name, rgba=part.color, contype=0, conaffinity=0)
 
 
-def _add_surroundings(spec: mujoco.MjSpec, camera: Camera, floor: float) -> None:
-    """Add floor, lamp and sky for MuJoCo's renderer, with an off-screen buffer for large pictures."""
-    spec.add_texture(
-        name="tiles",
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.90, 0.91, 0.93],
-        rgb2=[0.96, 0.965, 0.975],
-        width=512,
-        height=512,
-    )
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
-        rgb1=[1.0, 1.0, 1.0],
-        rgb2=[1.0, 1.0, 1.0],
-        width=64,
-        height=384,
-    )
-    material = spec.add_material(
-        name="floor", emission=0.1, specular=0.0, texrepeat=[2.5 / camera.height, 2.5 / camera.height], texuniform=True
-    )
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0.0, 0.0, 1.0],
-        pos=[*camera.center[:2], floor],
-        material="floor",
-        group=FLOOR_GROUP,
-    )
-    lamp = np.asarray(camera.center) + 4.0 * camera.height * TO_LAMP
-    spec.worldbody.add_light(
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
-        pos=lamp,
-        dir=-TO_LAMP,
-        diffuse=[0.45, 0.45, 0.45],
-        specular=[0.2, 0.2, 0.2],
-        castshadow=True,
-    )
-    spec.visual.global_.offwidth, spec.visual.global_.offheight = 2560, 1440
-    spec.visual.headlight.ambient[:] = 0.42
-    spec.visual.headlight.diffuse[:] = 0.28
-    spec.visual.headlight.specular[:] = 0.0
-    spec.visual.quality.shadowsize, spec.visual.map.shadowclip = 4096, 4.0 * camera.height
-    spec.visual.map.fogstart, spec.visual.map.fogend = 4.5 * camera.height, 11.0 * camera.height
-    spec.visual.map.znear, spec.visual.map.zfar = 0.1 * camera.height, 40.0 * camera.height
-    spec.visual.rgba.fog[:] = 1.0
-    spec.stat.extent = 1.0  # the lengths of visual.map are multiples of it
+def _surroundings(camera: Camera, floor: float) -> mujoco.MjSpec:
+    """Return floor, lamp and sky for MuJoCo's renderer, with an off-screen buffer for large pictures."""
+    x, y, _ = camera.center
+    tall, lamp, way = camera.height, np.asarray(camera.center) + 4.0 * camera.height * TO_LAMP, -TO_LAMP
+    return mujoco.MjSpec.from_string(f"""<mujoco>
+    <statistic extent="1"/>  <!-- the lengths of map are multiples of it -->
+    <visual>
+      <global offwidth="2560" offheight="1440" fovy="{camera.view_angle}"/>
+      <headlight ambient="0.42 0.42 0.42" diffuse="0.28 0.28 0.28" specular="0 0 0"/>
+      <quality shadowsize="4096"/>
+      <map shadowclip="{4.0 * tall}" fogstart="{4.5 * tall}" fogend="{11.0 * tall}" znear="{0.1 * tall}"
+        zfar="{40.0 * tall}"/>
+      <rgba fog="1 1 1 1"/>
+    </visual>
+    <asset>
+      <texture name="tiles" type="2d" builtin="checker" rgb1="0.9 0.91 0.93" rgb2="0.96 0.965 0.975" width="512"
+        height="512"/>
+      <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1" width="64" height="384"/>
+      <material name="floor" texture="tiles" emission="0.1" specular="0" texrepeat="{2.5 / tall} {2.5 / tall}"
+        texuniform="true"/>
+    </asset>
+    <worldbody>
+      <geom type="plane" size="0 0 1" pos="{x} {y} {floor}" material="floor" group="{FLOOR_GROUP}"/>
+      <light type="directional" pos="{lamp[0]} {lamp[1]} {lamp[2]}" dir="{way[0]} {way[1]} {way[2]}"
+        diffuse="0.45 0.45 0.45" specular="0.2 0.2 0.2"/>
+    </worldbody>
+    </mujoco>""")

@@ -97,7 +97,7 @@ def test_an_exported_page_holds_everything(tmp_path: Path) -> None:
     q = np.tile(np.asarray(ARM.q0), (50, 1)) + np.linspace(0.0, 0.5, 50)[:, None]
     path = export_html(ARM, {"one": q, "other": q[::-1]}, tmp_path / "arm.html", dt=0.02, title="a <b> arm")
     page = path.read_text(encoding="utf-8")
-    assert "<title>a &lt;b> arm</title>" in page and "__VISER_EMBED_DATA__" in page
+    assert "<title>a &lt;b&gt; arm</title>" in page and "__VISER_EMBED_DATA__" in page
     assert ' src="http' not in page and ' href="http' not in page
     still = export_html(ARM, q[:1], tmp_path / "still.html")
     assert len(page) - len(still.read_text(encoding="utf-8")) > 1000  # what moves

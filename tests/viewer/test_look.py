@@ -20,8 +20,9 @@ from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raster import Rasterizer, draw_triangles
 from osik_jax.viewer._raycast import RayCaster
-from osik_jax.viewer._shapes import lowest_points, robot_surface
+from osik_jax.viewer._shapes import lowest_points
 from osik_jax.viewer._stage import Stage, frame_camera
+from osik_jax.viewer.live._surfaces import part_triangles
 
 MESHES = Path(__file__).parents[1] / "data" / "meshes"
 COLLADA = (MESHES / "square.dae").read_text(encoding="utf-8")
@@ -103,8 +104,9 @@ def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
     assert look.missing == () and [shape.link for shape in look.shapes] == ["base", "upper"]
     shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, [0.5]))
     assert shape.style == "look"
-    quads, _ = robot_surface(shape, data, 4)
-    low, high = quads.min((0, 1)), quads.max((0, 1))
+    placed = zip(shape.parts, *shape.poses(data), strict=True)
+    points = np.concatenate([part_triangles(part).vertices @ R.T + p for part, p, R in placed])
+    low, high = points.min(0), points.max(0)
     turn = np.array([[np.cos(0.5), np.sin(0.5)], [-np.sin(0.5), np.cos(0.5)]])
     corners = np.array([(x, z) for x in (-0.1, 0.1) for z in (-0.05, 0.25)]) @ turn.T + [0.0, 0.2]
     np.testing.assert_allclose(high[[0, 2]], np.maximum(corners.max(0), [0.1, 0.2]), atol=1e-6)

@@ -20,7 +20,7 @@ from osik_jax.viewer import _animate, _mujoco, _opengl
 from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
-from osik_jax.viewer._shapes import robot_surface
+from osik_jax.viewer._shapes import part_surface
 from osik_jax.viewer._stage import Camera, Stage
 
 CAMERA = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
@@ -67,23 +67,19 @@ def signed_volume(quads):
 def test_faces_lie_on_mujocos_geoms(shapes):
     q = random_configurations(shapes, 1)[0]
     data = mujoco_at(shapes, q)
-    quads, _ = robot_surface(robot_parts(shapes), data, 6)
-    model, start = shapes.mj_model, 0
-    per_geom = [len(robot_surface_of(shapes, data, g)) for g in range(model.ngeom)]
-    for geom, count in enumerate(per_geom):
-        points = quads[start : start + count].reshape(-1, 3)
+    model = shapes.mj_model
+    for geom in range(model.ngeom):
+        points = robot_surface_of(shapes, data, geom).reshape(-1, 3)
         local = (points - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
-        np.testing.assert_allclose(
-            surface_distance(model.geom_type[geom], model.geom_size[geom], local), 0.0, atol=1e-12
-        )
-        start += count
-    assert start == len(quads)
+        distance = surface_distance(model.geom_type[geom], model.geom_size[geom], local)
+        assert len(distance)
+        np.testing.assert_allclose(distance, 0.0, atol=1e-12)
 
 
 def robot_surface_of(robot, data, geom):
     shape = robot_parts(robot)
-    one = type(shape)(shape.model, shape.style, (shape.parts[geom],), shape.tips)
-    return robot_surface(one, data, 6)[0]
+    position, rotation = (each[geom] for each in shape.poses(data))
+    return part_surface(shape.parts[geom], 6) @ rotation.T + position
 
 
 @pytest.mark.parametrize(

@@ -51,12 +51,11 @@ class BatchView(Served):
         look: Look | None,
         host: str,
         port: int,
-        title: str,
     ) -> None:
         """Start the server and the loop."""
         self.names, self._robot = tuple(controllers), robot
         self.loop = ControlLoop(robot, stacked(tuple(controllers.values())), dt=dt, q0=jnp.asarray(q0))
-        super().__init__(host, port, title)
+        super().__init__(host, port, "osik-jax")
         shapes = robot_parts(robot, look=look)
         span = np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, q0)])
         size = float(np.linalg.norm(np.ptp(span, axis=0)))
@@ -242,6 +241,5 @@ def serve_batch(
         scheme = scheme_for(next(iter(tasks.values())), robot.q0.dtype)
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
-    return BatchView(
-        robot, controllers, q0s, dt=dt, look=given_look(look), host=host, port=port, title="osik-jax"
-    ).opened(open_browser)
+    view = BatchView(robot, controllers, q0s, dt=dt, look=given_look(look), host=host, port=port)
+    return view.opened(open_browser)

@@ -19,18 +19,10 @@ _BOX = 0.7
 
 
 def link_covers(robot: Robot, shapes: RobotParts) -> dict[str, CollisionShape]:
-    """Return a shape around each moving link, fixed to it and named like it plus ``SUFFIX``.
-
-    Args:
-        robot: the robot.
-        shapes: what is drawn of it.
-    """
+    """Return a shape around each moving link, fixed to it and named like it plus ``SUFFIX``."""
     clouds, size = _clouds(robot, shapes)
-    covers: dict[str, CollisionShape] = {}
-    for body, points in clouds.items():
-        if np.linalg.norm(np.ptp(points, axis=0)) > _SMALL * size:
-            covers[body + SUFFIX] = _cover(points, body)
-    return covers
+    large = {body: points for body, points in clouds.items() if np.linalg.norm(np.ptp(points, axis=0)) > _SMALL * size}
+    return {body + SUFFIX: _cover(points, body) for body, points in large.items()}
 
 
 def _clouds(robot: Robot, shapes: RobotParts) -> tuple[dict[str, Float[np.ndarray, "k 3"]], float]:

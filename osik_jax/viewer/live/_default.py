@@ -35,13 +35,7 @@ def default_session(
 ) -> Session:
     """Return the default session of a robot; waist and centre of mass are offered but switched off.
 
-    Args:
-        robot: the robot.
-        q: where it starts; default: ``robot.q0``. (nq,)
-        feet: frames that stand on the ground.
-        polygon: over which the centre of mass stays.
-        source: where the robot comes from.
-        dt: time of a step [s].
+    It starts at ``q`` (default: ``robot.q0``) with ``feet`` on the ground and its centre of mass over ``polygon``.
     """
     start = robot.q0 if q is None else q
     poses = forward_kinematics(robot, start)

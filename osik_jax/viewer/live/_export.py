@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -56,11 +57,7 @@ def export_html(
 def write_page(
     robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str, beside: str | None = None
 ) -> Path:
-    """Write the page of an already loaded motion; ``beside`` is HTML that is shown beside it.
-
-    Raises:
-        ImportError: viser is not installed.
-    """
+    """Write the page of an already loaded motion; ``beside`` is HTML that is shown beside it."""
     server = open_server("127.0.0.1", 0, title)
     try:
         cast = Cast(server, robot, motion, look, panel=False)
@@ -72,7 +69,7 @@ def write_page(
         page = serializer.as_html()
     finally:
         close_server(server)
-    page = page.replace("<title>Viser</title>", f"<title>{_escaped(title)}</title>", 1)
+    page = page.replace("<title>Viser</title>", f"<title>{html.escape(title, quote=False)}</title>", 1)
     if beside is not None:
         start, end = page.rsplit("</body>", 1)
         page = f"{start}{beside}</body>{end}"
@@ -96,7 +93,3 @@ def _motion(robot: Robot, trajectory: Any, dt: float | None) -> Motion:
             f"there are {len(runs)} runs and dt is {period}; it takes one at least, and a positive time"
         )
     return Motion(runs, {name: np.arange(len(q)) * period for name, q in runs.items()})
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;")

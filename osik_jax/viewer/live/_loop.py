@@ -23,7 +23,7 @@ from ...solvers import Status
 from ._compiler import Compiler
 from ._hold import targets_here
 from ._obstacles import moved
-from ._priority import run_before_others
+from ._priority import CONTROL, be_nice
 from ._push import Push
 from ._recorder import Recorder
 from ._snapshot import Recording, Snapshot
@@ -206,14 +206,18 @@ class ControlLoop:
         """
         if name not in self._wanted.tasks:
             raise unknown_name("task", name, tuple(self._wanted.tasks))
-        task: Any = self._wanted.tasks[name]
-        aimed: Any = jax.vmap(_aim)(task, target) if self._batched else _aim(task, target)
+
+        def aimed(task: Any, target: Any) -> Any:
+            return task.replace(target=target).target
+
+        task = self._wanted.tasks[name]
+        new = jax.vmap(aimed)(task, target) if self._batched else aimed(task, target)
         until = np.inf if timeout is None else time.monotonic() + timeout
         with self._lock:
             self._leases.pop(name, None)
             if owner is not None or timeout is not None:
                 self._leases[name] = _Lease(owner, until)
-            self._retarget({name: aimed.target})
+            self._retarget({name: new})
 
     def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
         """Set position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``) in all controllers."""
@@ -290,7 +294,7 @@ class ControlLoop:
 
     def _run(self) -> None:
         """Run the control thread."""
-        run_before_others()
+        be_nice(CONTROL)
         deadline = time.perf_counter()
         while not self._stop.is_set():
             self._run_once()
@@ -366,8 +370,3 @@ class ControlLoop:
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
             self._retarget(here)
-
-
-def _aim(task: Any, target: Any) -> Any:
-    """Return the task with another target."""
-    return task.replace(target=target)

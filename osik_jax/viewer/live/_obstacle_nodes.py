@@ -9,23 +9,25 @@ import numpy as np
 from jaxtyping import Float
 
 from ...robot.loading._mjmodel import quaternion, rotation_matrix
-from ._handles import Handles
+from ._handles import Handles, Pose
 from ._obstacles import Obstacle
 
 if TYPE_CHECKING:
     from viser import SceneApi
 
-Dragged = Callable[[str, Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]], None]
-"""Arguments of a drag callback: obstacle, position [m] and rotation."""
 _COLOR = (231, 126, 34)
 
 
 class ObstacleNodes(Handles):
     """Obstacles as nodes of a page's scene, with handles to drag, turn and resize them."""
 
-    def __init__(self, scene: SceneApi, size: float, dragged: Dragged) -> None:
-        """Take the size of the robot [m] and the drag callback."""
-        super().__init__(scene, lambda name, pose, *_: dragged(name, pose[0], rotation_matrix(pose[1])))
+    def __init__(self, scene: SceneApi, size: float, move: Callable[..., None]) -> None:
+        """Take the size of the robot [m] and ``move(obstacle, position=, rotation=)``, which a drag calls."""
+
+        def dragged(name: str, pose: Pose, *_: object) -> None:
+            move(name, position=pose[0], rotation=rotation_matrix(pose[1]))
+
+        super().__init__(scene, dragged)
         self._scale = 0.1 * size
         self._sizes: dict[str, Float[np.ndarray, "3"]] = {}
         self._last: Mapping[str, Obstacle] | None = None

@@ -28,7 +28,7 @@ MARGIN = 0.01
 """Least distance to obstacles, and of links that are farther apart at the start [m]."""
 PARKED = np.array([0.0, 0.0, -1e3])
 """Position of obstacles out of use [m]."""
-_ROWS = {"itself": 12, "world": 12}
+_ROWS = 12
 
 
 class Obstacle(NamedTuple):
@@ -95,12 +95,7 @@ def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."
 
 
 def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float) -> CollisionAvoidanceLimit:
-    """Return the limit between links and obstacles, with all obstacles out of use.
-
-    Args:
-        robot: the robot.
-        covers: what links are taken for.
-        size: of the robot [m].
+    """Return the limit between links and obstacles, with all obstacles out of use; ``size`` is the robot's [m].
 
     Raises:
         ValueError: no link moves.
@@ -110,7 +105,7 @@ def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float)
     slots |= {f"box {number + 1}": CollisionShape.box((edge, edge, edge), PARKED) for number in range(SLOTS["box"])}
     pairs, shapes = list(product(slots, covers)), {**covers, **slots}
     return CollisionAvoidanceLimit(
-        robot, pairs=pairs, shapes=shapes, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS["world"]
+        robot, pairs=pairs, shapes=shapes, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS
     )
 
 
@@ -133,7 +128,7 @@ def own_limit(
     if not kept:
         raise OsikValueError("no two links of this robot are apart where it starts")
     return CollisionAvoidanceLimit(
-        robot, pairs=kept, shapes=covers, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS["itself"]
+        robot, pairs=kept, shapes=covers, minimum_distance=MARGIN, q0_distance=-np.inf, max_pairs=_ROWS
     )
 
 

@@ -15,41 +15,16 @@ from ...robot import Robot
 from .._parts import robot_parts
 from ._default import default_session
 from ._export import write_page
-from ._needs import import_viser
 from ._page import LiveView
 from ._playback import Player, read_motion
 from ._reach import ReachView, check_map, serve_reach
-from ._server import check_port
 from ._session import load_session
 from ._source import RobotSource, source_look
 from ._stance import sole_polygon, standing
 
 
-def check(host: str, port: int) -> None:
-    """Raise an error early if address, port or extra would fail later.
-
-    Raises:
-        ImportError: viser is not installed.
-        OSError: the port is in use, or the address is none of this machine's.
-    """
-    import_viser()
-    check_port(host, port)
-
-
 def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:
-    """Open a page with a robot to drag.
-
-    Args:
-        robot: the robot.
-        source: where it comes from.
-        feet: frames that stand on the ground.
-        host: address to listen at.
-        port: to listen at.
-
-    Raises:
-        KeyError: no such frame.
-        OSError: the port is in use.
-    """
+    """Open a page with a robot to drag; ``feet`` are the frames that stand on the ground."""
     for foot in feet:
         robot.tree.frame(foot)
     look = source_look(source)
@@ -63,12 +38,7 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
 
 
 def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> Player:
-    """Open a page that plays a motion.
-
-    Raises:
-        FileNotFoundError, ValueError: as in ``read_motion``.
-        OSError: the port is in use.
-    """
+    """Open a page that plays a motion."""
     motion = read_motion(path, robot)
     return Player(robot, motion, look=source_look(source), host=host, port=port, title=path.name)
 
@@ -83,12 +53,7 @@ def is_map(path: Path) -> bool:
 
 
 def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> ReachView:
-    """Open a page with a reachability map.
-
-    Raises:
-        ValueError: a map of another version, or of another robot.
-        OSError: the port is in use.
-    """
+    """Open a page with a reachability map."""
     found = load_map(path)
     try:
         check_map(robot, found)
@@ -98,22 +63,12 @@ def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: 
 
 
 def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> None:
-    """Write a page that plays a motion without a server.
-
-    Raises:
-        FileNotFoundError, ValueError: as in ``read_motion``.
-        OSError: the page cannot be written.
-    """
+    """Write a page that plays a motion without a server."""
     write_page(robot, read_motion(path, robot), page, look=source_look(source), title=path.stem)
 
 
 def open_session(path: Path, *, host: str, port: int) -> LiveView:
-    """Open a page that resumes a saved session.
-
-    Raises:
-        FileNotFoundError, ValueError: as in ``load_session``.
-        OSError: the port is in use.
-    """
+    """Open a page that resumes a saved session."""
     session = load_session(path)
     look = None if session.source is None else source_look(session.source)
     return session.serve(look=look, host=host, port=port)

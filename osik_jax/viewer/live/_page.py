@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,7 +17,7 @@ from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
 from .._look import Look
-from .._mujoco import robot_com
+from .._mujoco import mujoco_poses, robot_com
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._desk import Desk
@@ -40,20 +39,19 @@ if TYPE_CHECKING:
 class LiveView(Served):
     """Page that runs a session; ``serve`` says what it has."""
 
-    def __init__(self, session: Session, *, look: Look | None, host: str, port: int, title: str) -> None:
+    def __init__(self, session: Session, *, look: Look | None, host: str, port: int) -> None:
         """Start the server and the loop."""
-        super().__init__(host, port, title)
+        super().__init__(host, port, "osik-jax")
         robot = session.robot
-        shapes, self._data = robot_parts(robot, look=look), mujoco.MjData(robot.mj_model)
+        shapes, data = robot_parts(robot, look=look), next(mujoco_poses(robot, session.q))
         self._desk = Desk(session, shapes)
-        self._kinematics(session.q)
-        seen, floor = shapes.corners(self._data), floor_height(robot, shapes, [self._data])
+        seen, floor = shapes.corners(data), floor_height(robot, shapes, [data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         add_surroundings(self._server, seen, floor)
         self._robot = RobotNodes(self._server.scene, robot, look=look)
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
-        self._obstacles = ObstacleNodes(self._server.scene, size, self._place)
+        self._obstacles = ObstacleNodes(self._server.scene, size, self._desk.move_obstacle)
         self._panel = Panel(self._server, self._desk, seen)
         self._polygon: SupportPolygon | None = None
         self._drawn: Session | None = None
@@ -98,14 +96,14 @@ class LiveView(Served):
     def _draw(self) -> None:
         """Draw the current state of the robot."""
         session = self._desk.session
-        self._kinematics(self.loop.snapshot.q)
+        data = next(mujoco_poses(session.robot, self.loop.snapshot.q))
         with self._server.atomic():
-            self._robot.place(self._data)
+            self._robot.place(data)
             if session is not self._drawn or self._gizmos.held:
                 self._draw_session(session)
             self._obstacles.show(self._desk.obstacles)
             if self._marks is not None:
-                self._marks.place(robot_com(session.robot, self._data))
+                self._marks.place(robot_com(session.robot, data))
 
     def _draw_session(self, session: Session) -> None:
         """Redraw the parts of the page that depend on the session alone."""
@@ -116,13 +114,6 @@ class LiveView(Served):
             self._marks.show_polygon(polygon)
             self._polygon = polygon
 
-    def _kinematics(self, q: Float[np.ndarray, " nq"]) -> None:
-        robot = self._desk.session.robot
-        index, coefficient = robot.tree.qpos_source
-        self._data.qpos[:] = np.asarray(q)[index] * coefficient + np.asarray(robot.qpos_offset)
-        mujoco.mj_kinematics(robot.mj_model, self._data)
-        mujoco.mj_comPos(robot.mj_model, self._data)
-
     def _drag(self, name: str, pose: Pose, visitor: int, phase: str) -> None:
         """Apply a visitor's drag of a handle; a visitor who left stops the robot."""
         if phase != "end":
@@ -131,10 +122,6 @@ class LiveView(Served):
             self.loop.let_go(visitor)
         else:
             self.loop.release(visitor)
-
-    def _place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
-        """Apply a visitor's drag of an obstacle."""
-        self._desk.move_obstacle(obstacle, position=position, rotation=rotation)
 
     def _gone(self, client: ClientHandle) -> None:
         """Release the handles and the dragged robots of a visitor who closed the page."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from collections.abc import Mapping
@@ -27,6 +28,7 @@ _RATE = 200.0
 """Sample rate of an array without times [Hz]."""
 
 
+@dataclasses.dataclass(frozen=True)
 class Motion:
     """Motion of one or more runs, with their times.
 
@@ -36,14 +38,9 @@ class Motion:
         person: the person whose motion the first run is, at its times; None: nobody's.
     """
 
-    def __init__(
-        self,
-        runs: Mapping[str, Float[np.ndarray, "T nq"]],
-        times: Mapping[str, np.ndarray],
-        person: StickFigure | None = None,
-    ) -> None:
-        """Take configurations by name of the run, and the times of each run's frames [s]."""
-        self.runs, self.times, self.person = dict(runs), dict(times), person
+    runs: Mapping[str, Float[np.ndarray, "T nq"]]
+    times: Mapping[str, Float[np.ndarray, " T"]]
+    person: StickFigure | None = None
 
     @property
     def duration(self) -> float:
@@ -164,18 +161,14 @@ def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.n
 
 
 class Player(Served):
-    """Page that plays a motion in a loop.
-
-    Attributes:
-        url: address of the page.
-    """
+    """Page that plays a motion in a loop."""
 
     def __init__(self, robot: Robot, motion: Motion, *, look: Look | None, host: str, port: int, title: str) -> None:
         """Start the server and the playback."""
         super().__init__(host, port, title)
         self._cast, self._motion = Cast(self._server, robot, motion, look, panel=True), motion
-        gui, length = self._server.gui, motion.duration
-        self._time = gui.add_slider("Time [s]", 0.0, max(length, 1e-3), step=1e-3, initial_value=0.0)
+        gui = self._server.gui
+        self._time = gui.add_slider("Time [s]", 0.0, max(motion.duration, 1e-3), step=1e-3, initial_value=0.0)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
         self._play = gui.add_checkbox("Play", initial_value=True)
         self._thread.start()

@@ -51,13 +51,11 @@ class Slice(NamedTuple):
 class ReachView(Served):
     """Page that shows a slice of a map; ``serve_reach`` says what it has."""
 
-    def __init__(
-        self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int, title: str
-    ) -> None:
+    def __init__(self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int) -> None:
         """Start the server."""
-        super().__init__(host, port, title)
+        super().__init__(host, port, f"Reach of {found.frame}")
         self.map, self._robot = found, robot
-        self._axes = found.x, found.y, found.z
+        self._axes = found.axes
         corners = robot_parts(robot, look=look).corners(next(mujoco_poses(robot, np.asarray(robot.q0))))
         seen = np.concatenate([corners, found.positions[found.reached.any(-1)]])
         add_surroundings(self._server, seen, float(seen[:, 2].min()))
@@ -176,16 +174,15 @@ class ReachView(Served):
 
 def slice_picture(found: ReachabilityMap, across: int, index: int) -> Slice:
     """Return the slice across an axis at one coordinate, as a page draws it."""
-    axes = found.x, found.y, found.z
     first, second = (i for i in range(3) if i != across)
-    edges = cell_edges(axes)
+    edges = cell_edges(found.axes)
     length = {i: float(edges[i][-1] - edges[i][0]) for i in (first, second)}
     cells = [_cell_of_pixels(edges[i], _PIXELS * length[i] / max(length.values())) for i in (second, first)]
-    colors = np.moveaxis(slice_colors(found.share, found.beyond_reach, across, index), 0, 1)
-    some = np.take(found.reached.any(-1), index, across).T
-    colors[..., 3] = np.where(colors[..., 3] > 0, np.where(some, _SOLID, _FAINT), 0)
+    share, beyond = (np.take(field, index, across).T for field in (found.share, found.beyond_reach))
+    colors = slice_colors(share, beyond)
+    colors[..., 3] = np.where(colors[..., 3] > 0, np.where(share > 0.0, _SOLID, _FAINT), 0)
     center = np.array([0.5 * (edges[i][0] + edges[i][-1]) for i in range(3)])
-    center[across] = axes[across][index]
+    center[across] = found.axes[across][index]
     turn, wxyz = np.zeros((3, 3)), np.empty(4)
     turn[first, 0] = turn[second, 1] = 1.0
     turn[:, 2] = np.cross(turn[:, 0], turn[:, 1])
@@ -203,7 +200,7 @@ def _cell_of_pixels(edges: Float[np.ndarray, " n_1"], number: float) -> np.ndarr
 def slice_words(found: ReachabilityMap, across: int, index: int) -> str:
     """Return a line of text that says how much of a slice is reached."""
     share, beyond = (np.take(field, index, across) for field in (found.share, found.beyond_reach > 0.0))
-    at, some = (found.x, found.y, found.z)[across][index], share > 0.0
+    at, some = found.axes[across][index], share > 0.0
     mean = f", on average in {share[some].mean():.0%} of the orientations" if some.any() else ""
     return (
         f"**{_AXES[across]} = {at:.3f} m**: {some.sum():,} of {some.size:,} positions reached{mean}; "
@@ -268,9 +265,7 @@ def serve_reach(
         ValueError: the map is of another robot.
     """
     check_map(robot, found)
-    return ReachView(robot, found, look=given_look(look), host=host, port=port, title=f"Reach of {found.frame}").opened(
-        open_browser
-    )
+    return ReachView(robot, found, look=given_look(look), host=host, port=port).opened(open_browser)
 
 
 def check_map(robot: Robot, found: ReachabilityMap) -> None:

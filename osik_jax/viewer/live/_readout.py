@@ -14,12 +14,6 @@ from ...tasks import ComTask, FrameTask, Task
 from ._snapshot import Snapshot
 from ._timing import Timing
 
-_WORDS = {
-    Status.SOLVED: "solved",
-    Status.MAX_ITERATIONS: "out of iterations",
-    Status.INFEASIBLE: "infeasible",
-    Status.NUMERICAL_ERROR: "numerical error",
-}
 _NEAREST = 5
 
 
@@ -39,9 +33,9 @@ def state_text(snapshot: Snapshot) -> str:
 
 def timing_text(snapshot: Snapshot, timing: Timing) -> str:
     """Return status and time of the last step, and the rate of the loop, as text."""
-    status = _WORDS.get(Status(snapshot.status), str(snapshot.status))
+    status = Status(snapshot.status).name.lower().replace("_", " ")
     if not timing.steps:
-        return f"{status}"
+        return status
     rate = 1.0 / timing.period[0] if timing.period[0] > 0.0 else 0.0
     return f"{status} · step {1e3 * timing.step[0]:.2f} ms · {rate:.0f} Hz, period p99 {1e3 * timing.period[1]:.1f} ms"
 

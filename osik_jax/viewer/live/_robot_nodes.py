@@ -34,18 +34,8 @@ class RobotNodes:
         look: Look | None = None,
         name: str = "robot",
         offset: Float[np.ndarray, "3"] | None = None,
-        opacity: float | None = None,
     ) -> None:
-        """Add the robot at ``robot.q0``.
-
-        Args:
-            scene: viser's scene.
-            robot: the robot.
-            look: shapes and colours of its links, as its URDF gives them.
-            name: name of its node in the scene.
-            offset: translation of the whole robot [m].
-            opacity: below 1 for a robot that can be seen through; None: solid.
-        """
+        """Add the robot at ``robot.q0``, moved by an offset [m], as a node of this name."""
         shapes = robot_parts(robot, look=look)
         data = next(mujoco_poses(robot, np.asarray(robot.q0)))
         scene.add_frame(f"/{name}", show_axes=False, position=np.zeros(3) if offset is None else offset)
@@ -61,7 +51,7 @@ class RobotNodes:
                     surface.vertices,
                     surface.faces,
                     color=color[:3],
-                    opacity=opacity if color[3] >= 255 else color[3] / 255.0,
+                    opacity=None if color[3] >= 255 else color[3] / 255.0,
                 )
         self._bodies = np.array(list(self._frames), int)
         self._position, self._quaternion = data.xpos[self._bodies], data.xquat[self._bodies]

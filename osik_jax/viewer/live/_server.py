@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import socket
 import threading
 import webbrowser
 from abc import ABC, abstractmethod
+from types import ModuleType
 from typing import TYPE_CHECKING, Self
 
-from ._needs import import_viser
-from ._priority import run_after_others
+from ..._errors import missing_extra
+from ._priority import DRAWING, be_nice
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -63,7 +65,7 @@ class Served(ABC):
         self.stop()
 
     def _draw_all(self) -> None:
-        run_after_others()
+        be_nice(DRAWING)
         self._run()
 
     @abstractmethod
@@ -74,18 +76,16 @@ class Served(ABC):
         """End everything that runs beside the page."""
 
 
+def import_viser() -> ModuleType:
+    """Return the module viser, or raise ImportError that names the extra."""
+    try:
+        return importlib.import_module("viser")
+    except ImportError as missing:
+        raise missing_extra("a live view", "viser", "viewer") from missing
+
+
 def open_server(host: str, port: int, title: str) -> ViserServer:
-    """Start a server.
-
-    Args:
-        host: address to listen at.
-        port: 0 for any that is free.
-        title: of the panel.
-
-    Raises:
-        ImportError: viser is not installed.
-        OSError: the port is in use, or the address is none of this machine's.
-    """
+    """Start a server with a title; exceptions are those of ``import_viser`` and ``check_port``."""
     viser = import_viser()
     free = check_port(host, port)
     with contextlib.redirect_stdout(io.StringIO()):  # its own greeting

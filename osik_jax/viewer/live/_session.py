@@ -100,7 +100,7 @@ class Session:
         check_setting("serve(robot, tasks)", self.robot, self.scheme, self.dt)
         check_tasks(self.tasks, self.robot)
         checked_limits(self.robot, self.limits)
-        return LiveView(self, look=given_look(look), host=host, port=port, title="osik-jax").opened(open_browser)
+        return LiveView(self, look=given_look(look), host=host, port=port).opened(open_browser)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the session to a file for ``load_session``.

@@ -38,11 +38,6 @@ def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.
     """Return home with the waist slightly lowered over the feet and the robot on the ground. (nq,).
 
     A robot that has a keyframe is where that says.
-
-    Args:
-        robot: a robot that moves freely.
-        shapes: what is drawn of it.
-        feet: frames on the ground.
     """
     q = np.array(robot.q0)
     if robot.mj_model.nkey:

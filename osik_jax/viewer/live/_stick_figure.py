@@ -88,8 +88,7 @@ class StickNodes:
         """Move the figure to a frame."""
         points, turn = self._figure.points[frame], np.zeros(4)
         for node, (a, b) in zip(self._bones, self._figure.bones, strict=True):
-            along = points[b] - points[a]
-            mujoco.mju_quatZ2Vec(turn, along / max(float(np.linalg.norm(along)), 1e-9))
+            mujoco.mju_quatZ2Vec(turn, points[b] - points[a])
             node.position, node.wxyz = 0.5 * (points[a] + points[b]), turn.copy()
         for node, at, stands in zip(self._standing, self._figure.standing, self._figure.contact[frame], strict=False):
             node.position = points[at]
