@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike, Num
 
 from .._errors import OsikValueError
 from ._model import RobotModel
-from ._plausible import warn_of_far_joints
 from ._tree import BALL, FREE, QPOS_WIDTH
 
 _LEAST_QUATERNION = 1e-8
@@ -31,14 +30,6 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
         full = robot.tree.full_qpos_address[joint]
         index = robot.joint_qpos_index(name)
         q = q.at[index].set((value - robot.qpos_offset[full]) / coefficient[full])
-    return q
-
-
-def configuration(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
-    """Return a configuration; see ``Robot.configuration``."""
-    q = with_joints(robot, joints, base)
-    if np.shape(q) == (robot.nq,):
-        warn_of_far_joints(robot, q, "configuration")
     return q
 
 

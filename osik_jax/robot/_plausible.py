@@ -15,7 +15,6 @@ _FAR = 0.5
 """A joint that is further outside its range [rad or m] than this is not there: encoders are off by a hundredth."""
 _TIMES = 10.0
 """A speed that is more times the file's is not meant: degrees are 57 times radians, millimetres 1000 times metres."""
-_NAMES_SHOWN = 4
 
 
 def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
@@ -35,7 +34,7 @@ def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
             if not low - _FAR <= values[at] <= high + _FAR:
                 far.append(f"{tree.joint_names[joint]} is {values[at]:g}, its range is [{low:g}, {high:g}]")
     if far:
-        warn(f"{what} is far outside the joints' ranges; it is in radians and metres: {_some(far)}")
+        warn(f"{what} is far outside the joints' ranges; it is in radians and metres: {first_of(far)}")
 
 
 def warn_of_fast_joints(names: Any, given: Any, own: Any, what: str) -> None:
@@ -53,9 +52,10 @@ def warn_of_fast_joints(names: Any, given: Any, own: Any, what: str) -> None:
     fast = np.flatnonzero(np.isfinite(given) & (given > _TIMES * own))
     if len(fast):
         shown = dict.fromkeys(f"{names[k]}: {given[k]:g}, the file has {own[k]:g}" for k in fast)
-        warn(f"{what} is more than ten times the file's; it is in rad/s and m/s: {_some(list(shown))}")
+        warn(f"{what} is more than ten times the file's; it is in rad/s and m/s: {first_of(list(shown))}")
 
 
-def _some(texts: list[str]) -> str:
-    more = f"; and {len(texts) - _NAMES_SHOWN} more" if len(texts) > _NAMES_SHOWN else ""
-    return "; ".join(texts[:_NAMES_SHOWN]) + more
+def first_of(texts: list[str], most: int = 4) -> str:
+    """Return the first texts in a line, and the number of further ones."""
+    more = f"; and {len(texts) - most} more" if len(texts) > most else ""
+    return "; ".join(texts[:most]) + more

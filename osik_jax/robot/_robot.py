@@ -15,11 +15,12 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Num
 
 from ..numerics._arguments import float_dtype
 from . import loading
-from ._configuration import check_configuration, configuration
+from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
 from ._model import RobotModel
+from ._plausible import warn_of_far_joints
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
 
@@ -233,7 +234,10 @@ class Robot(RobotModel):
         Warns:
             OsikWarning: a joint is more than 0.5 rad or 0.5 m outside its range, as degrees are.
         """
-        return configuration(self, joints, base)
+        q = with_joints(self, joints, base)
+        if q.shape == (self.nq,):
+            warn_of_far_joints(self, q, "configuration")
+        return q
 
     def with_home(self, home: Home) -> Self:
         """Return the robot with another ``q0``, the default target of tasks that are made for it.

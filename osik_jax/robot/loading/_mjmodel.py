@@ -14,7 +14,7 @@ from ..._errors import OsikTypeError, OsikValueError, warn
 from .._balls import with_balls_inside
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
-from .._plausible import warn_of_fast_joints
+from .._plausible import first_of, warn_of_fast_joints
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
@@ -411,9 +411,8 @@ def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, g
 def _warn_of_report(report: LoadReport) -> None:
     """Give one warning for everything that the file asks for and the robot does not keep."""
     if report:
-        shown = "; ".join(map(str, report[:_NOTES_SHOWN]))
-        rest = f"; and {len(report) - _NOTES_SHOWN} more" if len(report) > _NOTES_SHOWN else ""
-        warn(f"the robot does not keep all that its file asks for (print(robot.load_report)): {shown}{rest}")
+        shown = first_of([str(note) for note in report], _NOTES_SHOWN)
+        warn(f"the robot does not keep all that its file asks for (print(robot.load_report)): {shown}")
 
 
 def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import itertools
 import math
 import xml.etree.ElementTree as ElementTree
@@ -13,7 +12,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..._errors import OsikValueError
+from ..._errors import OsikValueError, unknown_name
 from .._load_report import LoadNote
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
@@ -361,7 +360,7 @@ def _root(links: Mapping[str, Link], joints: Mapping[str, Joint]) -> str:
     for joint in joints.values():
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise OsikValueError(f"joint {joint.name!r}: {_no_such('link', link, links)} (its {role})")
+                raise OsikValueError(f"joint {joint.name!r}: {unknown_name('link', link, tuple(links))} (its {role})")
         if joint.child in parent_joint:
             raise OsikValueError(
                 f"link {joint.child!r} is the child of two joints, {parent_joint[joint.child]!r} and {joint.name!r}: "
@@ -400,24 +399,7 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
             continue
         leader = joints.get(joint.mimic.leader)
         if leader is None:
-            raise OsikValueError(
-                f"joint {joint.name!r} mimics what is not there: {_no_such('joint', joint.mimic.leader, joints)}"
-            )
+            missing = unknown_name("joint", joint.mimic.leader, tuple(joints))
+            raise OsikValueError(f"joint {joint.name!r} mimics what is not there: {missing}")
         if leader.kind not in SCALAR:
             raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
-        _check_chain(joint, joints)
-
-
-def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
-    chain = [joint.name]
-    while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
-        if mimic.leader in chain:
-            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
-        chain.append(mimic.leader)
-
-
-def _no_such(kind: str, name: str, available: Iterable[str]) -> str:
-    available = list(available)
-    close = difflib.get_close_matches(name, available, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else "."
-    return f"no {kind} {name!r}{hint} {kind}s: {', '.join(available) or '(none)'}"
