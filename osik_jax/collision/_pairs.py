@@ -59,7 +59,7 @@ def members(robot: Robot, shapes: Mapping[str, CollisionShape]) -> list[Member]:
         ValueError: a shape has the name of a geom.
     """
     tree, model = robot.tree, robot.mj_model
-    bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    bodies = element_names(model, "body")
     links = [*model.geom_bodyid.tolist(), *(bodies.index(mesh.link) for mesh in robot.holder.meshes)]
     masks = [*zip(model.geom_contype.tolist(), model.geom_conaffinity.tolist(), strict=True)]
     masks += [(1, 1)] * len(robot.holder.meshes)
@@ -219,7 +219,7 @@ class _RigidParts:
 
     def __init__(self, robot: Robot) -> None:
         self._model, self._welds = robot.mj_model, _welds(robot.tree)
-        names = element_names(self._model, mujoco.mjtObj.mjOBJ_BODY, "body", self._model.nbody)
+        names = element_names(self._model, "body")
         self._parents = [self._above(robot.tree, body, names) for body in range(len(robot.tree.body_names))]
 
     def part(self, member: Member) -> int:

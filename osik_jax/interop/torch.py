@@ -85,14 +85,11 @@ class _Bridge:
         places = [place for place, leaf in enumerate(leaves) if isinstance(leaf, torch.Tensor)]
         tensors = [leaves[place] for place in places]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-            return self._with_gradient(tree, leaves, places, tensors)
+            structure: list[Any] = []  # of the results, which `forward` adds
+            results = _Step.apply(self, tree, leaves, places, structure, *tensors)
+            return jax.tree.unflatten(structure[0], results)
         found, out = jax.tree.flatten(self.plain(*jax.tree.unflatten(tree, _with_arrays(leaves, places, tensors))))
         return jax.tree.unflatten(out, _to_torch(found, tensors))
-
-    def _with_gradient(self, tree: Any, leaves: list[Any], places: list[int], tensors: list[torch.Tensor]) -> Any:
-        out: list[Any] = []  # structure of the results, which `forward` fills in
-        results = _Step.apply(self, tree, leaves, places, out, *tensors)
-        return jax.tree.unflatten(out[0], results)
 
 
 class _Step(torch.autograd.Function):

@@ -125,7 +125,13 @@ def simulate(
         solutions.append(solution)
         if simulation.fallen():
             break
-    return _recording(frames, commands, solutions, dt, simulation.fallen())
+    return Recording(
+        time=dt * np.arange(len(frames)),
+        command=np.array(commands),
+        solution=jax.tree.map(lambda *leaves: np.stack(leaves), *solutions),
+        fell=simulation.fallen(),
+        **{name: np.array([frame[name] for frame in frames]) for name in frames[0]},
+    )
 
 
 @partial(jax.jit, static_argnames="static")
@@ -170,28 +176,12 @@ def _at(paths: Targets | None, k: int) -> Targets | None:
     return jax.tree.map(lambda path: path[k], paths)
 
 
-def _frame(simulation: Simulation) -> tuple[np.ndarray, ...]:
-    return (
-        simulation.sense(),
-        simulation.effort(),
-        simulation.com(),
-        simulation.contact_points(),
-        simulation.contact_forces(),
-    )
-
-
-def _recording(
-    frames: list[tuple[np.ndarray, ...]], commands: list[Array], solutions: list[Solution], dt: float, fell: bool
-) -> Recording:
-    q, effort, com, points, forces = (np.array(part) for part in zip(*frames, strict=True))
-    return Recording(
-        time=dt * np.arange(len(q)),
-        q=q,
-        command=np.array(commands),
-        effort=effort,
-        com=com,
-        contact_points=points,
-        contact_forces=forces,
-        solution=jax.tree.map(lambda *leaves: np.stack(leaves), *solutions),
-        fell=fell,
+def _frame(simulation: Simulation) -> dict[str, np.ndarray]:
+    """Return MuJoCo's data of the present state, by the field of a recording."""
+    return dict(
+        q=simulation.sense(),
+        effort=simulation.effort(),
+        com=simulation.com(),
+        contact_points=simulation.contact_points(),
+        contact_forces=simulation.contact_forces(),
     )

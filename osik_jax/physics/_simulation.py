@@ -96,13 +96,11 @@ class Simulation:
         """
         targets = np.asarray(command)[self._targets]
         if not np.isfinite(targets).all():
-            raise OsikValueError(f"the command of {', '.join(self._spoiled(targets))} is not finite")
+            spoiled = [name for name, value in zip(self.world.servos, targets, strict=True) if not np.isfinite(value)]
+            raise OsikValueError(f"the command of {', '.join(spoiled)} is not finite")
         self.data.ctrl[:] = targets
         mujoco.mj_step(self.model, self.data, self._substeps(duration))
         mujoco.mj_forward(self.model, self.data)
-
-    def _spoiled(self, targets: np.ndarray) -> list[str]:
-        return [name for name, value in zip(self.world.servos, targets, strict=True) if not np.isfinite(value)]
 
     def _substeps(self, duration: float) -> int:
         steps = duration / self.model.opt.timestep

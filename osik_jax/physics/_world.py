@@ -114,7 +114,8 @@ def build_world(
         )
     points = _contact_points(robot, feet)
     drives = choose_servos(robot, servos or {})
-    poses = _home_poses(robot, tuple(points))
+    home = _home(robot)
+    poses = {foot: frame_pose(robot, home, foot) for foot in points}
     lowest = [float((p + points[foot] @ R.T)[:, 2].min()) for foot, (p, R) in poses.items()]
     height = (min(lowest) if lowest else 0.0) if floor is None else float(floor)
     spec = mujoco.MjSpec()
@@ -185,11 +186,6 @@ def _lower_corners(model: mujoco.MjModel, data: mujoco.MjData, box: int) -> Floa
     return np.array([face + a + left, face - a + left, face - a - left, face + a - left])
 
 
-def _home_poses(robot: Robot, frames: tuple[str, ...]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    data = _home(robot)
-    return {frame: frame_pose(robot, data, frame) for frame in frames}
-
-
 def _home(robot: Robot) -> mujoco.MjData:
     """Return MuJoCo's data of the robot's own model at ``robot.q0``."""
     data = mujoco.MjData(robot.mj_model)
@@ -211,11 +207,7 @@ def frame_pose(
 
 def _model_body(robot: Robot, body: int) -> int:
     """Return MuJoCo's number of a body of the tree."""
-    return _body_names(robot.mj_model).index(robot.tree.body_names[body])
-
-
-def _body_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    return element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    return element_names(robot.mj_model, "body").index(robot.tree.body_names[body])
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -> None:
@@ -229,8 +221,7 @@ def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -
 
 def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBody]:
     """Return the bodies of a compiled model with their inertias and joints, in the same order."""
-    bodies, names = [spec.worldbody], _body_names(model)
-    joints = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
+    bodies, names, joints = [spec.worldbody], element_names(model, "body"), element_names(model, "joint")
     for b in range(1, model.nbody):
         body = bodies[model.body_parentid[b]].add_body(
             name=names[b],

@@ -76,16 +76,14 @@ def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
 
 def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:
     """Return ``q0`` with named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
-    single: dict[str, Any] = {}
-    several: dict[str, Any] = {}
+    q = jnp.asarray(robot.q0)
     for name, value in values.items():
-        turning = robot.tree.joint_types[robot.tree.joint(name)] in (FREE, BALL)
-        (several if turning else single)[name] = value
-    numbers: Any = {name: _as_array(value, robot.q0.dtype) for name, value in single.items()}
-    q = with_joints(robot, numbers, None)
-    for name, value in several.items():
-        start, width = robot.joint_qpos_index(name), QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]]
-        entries = _as_array(value, q.dtype)
+        width, entries = QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]], _as_array(value, q.dtype)
+        if width == 1:
+            number: Any = entries
+            q = with_joints(robot, {name: number}, q)
+            continue
+        start = robot.joint_qpos_index(name)
         if entries.shape != (width,):
             layout = "x, y, z, then the quaternion w, x, y, z" if width == 7 else "a quaternion w, x, y, z"
             raise OsikValueError(f"home of joint {name!r} has shape {entries.shape}, expected ({width},): {layout}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -17,7 +16,7 @@ def own_masses(robot: RobotModel) -> Float[np.ndarray, " bodies"]:
         ValueError: the scene has several trees that may be the robot.
     """
     model = robot.mj_model
-    names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    names = element_names(model, "body")
     roots = {int(model.body_rootid[names.index(robot.tree.body_names[top])]) for top in robot.tree.tops}
     own = np.isin(model.body_rootid, sorted(roots)) & (model.body_weldid != 0)
     return np.where(own, model.body_mass, 0.0)

@@ -13,6 +13,7 @@ import numpy as np
 
 from .._errors import OsikValueError
 from ..batching._names import leaf_names
+from ..numerics._arguments import check_count
 from ._chunk_file import Block, Part, read_chunk, remove_partial_files, write_chunk
 from ._fingerprint import differences, fingerprint, identifier
 from ._folder import check_space, claim
@@ -80,7 +81,8 @@ def run_in_chunks(
             Before the first chunk is run, where it can be known; later, what is finished stays.
     """
     check_progress(progress)
-    job = _Job(function, batch, shared, _lanes(batch, count), _positive(chunk, "chunk"))
+    check_count("chunk", chunk)
+    job = _Job(function, batch, shared, _lanes(batch, count), int(chunk))
     if out is None:
         return _in_memory(job, progress, unit)
     folder = Path(out)
@@ -176,7 +178,8 @@ def _lanes(batch: Any, count: int | None) -> int:
     if callable(batch):
         if count is None:
             raise OsikValueError("batch is a function, so count has to say how many lanes there are")
-        return _positive(count, "count")
+        check_count("count", count)
+        return int(count)
     if count is not None:
         raise OsikValueError("count goes with a batch that is a function; of arrays it is their length")
     lengths = _lengths(batch)
@@ -184,12 +187,6 @@ def _lanes(batch: Any, count: int | None) -> int:
         found = ", ".join(str(n) for n in sorted(lengths)) or "nothing is given"
         raise OsikValueError(f"a batch is arrays with the lanes in front, of one length, at least 1; lengths: {found}")
     return lengths.pop()
-
-
-def _positive(value: Any, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise OsikValueError(f"{name} is {value!r}; it is a number of lanes, at least 1")
-    return int(value)
 
 
 def _agreed(chunks: int, finished: set[int]) -> list[int]:

@@ -21,7 +21,8 @@ from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
 from ..robot._tree import KinematicTree
-from ..robot.loading._equalities import KINDS, constraint_ends, constraint_names, is_in_tree
+from ..robot.loading._equalities import KINDS, constraint_ends, is_in_tree
+from ..robot.loading._mjmodel import element_names
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_weight
@@ -183,7 +184,7 @@ def _column(tree: KinematicTree, joint: str, dtype: Any) -> Float[Array, " nvful
 def _selected(robot: Robot, names: Iterable[str] | None) -> list[int]:
     """Return the indices of the selected constraints of the model, in its order."""
     model = robot.mj_model
-    available = constraint_names(model)
+    available = element_names(model, "equality")
     if names is None:
         active = np.flatnonzero(model.eq_active0)
         found = [int(e) for e in active if int(model.eq_type[e]) in KINDS and not is_in_tree(model, int(e))]
@@ -216,7 +217,7 @@ def _check_kind(robot: Robot, e: int, name: str) -> None:
 
 def _structure(robot: Robot, e: int) -> Constraint:
     model = robot.mj_model
-    name, kind = constraint_names(model)[e], KINDS[int(model.eq_type[e])]
+    name, kind = element_names(model, "equality")[e], KINDS[int(model.eq_type[e])]
     if kind != "joint":
         return Constraint(name, kind, constraint_ends(model, robot.frame_names, e).frames)
     joints = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
 from ..batching._structure import Static, put_together, taken_apart
+from ..numerics._arguments import check_count
 from ..scaling._sharded import moved
 from ..solvers import Status
 from ._loop import Loop
@@ -216,6 +217,5 @@ def chunk_size(chunk: int | None, count: int, mesh: Mesh | None = None) -> int:
     count = -(-count // mesh.size) if mesh is not None else count
     if chunk is None:
         return min(count, 64) if jax.default_backend() == "cpu" else count
-    if isinstance(chunk, bool) or not isinstance(chunk, int) or chunk < 1:
-        raise OsikValueError(f"chunk is {chunk!r}; it is how many scenarios run at a time")
+    check_count("chunk", chunk)
     return min(chunk, count)

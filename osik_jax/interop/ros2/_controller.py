@@ -172,15 +172,16 @@ class Controller:
             except Refused as reason:
                 count = memory.refused[0] + 1
                 memory = dataclasses.replace(memory, refused=(count, item.time_ns, str(reason)))
-        if (now_ns - memory.measured_ns > self.settings.state_timeout * 1e9).any():
-            return self._without_states(memory, now_ns)
+        late = now_ns - memory.measured_ns > self.settings.state_timeout * 1e9
+        if late.any():
+            return self._without_states(memory, now_ns, late)
         if memory.phase != "moving":
             memory = self._begun(memory)
         behind = np.abs(np.asarray(memory.q)[self.joints.index] - memory.measured)
         if behind.max() > self.settings.following_error:
             memory = dataclasses.replace(memory, velocity=np.zeros(self.robot.nv))
-            late = self.joints.names[int(behind.argmax())]
-            return memory, self._output(memory, now_ns, WARN, f"joint {late} does not follow: the command waits")
+            name = self.joints.names[int(behind.argmax())]
+            return memory, self._output(memory, now_ns, WARN, f"joint {name} does not follow: the command waits")
         memory, status = self._moved(memory, now_ns)
         level, text = (OK, "moving") if status == Status.SOLVED else (WARN, f"the step is {Status(status).name}")
         return memory, self._output(memory, now_ns, level, text)
@@ -222,8 +223,7 @@ class Controller:
         position, rotation = (np.asarray(part) for part in memory.poses[frame_id])
         return position + rotation @ pose[0], rotation @ pose[1]
 
-    def _without_states(self, memory: Memory, now_ns: int) -> tuple[Memory, Output]:
-        late = now_ns - memory.measured_ns > self.settings.state_timeout * 1e9
+    def _without_states(self, memory: Memory, now_ns: int, late: np.ndarray) -> tuple[Memory, Output]:
         names = ", ".join(name for name, is_late in zip(self.joints.names, late, strict=True) if is_late)
         if memory.phase == "waiting":
             return memory, self._output(memory, now_ns, WARN, f"waiting for states of {names}")

@@ -1,11 +1,9 @@
 """Readers of files and MuJoCo models, which return a ``RobotModel``. Host code, run once per robot."""
 
-from ._descriptions import described as described
 from ._descriptions import urdf_of_description as urdf_of_description
 from ._embedded import EXAMPLES as EXAMPLES
 from ._embedded import NAMES as NAMES
 from ._embedded import ROBOTS as ROBOTS
-from ._embedded import embedded as embedded
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjmodel import from_mjmodel as from_mjmodel
 from ._named import ELSEWHERE as ELSEWHERE

@@ -31,11 +31,6 @@ class Ends(NamedTuple):
     relative: np.ndarray
 
 
-def constraint_names(model: mujoco.MjModel) -> tuple[str, ...]:
-    """Return the names of all equality constraints; one without a name is called by its number."""
-    return element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
-
-
 def is_in_tree(model: mujoco.MjModel, e: int) -> bool:
     """Return whether the robot's coupled joints contain the constraint: active, on joints, of degree at most 1."""
     if int(model.eq_type[e]) != mujoco.mjtEq.mjEQ_JOINT or not model.eq_active0[e]:
@@ -46,7 +41,7 @@ def is_in_tree(model: mujoco.MjModel, e: int) -> bool:
 def constraint_ends(model: mujoco.MjModel, frame_names: Sequence[str], e: int) -> Ends:
     """Return the ends of a connect or weld; ``frame_names`` are the robot's frames."""
     ids = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]
-    bodies = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    bodies = element_names(model, "body")
     if model.eq_objtype[e] != mujoco.mjtObj.mjOBJ_SITE:
         anchors = model.eq_data[e, :6].reshape(2, 3)
         weld = int(model.eq_type[e]) == mujoco.mjtEq.mjEQ_WELD  # whose anchors are in the other order

@@ -43,7 +43,7 @@ def _model(source: Source, floating_base: bool | None) -> tuple[mujoco.MjModel, 
 
 
 def _free_joints(model: mujoco.MjModel) -> list[str]:
-    names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
+    names = element_names(model, "joint")
     free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     return [name for name, is_free in zip(names, free, strict=True) if is_free]
 
@@ -130,7 +130,7 @@ def _delete_references(spec: mujoco.MjSpec, geoms: set[str]) -> None:
 def _add_base(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Put a free joint on the one body of the world that carries joints, and its pose into the keyframes."""
     owners = {int(model.body_rootid[b]) for b in model.jnt_bodyid}
-    names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    names = element_names(model, "body")
     if len(owners) != 1:
         raise OsikValueError(
             "floating_base=True needs one root body with joints below it; "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -89,14 +89,14 @@ def from_mjmodel(
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
-    names = element_names(model, mujoco.mjtObj.mjOBJ_JOINT, "joint", model.njnt)
-    body_names = element_names(model, mujoco.mjtObj.mjOBJ_BODY, "body", model.nbody)
+    names = element_names(model, "joint")
+    body_names = element_names(model, "body")
     _check(model, names, body_names)
     asked = asked_locks(model, names, {**dict.fromkeys(fixed), **as_mapping(options.locked_joints)})
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
-    geom_names = element_names(model, mujoco.mjtObj.mjOBJ_GEOM, "geom", model.ngeom)
+    geom_names = element_names(model, "geom")
     mesh_places = [_mesh_place(placement[body_names.index(named.mesh.link)], named.mesh) for named in meshes]
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
@@ -148,10 +148,11 @@ def from_mjmodel(
     return RobotModel(tree=tree, holder=holder, **{k: _float_array(v) for k, v in arrays.items()})
 
 
-def element_names(model: mujoco.MjModel, kind: mujoco.mjtObj, prefix: str, count: int) -> tuple[str, ...]:
-    """Return the names of a model's bodies, joints or geoms; one without a name is called by its kind and number."""
-    given = [mujoco.mj_id2name(model, kind, k) for k in range(count)]
-    return tuple(name or free_name(f"{prefix}{k}", given) for k, name in enumerate(given))
+def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "geom", "equality"]) -> tuple[str, ...]:
+    """Return the names of a model's elements; one without a name is called by its kind and number."""
+    count = dict(body=model.nbody, joint=model.njnt, geom=model.ngeom, equality=model.neq)[kind]
+    given = [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) for k in range(count)]
+    return tuple(name or free_name(f"{kind}{k}", given) for k, name in enumerate(given))
 
 
 def free_name(name: str, taken: Collection[str]) -> str:
@@ -163,7 +164,7 @@ def free_name(name: str, taken: Collection[str]) -> str:
 
 def equality_end_sites(model: mujoco.MjModel) -> set[int]:
     """Return the sites that ``to_mjcf`` added as ends of constraints; they are no frames of the robot."""
-    names = element_names(model, mujoco.mjtObj.mjOBJ_EQUALITY, "equality", model.neq)
+    names = element_names(model, "equality")
     found: set[int] = set()
     for e in np.flatnonzero(model.eq_objtype == int(mujoco.mjtObj.mjOBJ_SITE)):
         ends = {int(model.eq_obj1id[e]), int(model.eq_obj2id[e])}

@@ -403,3 +403,12 @@ def _check_mimics(joints: Mapping[str, Joint]) -> None:
             raise OsikValueError(f"joint {joint.name!r} mimics what is not there: {missing}")
         if leader.kind not in SCALAR:
             raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
+        _check_chain(joint, joints)
+
+
+def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
+    chain = [joint.name]
+    while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
+        if mimic.leader in chain:
+            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
+        chain.append(mimic.leader)

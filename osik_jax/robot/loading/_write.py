@@ -15,12 +15,13 @@ from ..._errors import OsikValueError
 from .._describe import model_name
 from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree
-from ._equalities import KINDS, Ends, constraint_ends, constraint_names, is_in_tree
+from ._equalities import KINDS, Ends, constraint_ends, is_in_tree
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
     EQUALITY_END_PREFIX,
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
+    element_names,
     free_name,
     quaternion,
     rotation_matrix,
@@ -312,7 +313,7 @@ def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:
 def _add_constraints(robot: RobotModel, bodies: list[ElementTree.Element], element: ElementTree.Element) -> None:
     """Constraints that are not in the tree: closed loops, and joints coupled by polynomials."""
     model, tree = robot.mj_model, robot.tree
-    names = constraint_names(model)
+    names = element_names(model, "equality")
     for e in (e for e in range(model.neq) if int(model.eq_type[e]) in KINDS and not is_in_tree(model, e)):
         kind = KINDS[int(model.eq_type[e])]
         places: dict[str, str | ArrayLike] = {}
