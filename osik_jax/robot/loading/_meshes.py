@@ -17,7 +17,6 @@ from ._mjmodel import rotation_matrix
 from ._packages import Packages
 
 SUFFIXES = (".dae", ".stl", ".obj", ".msh")
-_TEXT_STL = b"facet"
 
 
 def read_mesh(path: Path) -> list[Triangles]:
@@ -76,7 +75,7 @@ def _is_text(path: Path) -> bool:
     """Return whether an STL file is text; binary files may start with the word "solid" too."""
     with path.open("rb") as file:
         start = file.read(512)
-    return start.lstrip().startswith(b"solid") and _TEXT_STL in start
+    return start.lstrip().startswith(b"solid") and b"facet" in start
 
 
 def _text_stl(path: Path) -> Triangles:

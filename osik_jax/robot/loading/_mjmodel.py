@@ -309,12 +309,8 @@ def _rates(
     model: mujoco.MjModel, names: tuple[str, ...], prefix: str, what: str, given: Mapping[str, float]
 ) -> np.ndarray:
     """Return greatest speed or acceleration of each joint: from the model's custom numerics, then from ``given``."""
-    numerics = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_NUMERIC, n) for n in range(model.nnumeric)]
-    own = {
-        numeric.removeprefix(prefix): float(model.numeric_data[model.numeric_adr[n]])
-        for n, numeric in enumerate(numerics)
-        if numeric.startswith(prefix)
-    }
+    numerics = [model.numeric(n) for n in range(model.nnumeric)]
+    own = {one.name.removeprefix(prefix): float(one.data[0]) for one in numerics if one.name.startswith(prefix)}
     out = np.full(len(names), np.inf)
     for pattern, value in (*own.items(), *given.items()):
         for joint in match_joints(pattern, names):
