@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.retargeting import HumanMotion, Profile, Retargeter
+from osik_jax.retargeting import HumanMotion, Profile, Retargeter, guess_profile
 from osik_jax.retargeting._person import palm_axes
 from osik_jax.robot.loading import example_urdf
 from osik_jax.runtime import configure_cpu
@@ -139,7 +139,7 @@ def main() -> None:
     robot = osik.Robot.from_urdf(file, floating_base=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", osik.OsikWarning)
-        profile = dataclasses.replace(Profile.guess(robot), scale=SCALE)
+        profile = dataclasses.replace(guess_profile(robot), scale=SCALE)
     own, tips = Retargeter(robot, profile=profile), Fingertips(urdf, profile)
     rows: dict[str, list[tuple[np.ndarray, float, float]]] = {"osik-jax": []}
     for motion in grasps():

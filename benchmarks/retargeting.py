@@ -28,7 +28,17 @@ import numpy as np
 
 from osik_jax import Robot, load_robot
 from osik_jax.execution._workers import cores
-from osik_jax.retargeting import HumanMotion, LiveRetargeter, Profile, Retargeted, Retargeter, load_motion
+from osik_jax.retargeting import (
+    HumanMotion,
+    LiveRetargeter,
+    Profile,
+    Retargeted,
+    Retargeter,
+    guess_profile,
+    load_motion,
+    load_profile,
+    report,
+)
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live import LiveFrame
 from osik_jax.retargeting._live_command import replay
@@ -54,7 +64,7 @@ _DIGITS = {"slip [mm]": 2, "frames beyond ranges [%]": 0, "jump frames": 0, "acc
 
 def own_figures(result: Retargeted) -> dict[str, Any]:
     """``report``'s figures, under a judge's names."""
-    own = result.report()
+    own = report(result)
     joints, feet, tracking = own["joints"], own["feet"], own["tracking"]
     return {
         "slip": {"move_mm_max": feet["slip_mm_max"]},
@@ -225,7 +235,7 @@ def smoothed(
     for motion in motions:
         for smoothness in smoothnesses:
             result = Retargeter(robot, profile=profile, smoothness=smoothness).retarget(motion)
-            joints = result.report()["joints"]
+            joints = report(result)["joints"]
             more = [f"{joints['acceleration_rms']:.1f}", f"{joints['jerk_rms']:.0f}", str(result.iterations)]
             print(row(f"{motion.name}, {smoothness:g} s", judge(result), None, more), flush=True)
 
@@ -262,8 +272,8 @@ def main() -> None:
     jax.config.update("jax_enable_x64", not options.single)
     by_name = options.robot in NAMES
     robot = load_robot(options.robot) if by_name else Robot.from_urdf(Path(options.robot), floating_base=True)
-    made = {"guess": Profile.guess, "bundled": lambda _: None}
-    profile = made.get(options.profile, lambda _: Profile.load(options.profile))(robot)
+    made = {"guess": guess_profile, "bundled": lambda _: None}
+    profile = made.get(options.profile, lambda _: load_profile(options.profile))(robot)
     judge = Judge(*options.judge) if options.judge else own_figures
     peers = json.loads(Path(options.peer).read_text(encoding="utf-8")) if options.peer else {}
     motions = [load_motion(path) for path in options.clips]

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import retargeting, viewer
+from osik_jax.retargeting import report
 
 jax.config.update("jax_enable_x64", True)
 HALF = np.array([0.15, 0.17, 0.12])  # of the box [m]
@@ -43,7 +44,7 @@ def lifting(frames=75, fps=30.0):
 
 robot, motion = osik.load_robot("g1"), lifting()
 result = retargeting.retarget(robot, motion)
-figures, box = result.report(), result.objects["box"]  # figures are recomputed by MuJoCo
+figures, box = report(result), result.objects["box"]  # figures are recomputed by MuJoCo
 print(f"wrists are {figures['touches']['off_mm_max']:.2f} mm at most off their place on the box")
 print(f"feet slip by {figures['feet']['slip_mm_max']:.3f} mm at most; notes: {figures['notes'] or 'none'}")
 

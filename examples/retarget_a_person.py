@@ -5,6 +5,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax import retargeting, viewer
+from osik_jax.retargeting import report
 
 jax.config.update("jax_enable_x64", True)
 
@@ -31,7 +32,7 @@ def person(frames=61, fps=30.0):
 
 nao = osik.load_robot("nao")
 result = retargeting.retarget(nao, person())
-figures = result.report()  # recomputed by MuJoCo from the configurations alone
+figures = report(result)  # recomputed by MuJoCo from the configurations alone
 print(f"{len(result.q)} frames")
 print(f"limbs are turned by {figures['tracking']['segment_angle_deg_mean']:.1f} degrees from the person's, on average")
 print(f"feet slip by {figures['feet']['slip_mm_max']:.4f} mm at most")

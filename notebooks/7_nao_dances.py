@@ -33,6 +33,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax import retargeting
+from osik_jax.retargeting import report
 from osik_jax.viewer import hero_picture
 
 osik.runtime.configure_cpu()  # small problems, one after another
@@ -118,7 +119,7 @@ print(f"{motion.name}: {motion.frames} frames, {len(motion.joint_names)} joints"
 # %%
 nao = osik.load_robot("nao")
 result = retargeting.retarget(nao, motion)
-figures = result.report()  # recomputed by MuJoCo
+figures = report(result)  # recomputed by MuJoCo
 joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
 print(f"limbs are {tracking['segment_angle_deg_mean']:.1f} degrees off the person's on average")
 print(f"standing feet move {feet['slip_mm_max']:.3f} mm at most")
@@ -226,7 +227,7 @@ plt.show()
 # %%
 quick = replace(motion, name="quick", fps=3.0 * FPS).resampled(FPS)
 hurried = retargeting.retarget(nao, quick)
-hasty = hurried.report()
+hasty = report(hurried)
 print(f"{'':24}{'as danced':>12}{'3 x faster':>12}")
 for name, part, key in (
     ("limbs off [deg]", "tracking", "segment_angle_deg_mean"),

@@ -317,9 +317,9 @@ def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
 
 
 def _profile(file: str | None) -> Profile | None:
-    from ..retargeting import Profile
+    from ..retargeting import load_profile
 
-    return None if file is None else Profile.load(file)
+    return None if file is None else load_profile(file)
 
 
 def _page(command: Retarget) -> dict[str, Any]:

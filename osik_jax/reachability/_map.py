@@ -73,9 +73,10 @@ class ReachabilityMap:
         Raises:
             ValueError: ``at`` is no point.
         """
-        from ._picture import draw_slices
+        from ._picture import Field, draw_slices
 
-        return draw_slices(self, at)
+        field = Field(self.axes, self.share, self.beyond_reach, self.links)
+        return draw_slices(field, self.frame, len(self.rotations), at)
 
 
 def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:

@@ -13,6 +13,8 @@ from ._fit import Fit, fit
 from ._load import Reader, clips_in
 from ._page import write_report
 from ._profile import Profile
+from ._profile_file import save_profile
+from ._report import report
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ def fit_to_file(
     held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]
     learned = [motion for motion in motions if all(motion is not other for other in held_out)]
     found = fit(robot, learned, held_out=held_out, profile=profile, mapping=mapping, acceleration=acceleration)
-    found.profile.save(file)
+    save_profile(found.profile, file)
     return found, len(learned), len(held_out)
 
 
@@ -60,9 +62,9 @@ def write_folder(
     result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False, look: Look | None = None
 ) -> dict[str, Any]:
     """Write motion (.npz and .csv), report, profile and optionally GIF and page (with ``look``); return the report."""
-    figures = {"clip": name, **result.report()}
+    figures = {"clip": name, **report(result)}
     write_motion(result, figures, out, page, look)
-    result.profile.save(out / "profile.toml")
+    save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
     return figures

@@ -23,7 +23,8 @@ from ._lanes import Clip, one_a_core, shared_length
 from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
-from ._profile_file import find_profile, profile_text
+from ._profile_file import find_profile, profile_text, save_profile
+from ._report import report
 from ._retarget import Retargeter, Source
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def retarget_folder(
     job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
     with only_job(out):
         _claim(out, job)
-        retargeter.profile.save(out / "profile.toml")
+        save_profile(retargeter.profile, out / "profile.toml")
         sources = {name: _source(path, job) for name, path in files.items()}
         work = _Work(retargeter, out, sources, chunk, page, look)
         with reported(len(files), len(work.found), progress, "clips") as advance:
@@ -173,7 +174,7 @@ class _Work:
             except ValueError as error:
                 self.failed[name] = _reason(error)
                 continue
-            self.found[name] = {"clip": name, **self._sources[name], **result.report()}
+            self.found[name] = {"clip": name, **self._sources[name], **report(result)}
             (self._out / name).mkdir(exist_ok=True)
             write_motion(result, self.found[name], self._out / name, *self._page)
         return len(clips)

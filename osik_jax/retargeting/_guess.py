@@ -48,7 +48,24 @@ _ROOM = 6e-3
 
 
 def guess_profile(robot: Robot) -> Profile:
-    """Return the profile of a robot with limbs of a person, as ``Profile.guess`` says."""
+    """Return the profile of a robot with limbs of a person, as its tree and its home configuration show it.
+
+    Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as the bodies that reach farthest to the
+    sides. A knee or elbow is the joint that bends its limb far from both ends. A wrist is the last joint that moves
+    the whole hand; if that is the elbow, the wrist is a fixed hand frame, or the far end of the link's mesh or
+    mass. Soles are corner frames (``NAME_corner_0`` and so on), boxes or spheres of the feet; a foot without them
+    gets a length after its leg, or is a point where no joint moves it beside the shank. Check the profile, and save
+    it with ``save_profile`` to edit it.
+
+    A robot may lack legs or arms, and its arms may end at the elbow. With a fixed base its limbs follow the
+    person's beside the trunk. A free base stands on two feet, on four, or on wheels (bodies called ``wheel`` or
+    ``caster``). On four feet, legs follow those of a person or an animal on all fours; where there are arms too,
+    these follow and the feet stay where they are. An ``OsikWarning`` says what is found where that is not two legs
+    and two arms (``describe_profile``). A hand with a fixed base has fingers instead of limbs.
+
+    Raises:
+        ValueError: neither two legs nor two arms are found, or a free base has neither feet nor wheels.
+    """
     tree = robot.tree
     hand = guess_hand(robot)
     if hand is not None:
@@ -89,7 +106,7 @@ def guess_profile(robot: Robot) -> Profile:
 
 
 def describe_profile(robot: Robot, profile: Profile) -> str:
-    """Return the text of ``Profile.describe``."""
+    """Say in words what of a person the robot's profile has, what it lacks, and which joints follow nothing."""
     tree, parts = robot.tree, _fingers_found(profile) if profile.is_hand else _limbs_found(profile)
     if not robot.floating_base:
         parts.append("the base is fixed")

@@ -106,7 +106,7 @@ class LiveRetargeter(OnRobot):
     the motion is as close to that of ``Retargeter`` as the look-ahead allows.
 
     Args:
-        robot: with limbs of a person, see ``Profile.guess``; z up at home.
+        robot: with limbs of a person, see ``guess_profile``; z up at home.
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         mapping: role to joint name of the stream. None: by common names.

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Collection, Mapping
-from pathlib import Path
 
 from .._errors import OsikValueError, unknown_name
-from ..robot import Robot
 from ._goals import Weights
 from ._roles import FINGER_REACHES, FINGERS, HAND, LIMBS, NEEDED, REACHES, STANDING
 
@@ -114,54 +111,6 @@ class Profile:
             raise OsikValueError(f"scale is {self.scale}; it is robot over person, more than 0")
         if not self.stretch > 0.0:
             raise OsikValueError(f"stretch is {self.stretch}; it has to be more than 0")
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Profile:
-        """Read a profile from a TOML file, or a bundled one: ``"nao"``, ``"g1"``, ``"talos"``.
-
-        Raises:
-            FileNotFoundError: no such file.
-            ValueError: the file is broken; the message says what is wrong.
-        """
-        from ._profile_file import load_profile  # reads into this class
-
-        return load_profile(path)
-
-    @classmethod
-    def guess(cls, robot: Robot) -> Profile:
-        """Return the profile of a robot with limbs of a person, as its tree and its home configuration show it.
-
-        Feet are found by name (``foot``, ``sole``, ``ankle``, ``toe``), arms as the bodies that reach farthest to the
-        sides. A knee or elbow is the joint that bends its limb far from both ends. A wrist is the last joint that moves
-        the whole hand; if that is the elbow, the wrist is a fixed hand frame, or the far end of the link's mesh or
-        mass. Soles are corner frames (``NAME_corner_0`` and so on), boxes or spheres of the feet; a foot without them
-        gets a length after its leg, or is a point where no joint moves it beside the shank. Check the profile, and save
-        it with ``save`` to edit it.
-
-        A robot may lack legs or arms, and its arms may end at the elbow. With a fixed base its limbs follow the
-        person's beside the trunk. A free base stands on two feet, on four, or on wheels (bodies called ``wheel`` or
-        ``caster``). On four feet, legs follow those of a person or an animal on all fours; where there are arms too,
-        these follow and the feet stay where they are. An ``OsikWarning`` says what is found where that is not two legs
-        and two arms (``describe``). A hand with a fixed base has fingers instead of limbs.
-
-        Raises:
-            ValueError: neither two legs nor two arms are found, or a free base has neither feet nor wheels.
-        """
-        from ._guess import guess_profile  # makes this class
-
-        return guess_profile(robot)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the profile as a TOML file for ``load``."""
-        from ._profile_file import profile_text
-
-        Path(path).write_text(profile_text(self), encoding="utf-8")
-
-    def describe(self, robot: Robot) -> str:
-        """Say in words what of a person the robot's profile has, what it lacks, and which joints follow nothing."""
-        from ._guess import describe_profile
-
-        return describe_profile(robot, self)
 
     @property
     def reached(self) -> tuple[Limb, ...]:

@@ -23,7 +23,12 @@ BUNDLED = ("nao", "g1", "talos")
 
 
 def load_profile(path: str | os.PathLike[str]) -> Profile:
-    """Return the profile of a TOML file or a bundled one, as ``Profile.load`` does."""
+    """Read a profile from a TOML file, or a bundled one: ``"nao"``, ``"g1"``, ``"talos"``.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: the file is broken; the message says what is wrong.
+    """
     if str(path) in BUNDLED:
         text = (resources.files("osik_jax") / "retargeting" / "profiles" / f"{path}.toml").read_text(encoding="utf-8")
         return _parsed(text, f"{path}.toml")
@@ -32,11 +37,16 @@ def load_profile(path: str | os.PathLike[str]) -> Profile:
     return _parsed(Path(path).read_text(encoding="utf-8"), str(path))
 
 
+def save_profile(profile: Profile, path: str | os.PathLike[str]) -> None:
+    """Write a profile as a TOML file for ``load_profile``."""
+    Path(path).write_text(profile_text(profile), encoding="utf-8")
+
+
 def find_profile(robot: Robot) -> Profile:
     """Return the bundled profile whose frames a robot all has, else a guess.
 
     Raises:
-        ValueError: as in ``Profile.guess``.
+        ValueError: as in ``guess_profile``.
     """
     for name in BUNDLED:
         profile = load_profile(name)

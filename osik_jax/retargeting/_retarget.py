@@ -51,7 +51,7 @@ class Retargeter(OnRobot):
     """Retargeter for any number of clips to one robot; data that does not depend on the clip is computed once.
 
     Args:
-        robot: robot with limbs of a person (``Profile.guess``), z up at home.
+        robot: robot with limbs of a person (``guess_profile``), z up at home.
         profile: the robot's profile. None: a bundled one (NAO, G1, Talos) or a guess.
         acceleration: acceleration limit of all joints, or by joint name or glob [rad/s^2 or m/s^2].
         smoothness: time below which motion is smoothed out [s]: its fourth power is added to the weight of
@@ -278,7 +278,7 @@ def retarget(
     remaining distance.
 
     Args:
-        robot: robot with limbs of a person (``Profile.guess``), z up at home.
+        robot: robot with limbs of a person (``guess_profile``), z up at home.
         motion: clip of a person, or of another robot (``SourceMotion``).
         mapping: role to joint name of the clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.

@@ -77,22 +77,6 @@ class Retargeted:
             **objects,
         )
 
-    def report(self) -> dict[str, Any]:
-        """Return the motion's figures, recomputed by MuJoCo; lengths in mm, angles in rad except ``segment_angle_deg``.
-
-        ``joints``: largest excess beyond ranges and speed limits, accelerations and jerks (``rms``: root mean square
-        over joints and frames), and frames with a speed jump over 15 rad/s. ``feet``: distance of contact points from
-        their landing place (``slip``), their height (``float``), and depth of soles below the floor. ``balance``: in
-        double support, the share of frames with the centre of mass over the support polygon, and its least distance
-        inside the edge (negative outside). ``shapes``: depth of overlaps between the profile's capsules. ``tracking``:
-        keypoint errors per limb, at the scale that fits each limb best, and the angle between the person's segments and
-        the robot's. ``touches``: distance of joints from their place on what they hold. ``notes``: sentences on
-        violated bounds and on clips whose feet stand in less than 20 % of the frames.
-        """
-        from ._report import figures_of  # takes this class
-
-        return figures_of(self)
-
 
 def as_retargeted(
     robot: Robot, profile: Profile, person: Person, q: Float[np.ndarray, "F nq"], off_plan: Float[np.ndarray, " F"]

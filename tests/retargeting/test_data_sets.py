@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 from small_robots import quietly, robot_of
 
 import osik_jax as osik
-from osik_jax.retargeting import HumanMotion, Retargeter, load_motion
+from osik_jax.retargeting import HumanMotion, Retargeter, load_motion, report
 from osik_jax.retargeting._path import with_path
 from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._skeletons import find_roles
@@ -240,7 +240,7 @@ def test_poses_about_the_hips_walk(tmp_path, kind):
     retargeter = quietly(Retargeter, robot_of("legs", "arms"))
     with pytest.warns(osik.OsikWarning, match="webcam has the hips at the origin in all frames; its path is inferred"):
         result = retargeter.retarget(motion)
-    figures, points = result.report(), {name: result.human[:, k] for k, name in enumerate(result.human_names)}
+    figures, points = report(result), {name: result.human[:, k] for k, name in enumerate(result.human_names)}
     middle = turned_back(0.5 * (own.track("left_hip") + own.track("right_hip")))
     off = points["root"] - middle
     np.testing.assert_allclose(off - off[:1], 0.0, atol=0.015)

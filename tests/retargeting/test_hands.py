@@ -10,7 +10,17 @@ from scipy.spatial.transform import Rotation
 from small_robots import quietly
 
 import osik_jax as osik
-from osik_jax.retargeting import HumanMotion, Profile, Retargeter, SourceMotion
+from osik_jax.retargeting import (
+    HumanMotion,
+    Profile,
+    Retargeter,
+    SourceMotion,
+    describe_profile,
+    guess_profile,
+    load_profile,
+    report,
+    save_profile,
+)
 from osik_jax.retargeting._person import palm_axes
 from osik_jax.retargeting._roles import FINGERS, HAND
 from osik_jax.retargeting._skeletons import find_roles
@@ -56,7 +66,7 @@ def hand():
 
 @pytest.fixture(scope="module")
 def profile(hand):
-    return quietly(Profile.guess, hand)
+    return quietly(guess_profile, hand)
 
 
 def placed(robot, profile, qpos):
@@ -120,7 +130,7 @@ def off(robot, profile, result, motion, factor):
 def test_fingertips_are_those_of_a_smaller_hand_that_is_carried(hand, profile, tmp_path):
     clip, points = grasping(hand, profile)
     result = Retargeter(hand, profile=profile).retarget(clip)
-    figures = result.report()
+    figures = report(result)
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["speed_over_limit_max"] <= 1.0 + 1e-6
     assert set(figures["tracking"]["limb_error_mm"]) == set(FOUR)
     own = placed(hand, profile, result.motion.qpos)
@@ -129,8 +139,8 @@ def test_fingertips_are_those_of_a_smaller_hand_that_is_carried(hand, profile, t
     # a given scale is that of all fingers
     closer = dataclasses.replace(profile, scale=0.97 / SMALLER)
     assert off(hand, profile, Retargeter(hand, profile=closer).retarget(clip), clip, 0.97 / SMALLER)[0].mean() < 1e-3
-    profile.save(tmp_path / "hand.toml")
-    assert Profile.load(tmp_path / "hand.toml") == profile
+    save_profile(profile, tmp_path / "hand.toml")
+    assert load_profile(tmp_path / "hand.toml") == profile
 
 
 def test_a_hand_follows_a_hand(hand, profile):
@@ -159,15 +169,15 @@ WRIST = '<joint name="WRJ2" axis="0 1 0" range="-30 10"/><joint name="WRJ1" axis
 def test_fingers_are_found_and_reach_what_a_search_reaches(names, options, axes):
     robot = hand_of(names, **options)
     assert robot.nv == axes
-    profile = quietly(Profile.guess, robot)
+    profile = quietly(guess_profile, robot)
     for finger, name in names.items():
         assert profile.keypoints[f"{finger}_4"] == (f"{name}_tip", (0.0, 0.0, 0.0))
         assert profile.keypoints[f"{finger}_1"][0].startswith(name)
-    assert ("no little" in profile.describe(robot)) == ("little" not in names)
+    assert ("no little" in describe_profile(robot, profile)) == ("little" not in names)
     motion, factor = person((0.8, 0.9, 0.5)), 1.05
     profile = dataclasses.replace(profile, scale=factor)
     result = Retargeter(robot, profile=profile).retarget(motion)
-    figures = result.report()
+    figures = report(result)
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
     errors, goals = off(robot, profile, result, motion, factor)
     low, high = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
@@ -194,7 +204,7 @@ def test_what_is_no_hand():
     for name in ("ur5", "nao"):
         robot = osik.load_robot(name)
         try:
-            assert not quietly(Profile.guess, robot).is_hand
+            assert not quietly(guess_profile, robot).is_hand
         except ValueError:
             assert name == "ur5"
     with pytest.raises(ValueError, match="a hand has a keypoint wrist"):

@@ -10,7 +10,7 @@ from motion_files import dancer, sliding, write_bvh
 
 import osik_jax as osik
 from osik_jax.cli._retarget import Retarget
-from osik_jax.retargeting import Profile, Retargeter
+from osik_jax.retargeting import Retargeter, load_profile, report
 from osik_jax.retargeting._command import write_folder
 from osik_jax.viewer.live._playback import read_motion
 
@@ -74,11 +74,11 @@ def test_what_gave_way_is_told(tmp_path: Path) -> None:
     """A person whose feet are said to stand and move far apart: the page names the bound."""
     robot = osik.load_robot("nao")
     result = Retargeter(robot, max_iterations=2).retarget(sliding(FRAMES, 0.45))
-    notes = result.report()["notes"]
+    notes = report(result)["notes"]
     write_folder(result, "slides", tmp_path, animation=False, page=True)
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert notes and all(f"<li>{note}" in page for note in notes)
-    assert Profile.load(tmp_path / "profile.toml") == Profile.load("nao")
+    assert load_profile(tmp_path / "profile.toml") == load_profile("nao")
 
 
 def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -24,13 +24,16 @@ from osik_jax.kinematics import forward_kinematics
 from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
-    Profile,
     Retargeter,
     RobotMotion,
     _plan,
     fit,
+    guess_profile,
     load_motion,
+    load_profile,
+    report,
     retarget,
+    save_profile,
 )
 from osik_jax.retargeting._balance import overhang
 from osik_jax.retargeting._banded import BandedSystem, has_kernel, solve_banded
@@ -156,7 +159,7 @@ def test_rows_of_a_frame_have_the_derivatives_of_their_residuals(nao, dance):
 
 @pytest.mark.slow
 def test_nao_dances_with_its_feet_where_they_are(nao, danced):
-    figures = danced.report()
+    figures = report(danced)
     assert figures["feet"]["contact_share"] == 1.0
     assert figures["feet"]["slip_mm_max"] < 0.01
     assert figures["feet"]["float_mm_max"] < 0.01 and figures["feet"]["below_floor_mm_max"] < 0.01
@@ -218,10 +221,10 @@ def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, lea
             margins[-1].append(-edge_distance(data.subtree_com[0, :2], corners[:, :2]))
     without, within = map(min, margins)
     assert without < -0.01 and within > 0.01 - 5e-5
-    figures = kept.report()
+    figures = report(kept)
     assert figures["balance"]["double_support_frames"] == 30 and figures["balance"]["com_inside_share"] == 1.0
     assert figures["balance"]["com_margin_mm_min"] == pytest.approx(1e3 * within, abs=1e-6)
-    assert free.report()["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
+    assert report(free)["balance"]["com_inside_share"] == pytest.approx(np.mean(np.array(margins[0]) >= 0.0))
     assert figures["feet"]["slip_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
     assert figures["joints"]["jump_frames"] == 0 and figures["joints"]["beyond_range_max"] == 0.0
     # on one foot it is where it was
@@ -247,7 +250,7 @@ def test_limits_hold_exactly(nao, dance, danced):
     assert (q <= np.asarray(nao.position_upper)[dofs] + 1e-12).all()
     # met by leading: the plan keeps them by itself, and the feet stay
     assert tight.off_plan.max() < 1e-3
-    assert tight.report()["feet"]["slip_mm_max"] < 0.5
+    assert report(tight)["feet"]["slip_mm_max"] < 0.5
 
 
 def test_many_clips_give_what_each_gives_alone(nao, dance, danced, tmp_path):
@@ -311,7 +314,7 @@ def test_more_smoothness_is_less_acceleration_and_feet_stay(nao, dance, danced, 
     low, high, fast = (np.asarray(x)[dofs] for x in (nao.position_lower, nao.position_upper, nao.velocity_limit))
     for smoothness in (0.0, 0.03, 0.1):
         result = Retargeter(nao, smoothness=smoothness).retarget(noisy)
-        q, figures = result.motion.qpos[:, own], result.report()
+        q, figures = result.motion.qpos[:, own], report(result)
         speed, acceleration, jerk = (np.diff(q, n, axis=0) * FPS**n for n in (1, 2, 3))
         mean_squares.append([np.mean(acceleration**2), np.mean(jerk**2)])
         assert figures["feet"]["slip_mm_max"] < 0.1
@@ -381,7 +384,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
 
 def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danced, tmp_path, capsys):
     """A hand that holds what moves by 18 m cannot follow it."""
-    assert danced.report()["notes"] == []
+    assert report(danced)["notes"] == []
     motion, many = load_motion(dance), tmp_path / "clips"
     box = np.linspace([-9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], [9.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0], motion.frames)
     held: Any = {"object.box": box, "touch.left_wrist.box": np.ones(motion.frames, bool)}
@@ -395,8 +398,8 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     assert max(figures["feet"]["slip_mm_max"], figures["touches"]["off_mm_max"]) > 5.0
     assert last == f"note: {figures['notes'][-1]}" and last.startswith("note: a bound gave way: ")
     rare = dataclasses.replace(danced, contact=danced.contact & (np.arange(30) < 5)[:, None])
-    assert rare.report()["notes"][0].startswith("feet stand in 17 % of the frames")
-    whole = danced.report()
+    assert report(rare)["notes"][0].startswith("feet stand in 17 % of the frames")
+    whole = report(danced)
     tipped = {**whole, "balance": {"com_margin_mm_min": -3.0}, "shapes": {"penetration_mm_max": 2.5}}
     assert notes(tipped) == ["a bound gave way: shapes overlap by 2.5 mm"]
     assert notes(tipped, 0.01)[1] == "a bound gave way: the centre of mass is 3.0 mm outside the feet"
@@ -452,7 +455,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     motion = RobotMotion.load(out / "motion.npz")
     table = RobotMotion.load(out / "motion.csv", joint_names=motion.joint_names, fps=motion.fps)
     np.testing.assert_allclose(table.qpos, motion.qpos, atol=1e-8)
-    assert Profile.load(out / "profile.toml").keypoints == Profile.load("nao").keypoints
+    assert load_profile(out / "profile.toml").keypoints == load_profile("nao").keypoints
 
 
 def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
@@ -554,7 +557,7 @@ def test_a_robot_may_face_any_way_at_home(nao, degrees):
     q[:3] = turn.apply(q[:3])
     q[3:7] = (turn * Rotation.from_quat(q[3:7], scalar_first=True)).as_quat(scalar_first=True)
     turned = nao.with_home(q)
-    assert Profile.guess(turned).keypoints == Profile.guess(nao).keypoints
+    assert guess_profile(turned).keypoints == guess_profile(nao).keypoints
     ours, own = Retargeter(turned), Retargeter(nao)
     assert own.robot is nao
     np.testing.assert_allclose(ours.robot.q0[:3], nao.q0[:3], atol=1e-12)
@@ -572,7 +575,7 @@ def test_the_left_of_two_is_told_by_name():
 
 def test_feet_stay_where_limbs_pull_at_them(nao):
     """The legs of a person whose standing feet move apart pull for 90 frames; a step's slip adds up over all frames."""
-    figures = Retargeter(nao).retarget(sliding(90, 0.1)).report()
+    figures = report(Retargeter(nao).retarget(sliding(90, 0.1)))
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.01
     assert figures["tracking"]["segment_angle_deg_mean"] > 1.0  # so that they pull
 
@@ -601,7 +604,7 @@ def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(nao, 
 
 
 def test_a_guess_sees_the_same_robot(nao):
-    guess, own = Profile.guess(nao), Profile.load("nao")
+    guess, own = guess_profile(nao), load_profile("nao")
     assert find_profile(nao) == own
     same = {role for role in NEEDED if guess.keypoints[role][0] == own.keypoints[role][0]}
     assert same == set(NEEDED) - {"left_hip", "right_hip"}
@@ -613,7 +616,7 @@ def test_a_guess_sees_the_same_robot(nao):
 
 def test_a_g1_is_guessed_from_its_urdf():
     g1 = osik.Robot.from_urdf(example_urdf("g1"), floating_base=True)
-    guess, own = Profile.guess(g1), Profile.load("g1")
+    guess, own = guess_profile(g1), load_profile("g1")
     assert find_profile(g1) == own
     for side in ("left", "right"):
         # the URDF's balls of 5 mm at these places, 30 mm below the ankle
@@ -636,12 +639,12 @@ def test_a_g1_is_guessed_from_its_urdf():
 )
 def test_a_wrist_is_not_what_grips(urdf, wrist):
     robot = osik.Robot.from_urdf(example_urdf("g1").parents[2] / urdf, floating_base=True)
-    assert Profile.guess(robot).keypoints["left_wrist"][0] == wrist
+    assert guess_profile(robot).keypoints["left_wrist"][0] == wrist
 
 
 def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
     path = example_urdf("talos")
-    talos, own = osik.Robot.from_urdf(path, floating_base=True), Profile.load("talos")
+    talos, own = osik.Robot.from_urdf(path, floating_base=True), load_profile("talos")
     assert find_profile(talos) == own
     boxes = ElementTree.parse(path.with_name("talos_full_v2_box.urdf")).getroot()
     for side in SIDES:
@@ -650,7 +653,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
         corners = np.array([*own.feet[side].heel, *own.feet[side].toe])
         signs = np.array([[-1, 1, 0], [-1, -1, 0], [1, 1, 0], [1, -1, 0]])
         np.testing.assert_allclose(corners, 0.5 * signs * [length, width, 0.0])
-    made, guessed = (Build.of(talos, profile).points for profile in (own, Profile.guess(talos)))
+    made, guessed = (Build.of(talos, profile).points for profile in (own, guess_profile(talos)))
     for role in NEEDED:
         np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))  # what a fit may move it by
 
@@ -658,7 +661,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
 @pytest.mark.release
 def test_talos_dances_with_its_feet_where_they_are(dance):
     talos = osik.Robot.from_urdf(example_urdf("talos"), floating_base=True)
-    figures = retarget(talos, load_motion(dance)).report()
+    figures = report(retarget(talos, load_motion(dance)))
     assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.05
     assert figures["feet"]["float_mm_max"] < 0.05 and figures["feet"]["below_floor_mm_max"] < 0.05
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["speed_over_limit_max"] <= 1.0 + 1e-9
@@ -695,7 +698,7 @@ def test_guessed_capsules_cover_the_meshes_of_limbs(name):
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         turn = data.geom_xmat[geom].reshape(3, 3)
         vertices.append(model.mesh_vert[first : first + count] @ turn.T + data.geom_xpos[geom])
-    outside = np.maximum(outside_capsules(plain, Profile.guess(plain).capsules, np.concatenate(vertices)), 0.0)
+    outside = np.maximum(outside_capsules(plain, guess_profile(plain).capsules, np.concatenate(vertices)), 0.0)
     assert 1e3 * outside.mean() < {"g1": 0.3, "talos": 3.0}[name]
 
 
@@ -704,7 +707,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
     """The vertices of a G1's hands as they look; the hand is fixed to a wrist that is too light for a capsule."""
     path = example_urdf("g1")
     g1 = osik.Robot.from_urdf(path, floating_base=True)
-    profile, places = Profile.guess(g1), home_kinematics(g1)
+    profile, places = guess_profile(g1), home_kinematics(g1)
     for side in SIDES:
         raw = (path.parents[1] / f"meshes/{side}_{part}.STL").read_bytes()
         faces = np.frombuffer(raw[84:], np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]))
@@ -718,7 +721,7 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
 def test_links_without_a_size_get_no_capsule():
     path = example_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)
-    capsules = {capsule.frame: capsule.radius for capsule in Profile.guess(icub).capsules}
+    capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
 
 
@@ -736,7 +739,7 @@ def test_links_are_no_longer_than_between_their_joints(urdf, link, ends):
     places = home_kinematics(robot)
     first, last = (np.asarray(places.frame_pose(robot, frame)[0]) for frame in ends)
     along = (last - first) / np.linalg.norm(last - first)
-    capsules = [capsule for capsule in Profile.guess(robot).capsules if capsule.frame == link]
+    capsules = [capsule for capsule in guess_profile(robot).capsules if capsule.frame == link]
     position, rotation = (np.asarray(x) for x in places.frame_pose(robot, link))
     for c in capsules:
         at = (position + np.array([c.start, c.end]) @ rotation.T - first) @ along
@@ -754,7 +757,7 @@ def test_links_that_are_too_light_for_their_size_are_made_smaller():
 
 
 def test_limbs_that_are_straight_at_home_begin_bent(nao):
-    profile = Profile.load("nao")
+    profile = load_profile("nao")
     np.testing.assert_array_equal(Build.of(nao, profile).start, nao.q0)  # nothing is at an end of its range
     elbows = {side: nao.joint_qpos_index(f"{side}ElbowRoll") for side in "LR"}
     straight = np.array(nao.q0)
@@ -776,7 +779,7 @@ def test_robots_that_cannot_walk_are_refused():
     with pytest.raises(ValueError, match="floating_base=True"):
         Retargeter(arm)
     with pytest.raises(ValueError, match="bolted down"):
-        Profile.guess(arm)
+        guess_profile(arm)
 
 
 @pytest.mark.slow
@@ -803,9 +806,9 @@ def test_products_are_in_full_precision(nao, dance):
 
 
 def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
-    profile = dataclasses.replace(Profile.load("g1"), scale=0.8, stretch=1.1)
-    profile.save(tmp_path / "robot.toml")
-    assert Profile.load(tmp_path / "robot.toml") == profile
+    profile = dataclasses.replace(load_profile("g1"), scale=0.8, stretch=1.1)
+    save_profile(profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == profile
     with pytest.raises(KeyError, match="no frame 'pelvis'"):
         Retargeter(nao, profile=profile)
     text = (tmp_path / "robot.toml").read_text()
@@ -822,7 +825,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         assert old in text
         (tmp_path / "broken.toml").write_text(text.replace(old, new))
         with pytest.raises(ValueError, match=message):
-            Profile.load(tmp_path / "broken.toml")
+            load_profile(tmp_path / "broken.toml")
 
 
 def test_a_fit_needs_clips_and_steps(nao, dance):
@@ -846,7 +849,7 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
 @pytest.mark.release
 def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
     """By central differences, over plans that go on from the same one; what the gradient leaves out is small here."""
-    own = Profile.load("nao")
+    own = load_profile("nao")
     own = dataclasses.replace(own, weights=dataclasses.replace(own.weights, smooth=2.0))
     setting = _Setting(Retargeter(nao, profile=own), LOSS)
     (problem,), _ = setting.problems([load_motion(dance)], [], None)
@@ -863,7 +866,7 @@ def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
 @pytest.mark.release
 def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(nao, dance, tmp_path, capsys):
     """From a profile that smooths too much; the file is what the command writes."""
-    start = Profile.load("nao")
+    start = load_profile("nao")
     start = dataclasses.replace(start, weights=dataclasses.replace(start.weights, smooth=2.0))
     motion = load_motion(dance)
     assert motion.rotations is not None
@@ -874,5 +877,5 @@ def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(na
     assert found.losses[found.step] < 0.95
     assert found.held_out[found.step] == found.held_out.min() < 0.95
     assert float(found.profile.weights.smooth) < 2.0
-    found.profile.save(tmp_path / "robot.toml")
-    assert Profile.load(tmp_path / "robot.toml") == found.profile
+    save_profile(found.profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == found.profile

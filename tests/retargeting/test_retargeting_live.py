@@ -15,7 +15,7 @@ from small_robots import nao_soles
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.retargeting import LiveRetargeter, load_motion, retarget
+from osik_jax.retargeting import LiveRetargeter, load_motion, report, retarget
 from osik_jax.retargeting._live import LiveStatus
 from osik_jax.retargeting._live_command import replay, stream
 from osik_jax.retargeting._stance import Stance, hold_feet
@@ -61,7 +61,7 @@ def test_the_centre_of_mass_stays_over_the_feet_frame_by_frame(nao, motion):
     margins = []
     for balance in (None, 0.01):
         make = partial(LiveRetargeter, nao, look_ahead=LOOK_AHEAD / FPS, balance=balance, budget=1.0)
-        margins.append(replay(make, bent_forward(motion), paced=False)[0].report()["balance"]["com_margin_mm_min"])
+        margins.append(report(replay(make, bent_forward(motion), paced=False)[0])["balance"]["com_margin_mm_min"])
     assert margins[0] < -5.0 and margins[1] > 10.0 - 0.5
 
 
@@ -73,7 +73,7 @@ def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     assert {frame.status for frame in frames} == {LiveStatus.FOLLOWED}
     apart = np.degrees(np.abs(joints_of(nao, frames) - joints_of(nao, [Frame(q) for q in whole.q])))
     assert apart.mean() < 1.0
-    figures, best = result.report(), whole.report()
+    figures, best = report(result), report(whole)
     assert figures["feet"]["slip_mm_max"] < 0.1
     assert figures["feet"]["float_mm_max"] < 0.1 and figures["feet"]["below_floor_mm_max"] < 0.1
     assert figures["tracking"]["segment_angle_deg_mean"] < best["tracking"]["segment_angle_deg_mean"] + 0.5

@@ -9,7 +9,7 @@ from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.retargeting import Profile, Retargeter, RobotMotion, SourceMotion, load_motion
+from osik_jax.retargeting import Profile, Retargeter, RobotMotion, SourceMotion, load_motion, report
 from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._load import Reader
 from osik_jax.retargeting._roles import HAND, LIMBS, NEEDED
@@ -39,7 +39,7 @@ def test_a_robot_that_follows_itself_does_the_same(nao, danced):
     names = [nao.joint_qpos_index(name) for name in nao.joint_names]
     assert np.degrees(np.abs(again.q - first.q)[:, names]).mean() < 0.5
     assert np.abs(again.q - first.q)[:, :3].max() < 2e-3
-    figures = again.report()
+    figures = report(again)
     assert figures["tracking"]["segment_angle_deg_mean"] < 0.2
     assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
 
@@ -51,7 +51,7 @@ def test_a_motion_goes_to_another_robot_and_comes_back(nao, danced):
     there = Retargeter(g1).retarget(SourceMotion.load(file, nao))
     back = retargeter.retarget(SourceMotion(g1, dataclasses.replace(there.motion, contact=there.contact)))
     for result in (there, back):
-        figures = result.report()
+        figures = report(result)
         np.testing.assert_array_equal(result.contact, first.contact)
         assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
         assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
@@ -69,7 +69,7 @@ def test_robots_of_other_builds_lead_a_g1(tmp_path):
         danced = first.retarget(dance)
         source = SourceMotion(robot, dataclasses.replace(danced.motion, contact=danced.contact), first.profile)
         led = g1.retarget(source)
-        figures, joints = led.report(), led.report()["joints"]
+        figures, joints = report(led), report(led)["joints"]
         np.testing.assert_array_equal(led.contact, danced.contact)
         assert joints["beyond_range_max"] == 0.0 and joints["speed_over_limit_max"] <= 1.0 + 1e-6
         assert figures["feet"]["slip_mm_max"] < 0.1 and figures["feet"]["float_mm_max"] < 0.1
@@ -89,7 +89,7 @@ def test_limbs_that_a_source_lacks_are_left_out(tmp_path):
     source = SourceMotion(short.robot, danced.motion, short.profile, "short")
     with pytest.warns(osik.OsikWarning, match="no left_wrist, right_wrist; .*left arm to the elbow"):
         led = whole.retarget(source)
-    figures = led.report()
+    figures = report(led)
     assert set(whole.profile.followed) - set(led.profile.followed) == {LIMBS[5], LIMBS[7]}
     assert figures["tracking"]["segment_angle_deg_mean"] < 1.0 and figures["feet"]["slip_mm_max"] < 0.1
     elbows = [whole.robot.joint_qpos_index(f"{side}_elbow") for side in ("left", "right")]

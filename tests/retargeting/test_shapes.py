@@ -17,11 +17,15 @@ import osik_jax as osik
 from osik_jax.retargeting import (
     HumanMotion,
     LiveRetargeter,
-    Profile,
     Retargeter,
     RobotMotion,
     SourceMotion,
+    describe_profile,
+    guess_profile,
     load_motion,
+    load_profile,
+    report,
+    save_profile,
 )
 from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
@@ -35,7 +39,7 @@ def motion(tmp_path_factory):
 
 def judged(result):
     """The report; what has to hold of every robot is asserted."""
-    figures = result.report()
+    figures = report(result)
     joints = figures["joints"]
     assert joints["beyond_range_max"] == 0.0 and joints["speed_over_limit_max"] <= 1.0 + 1e-6
     assert joints["jump_frames"] == 0 and figures["shapes"]["penetration_mm_max"] < 1.0
@@ -47,7 +51,7 @@ def test_arms_on_a_fixed_base_follow_beside_the_trunk(motion, tmp_path):
     """Wherever the person goes and however the trunk is turned, the arms are the same; the robot faces y."""
     robot = robot_of("arms", free=False, turn=90.0)
     retargeter = quietly(Retargeter, robot)
-    assert "the base is fixed" in retargeter.profile.describe(robot) and not retargeter.profile.feet
+    assert "the base is fixed" in describe_profile(robot, retargeter.profile) and not retargeter.profile.feet
     result = retargeter.retarget(motion)
     assert judged(result)["tracking"]["segment_angle_deg_mean"] < 1.0
     turns = Rotation.from_euler("zy", np.linspace([0, 0], [80, 30], motion.frames), degrees=True).as_matrix()
@@ -152,8 +156,8 @@ def test_four_feet_follow_a_dog(tmp_path):
     assert result.q[-1, 0] - result.q[0, 0] == pytest.approx(scale * 0.4 * (clip.frames - 1) / FPS, rel=0.05)
     assert figures["feet"]["slip_mm_max"] < 0.5
     # and the profile comes back from its file
-    profile.save(tmp_path / "robot.toml")
-    assert Profile.load(tmp_path / "robot.toml") == profile
+    save_profile(profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == profile
 
 
 @pytest.mark.release
@@ -218,12 +222,12 @@ def test_a_stream_drives_a_fixed_base(motion):
 
 
 def test_profiles_of_other_shapes_say_what_is_wrong():
-    profile = quietly(Profile.guess, on_four())
+    profile = quietly(guess_profile, on_four())
     robot = robot_of("legs", "arms")
     with pytest.raises(ValueError, match="nothing holds the robot's base"):
-        Retargeter(robot, profile=dataclasses.replace(quietly(Profile.guess, robot), feet={}))
+        Retargeter(robot, profile=dataclasses.replace(quietly(guess_profile, robot), feet={}))
     with pytest.raises(ValueError, match="it has no feet and no wheels"):
-        Profile.guess(robot_of("arms"))
+        guess_profile(robot_of("arms"))
     with pytest.raises(ValueError, match="no keypoints right_hip"):
         dataclasses.replace(profile, keypoints={r: p for r, p in profile.keypoints.items() if r != "right_hip"})
     with pytest.raises(KeyError, match="no keypoint 'tail'"):
@@ -232,7 +236,7 @@ def test_profiles_of_other_shapes_say_what_is_wrong():
         dataclasses.replace(profile, feet={name: foot for name, foot in profile.feet.items() if name != "right_front"})
     fixed = robot_of("arms", free=False)
     with pytest.raises(ValueError, match="balance is that of a robot on feet"):
-        Retargeter(fixed, profile=quietly(Profile.guess, fixed), balance=0.01)
+        Retargeter(fixed, profile=quietly(guess_profile, fixed), balance=0.01)
 
 
 @pytest.mark.release

@@ -11,7 +11,7 @@ from core_checks import needs_core
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.retargeting import HumanMotion, Retargeter, load_motion
+from osik_jax.retargeting import HumanMotion, Retargeter, load_motion, report
 from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
 
 FRAMES = 30
@@ -80,8 +80,8 @@ def test_wrists_stay_where_they_hold_the_box(nao):
     assert slips[0] < 1e-3 < 4e-3 < slips[1]
     apart = np.linalg.norm(np.subtract(*wrists(result)), axis=-1)[held]
     assert np.abs(apart - scale * 0.32).max() < 2e-3
-    figures = result.report()
-    assert figures["touches"]["off_mm_max"] < 1.0 and loose.report()["touches"]["off_mm_max"] is None
+    figures = report(result)
+    assert figures["touches"]["off_mm_max"] < 1.0 and report(loose)["touches"]["off_mm_max"] is None
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
     assert figures["feet"]["slip_mm_max"] < 0.5 and not figures["notes"]
     # a batch with clips that hold something and clips that do not gives the same
@@ -95,7 +95,7 @@ def test_a_hand_holds_the_other(nao):
     motion = carrying()
     touch = ("left_wrist", "right_wrist", motion.touches[0][2])
     result = Retargeter(nao).retarget(dataclasses.replace(motion, objects={}, touches=(touch,)))
-    assert result.report()["touches"]["off_mm_max"] < 1.0
+    assert report(result)["touches"]["off_mm_max"] < 1.0
     (goal,) = result.touches
     left, right = wrists(result)
     np.testing.assert_allclose((left - right)[goal.held], goal.goal[goal.held], atol=1e-3)
@@ -105,7 +105,7 @@ def test_a_hand_holds_the_other(nao):
 def test_arms_on_a_fixed_base_hold_beside_the_trunk():
     robot = osik.load_robot("g1", floating_base=False)
     result = Retargeter(robot).retarget(carrying())
-    assert result.report()["touches"]["off_mm_max"] < 1.0
+    assert report(result)["touches"]["off_mm_max"] < 1.0
 
 
 @pytest.mark.release

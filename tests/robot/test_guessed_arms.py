@@ -7,7 +7,7 @@ from small_robots import LEG
 
 import osik_jax as osik
 from osik_jax.kinematics._home import home_kinematics
-from osik_jax.retargeting import Profile, load_motion, retarget
+from osik_jax.retargeting import guess_profile, load_motion, report, retarget
 
 UPPER, FOREARM = 0.3, 0.28
 ARM = """<body name="{s}_pitch" pos="0 {y} 0.4"><joint name="{s}_pitch" axis="0 1 0" range="-170 170"/>
@@ -67,7 +67,7 @@ def places(robot, profile, *roles):
 )
 def test_the_end_of_the_last_link_is_the_wrist_of_an_arm_without_one(left, right, yaw):
     robot = stick_robot(left[0], right[0], yaw=yaw)
-    profile = Profile.guess(robot)
+    profile = guess_profile(robot)
     for side, (_, length, tolerance) in (("left", left), ("right", right)):
         assert profile.keypoints[f"{side}_elbow"][0] == f"{side}_elbow"
         elbow, wrist = places(robot, profile, f"{side}_elbow", f"{side}_wrist")
@@ -90,7 +90,7 @@ def test_fingers_do_not_make_the_wrist_an_elbow():
       </body></body>"""
     gripper = """<body name="{s}_claw" pos="0.3 0 0"><joint name="{s}_gripper" axis="0 0 1" range="0 60"/>
       <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.01"/></body>"""
-    profile = Profile.guess(stick_robot(CAPSULE + wrist, CAPSULE + gripper))
+    profile = guess_profile(stick_robot(CAPSULE + wrist, CAPSULE + gripper))
     assert [profile.keypoints[f"left_{role}"][0] for role in ("elbow", "wrist")] == ["left_elbow", "left_palm"]
     assert [profile.keypoints[f"right_{role}"][0] for role in ("elbow", "wrist")] == ["right_elbow", "right_claw"]
 
@@ -98,7 +98,7 @@ def test_fingers_do_not_make_the_wrist_an_elbow():
 def test_arms_that_do_not_bend_end_at_the_elbow():
     robot = stick_robot('<geom size="0.02"/>', '<geom size="0.02"/>', yaw=False)
     with pytest.warns(osik.OsikWarning, match=r"left arm to the elbow \(no wrist\)"):
-        profile = Profile.guess(robot)
+        profile = guess_profile(robot)
     assert {role.split("_")[1] for role in profile.keypoints} == {"hip", "knee", "ankle", "shoulder", "elbow"}
     for side in ("left", "right"):
         shoulder, elbow = places(robot, profile, f"{side}_shoulder", f"{side}_elbow")
@@ -109,7 +109,7 @@ def test_arms_that_do_not_bend_end_at_the_elbow():
 def test_elbows_without_wrists_follow_the_person(tmp_path):
     motion = load_motion(write_bvh(tmp_path / "dance.bvh", dancer(20), 0.01))
     result = retarget(stick_robot(CAPSULE, CAPSULE), motion)
-    figures = result.report()
+    figures = report(result)
     assert figures["tracking"]["segment_angle_deg_mean"] < 2.0 and figures["feet"]["slip_mm_max"] < 0.1
 
 
@@ -124,7 +124,7 @@ def test_a_trunk_with_placeholder_inertia_is_as_large_as_its_shape(mass, moment,
     placeholder = f'<inertial pos="0 0 0.2" mass="{mass}" diaginertia="{moment} {moment} {moment}"/>'
     box = '<geom type="box" pos="0 0 0.2" size="0.06 0.1 0.2" mass="0"/>' if solid else ""
     robot = osik.Robot.from_mjcf(text[:start] + placeholder + box + text[end:])
-    trunk = [capsule for capsule in Profile.guess(robot).capsules if capsule.frame == "base"]
+    trunk = [capsule for capsule in guess_profile(robot).capsules if capsule.frame == "base"]
     assert trunk
     for capsule in trunk:
         ends = np.array([capsule.start, capsule.end])

@@ -17,7 +17,7 @@ from waiting import until
 
 import osik_jax as osik
 from osik_jax.cli._retarget import Retarget
-from osik_jax.viewer import export_html, serve_reach
+from osik_jax.viewer import export_html, serve, serve_reach
 from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._page import LiveView
@@ -63,7 +63,7 @@ def visit() -> Iterator[Visit]:
 def view() -> Iterator[LiveView]:
     polygon = osik.support_polygon(ROBOT, ROBOT.q0, FEET, margin=0.01)
     session = default_session(ROBOT, feet=FEET, polygon=polygon, source=RobotSource("nao"))
-    with session.serve(port=0) as view:
+    with serve(session, port=0) as view:
         assert view.loop.wait_until_ready(120.0)
         yield view
 

@@ -15,7 +15,7 @@ from ...robot import Robot
 from .._parts import robot_parts
 from ._default import default_session
 from ._export import write_page
-from ._page import LiveView
+from ._page import LiveView, serve
 from ._playback import Player, read_motion
 from ._reach import ReachView, check_map, serve_reach
 from ._session import load_session
@@ -34,7 +34,7 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
     q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
     session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
-    return session.serve(look=look, host=host, port=port)
+    return serve(session, look=look, host=host, port=port)
 
 
 def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> Player:
@@ -71,4 +71,4 @@ def open_session(path: Path, *, host: str, port: int) -> LiveView:
     """Open a page that resumes a saved session."""
     session = load_session(path)
     look = None if session.source is None else source_look(session.source)
-    return session.serve(look=look, host=host, port=port)
+    return serve(session, look=look, host=host, port=port)

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...control._checks import checked_limits
+from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
-from .._look import Look
+from .._look import Look, given_look
 from .._mujoco import mujoco_poses, robot_com
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -131,8 +131,8 @@ class LiveView(Served):
 
 
 def serve(
-    robot: Robot,
-    tasks: Mapping[str, Task],
+    robot: Robot | Session,
+    tasks: Mapping[str, Task] | None = None,
     *,
     scheme: Scheme | None = None,
     limits: Limits | None = None,
@@ -150,7 +150,7 @@ def serve(
     ``view.wait()`` keeps a program going until Ctrl-C.
 
     Args:
-        robot: the robot.
+        robot: the robot, or a session of ``load_session``, which has all but ``look`` and the page's address.
         tasks: by name. Frame tasks and centres of mass that have a target get a handle to drag.
         scheme: as in ``osik_jax.solve``.
         limits: as in ``osik_jax.solve``.
@@ -178,18 +178,25 @@ def serve(
         OSError: the port is in use.
         TypeError, ValueError: as in ``osik_jax.solve``.
     """
-    start = robot.q0 if q0 is None else q0
-    robot.check_configuration(start, "q0")
-    session = Session(
-        robot=robot,
-        tasks=dict(tasks),
-        scheme=scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme,
-        limits=checked_limits(robot, limits) or (),
-        dt=dt,
-        q=np.asarray(start),
-        source=RobotSource(source) if isinstance(source, str) else source,
-    )
-    return session.serve(look=look, host=host, port=port, open_browser=open_browser)
+    if isinstance(robot, Session):
+        session = robot
+    else:
+        tasks = {} if tasks is None else tasks
+        start = robot.q0 if q0 is None else q0
+        robot.check_configuration(start, "q0")
+        session = Session(
+            robot=robot,
+            tasks=dict(tasks),
+            scheme=scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme,
+            limits=checked_limits(robot, limits) or (),
+            dt=dt,
+            q=np.asarray(start),
+            source=RobotSource(source) if isinstance(source, str) else source,
+        )
+    check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
+    check_tasks(session.tasks, session.robot)
+    checked_limits(session.robot, session.limits)
+    return LiveView(session, look=given_look(look), host=host, port=port).opened(open_browser)
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:

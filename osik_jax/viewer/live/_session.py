@@ -7,25 +7,20 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
-from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
 from ...schemes import Scheme
 from ...tasks import Task
-from .._look import Look, given_look
 from ._description import describe, python, rebuild
 from ._source import RobotSource, load_source
 from ._step import Controller
-
-if TYPE_CHECKING:
-    from ._page import LiveView
 
 _FORMAT = "osik-jax session 1"
 
@@ -85,22 +80,6 @@ class Session:
         tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
         limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
         return Controller(tasks, self.scheme, [no_limits, *(limit for limit in limits if limit is not None)])
-
-    def serve(
-        self,
-        *,
-        look: str | Path | Look | None = None,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        open_browser: bool = False,
-    ) -> LiveView:
-        """Run and show the session; arguments, view and exceptions are those of ``osik_jax.viewer.serve``."""
-        from ._page import LiveView  # shows sessions
-
-        check_setting("serve(robot, tasks)", self.robot, self.scheme, self.dt)
-        check_tasks(self.tasks, self.robot)
-        checked_limits(self.robot, self.limits)
-        return LiveView(self, look=given_look(look), host=host, port=port).opened(open_browser)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the session to a file for ``load_session``.
