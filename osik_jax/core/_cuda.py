@@ -101,10 +101,10 @@ def call(
 
 
 def call_lanes(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
-    """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane.
+    """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane: a robot of the batch.
 
     Args:
-        method: name of its handler on a CPU without "osik_".
+        method: name of its CPU handler without the prefix "osik_".
         outputs: shape and type of each result, as for ``_library.call``; all are floats.
         inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers.
 
@@ -186,7 +186,7 @@ def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
 
 
 def problems_of_a_block(problems: int) -> int:
-    """Return the problems per block that bound the number of blocks: each block has workspace in global memory."""
+    """Return how many problems each block solves, so that the workspace of all blocks in global memory is bounded."""
     return -(-problems // _MOST_SPACES)
 
 

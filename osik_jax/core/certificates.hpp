@@ -1,4 +1,4 @@
-// Whether candidates are answers, by the data of their problems alone: the core's text of the certificates in
+// Checks whether candidates solve their problems, by the data of these alone. The C++ version of the certificates in
 // solvers/qp/_dispatch.py (_is_certified, _is_stationary, kkt_residual) and solvers/hqp/_cascade.py (certify_levels).
 #pragma once
 #include <vector>

@@ -2,7 +2,7 @@
 //
 // Rows of weight 0 are left out, which are most rows of bounds. The others are scaled by the roots of their weights and
 // have their residuals in column n, so that one product gives matrix and gradient. Standing points are tied to those of
-// the last frame, so a frame is finished when the points of the next frame are known.
+// the frame before, so the rows of a frame are complete when the points of the next frame are known.
 #pragma once
 #include "banded.hpp"
 #include "capsules.hpp"

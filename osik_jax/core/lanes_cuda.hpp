@@ -1,4 +1,4 @@
-// A call of kinematic_calls.hpp on a GPU: one thread for each lane.
+// A call of kinematic_calls.hpp on a GPU. A lane is one robot of the batch, and has one thread.
 //
 // The lanes are the fastest axis of every array that is not shared, so that the threads of a warp read neighbours. The
 // text that includes this file defines Real, the sizes, and SPACE (core/_cuda.py: call_lanes).

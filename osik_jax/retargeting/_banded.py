@@ -87,7 +87,7 @@ def _solve_on_gpu(system: BandedSystem, right: Float[Array, "B F n"]) -> Float[A
 
 @cache
 def kernel_source(n: int, m: int) -> str:
-    """Return the CUDA source of the kernel for blocks of n x n, of which neighbours are coupled by m rows."""
+    """Return the CUDA source of the kernel: diagonal blocks are n x n, those beside them have m rows that are not 0."""
     return _cuda.constants(N=n, M=m) + (_build.FOLDER / "banded.cu").read_text()
 
 

@@ -261,7 +261,7 @@ class Build:
         return tuple(out)
 
     def objects(self, person: Person) -> dict[str, Float[np.ndarray, "F 7"]]:
-        """Return the poses of a person's objects (``seen``) in the robot's world, scaled as its path."""
+        """Return poses of the person's objects in the robot's world; positions are scaled like the path of its base."""
         return {
             name: np.concatenate([self._in_world(person, poses[:, :3], self.scale(person)), poses[:, 3:]], -1)
             for name, poses in person.objects.items()

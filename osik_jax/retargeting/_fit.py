@@ -43,7 +43,7 @@ _SETTLING, _FOLLOWING = 150, 40
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Result of ``fit``, which says what the fields are."""
+    """Result of ``fit``, whose docstring describes the fields."""
 
     profile: Profile
     step: int

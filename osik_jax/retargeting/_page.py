@@ -125,7 +125,10 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
 
 
 def _lines(rows: Mapping[str, Any], color: str) -> str:
-    """Return a strip per row of flags (F,), coloured where it holds, under one mark of the present time."""
+    """Return HTML with a strip for each row of flags (F,), coloured in frames where the flag is true.
+
+    One mark across all strips shows the present time.
+    """
     out = []
     for name, flags in rows.items():
         bars = "".join(f'<rect x="{a}" width="{b - a}" height="1" fill="{color}"/>' for a, b in stretches(flags))

@@ -220,7 +220,7 @@ def read_person(
 
 
 def bone_length(points: Mapping[str, np.ndarray], limb: Limb) -> float:
-    """Return the median length of a reach [m]: between its ends, or along the bones of a finger."""
+    """Return the median over frames of a limb's length [m]: between its ends, or along the bones of a finger."""
     roles = [role for role in chain(limb) if role in points] if limb in FINGER_REACHES else limb
     bones = [np.linalg.norm(points[b] - points[a], axis=-1) for a, b in itertools.pairwise(roles)]
     return float(np.median(sum(bones)))

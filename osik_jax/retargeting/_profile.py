@@ -155,7 +155,7 @@ class Profile:
 
     @property
     def standing(self) -> tuple[str, ...]:
-        """Return the names of the contact points that the feet follow, such as heels and toes; none without feet."""
+        """Return the person's contact points that the robot's feet follow, such as heels and toes; () without feet."""
         return STANDING.get(tuple(sorted(self.feet)), ())
 
     @property

@@ -83,7 +83,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
-    """Return the figures of the feet; None without feet or with a fixed base, and no slip for wheels."""
+    """Return what ``report`` says of the feet: None without feet or with a fixed base; slip is None for wheels."""
     names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
     if not result.profile.feet or not result.robot.floating_base:
         return dict.fromkeys(names)

@@ -57,8 +57,8 @@ class Retargeter(OnRobot):
         smoothness: time below which motion is smoothed out [s]: its fourth power is added to the weight of
             accelerations, relative to 1 for limb directions. 0: the profile's weights only. Changes do not recompile.
         balance: margin of the centre of mass inside the support polygon in double support [m], at most a third of the
-            polygon's width; a bound of the plan. None: not bounded.
-        max_iterations: largest number of iterations of the plan.
+            polygon's width; a bound of the optimisation. None: not bounded.
+        max_iterations: most iterations of the optimisation over the whole clip.
 
     Raises:
         ValueError: no limbs are found, nothing holds a free base, or a number is out of range.
@@ -238,7 +238,7 @@ class Retargeter(OnRobot):
         return self._body_that(touching), self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
 
     def _made_by_a_core(self, checked: _Checked) -> Retargeted:
-        """Retarget one checked clip in one thread; other threads compute while this one holds the GIL."""
+        """Retarget one checked clip in one thread; compiled code needs no GIL, so threads take clips side by side."""
         clip = self._read(*checked)
         return self._made(clip, shared_length(clip))
 

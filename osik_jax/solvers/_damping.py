@@ -108,10 +108,10 @@ def level_damping(
     upper: Float[Array, " n"],
     above: HardRows | None = None,
 ) -> Float[Array, ""]:
-    """Return the damping of one level, ``constant + unmet ratio``; 0 if its gradient would be roundoff.
+    """Return the damping of one level, ``constant + unmet * ratio``; 0 if the ratio's gradient would be roundoff.
 
-    The ratio is the fixed point of ``ratio = min(|w(x)| / demand, 1)``, with x the damped step of this very damping,
-    found from 1 downwards.
+    ``unmet`` and ``demand`` are fields of ``damping``. The ratio is what the damped step leaves of the level's error,
+    over ``demand``, and at most 1. As the step depends on the damping, it is a fixed point, found from 1 downwards.
 
     Args:
         damping: of the level.

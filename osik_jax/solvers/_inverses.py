@@ -223,7 +223,10 @@ def regularised_space(
 
 @custom_jvp
 def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """Return the inverse D; K with D = K A': (A'A + damping I)^-1, or (A'A)^+ for a damping of 0; and S = D A."""
+    """Return the damped inverse D of A (Moore-Penrose for damping 0), K with D = K A', and S = D A.
+
+    K is (A'A + damping I)^-1, or (A'A)^+ for a damping of 0.
+    """
     # D = V diag(s / (s^2 + damping)) U'; K = V diag(1 / (s^2 + damping)) V', and 1 / damping outside the row space
     u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
     damped = damping > 0.0

@@ -20,10 +20,10 @@ from ._task import DEFAULT_GAIN, TaskRows
 class AxisAlignTask(PointingTask):
     """Task that aligns an axis of a frame with a direction, or keeps it in a cone around one.
 
-    With R the frame's rotation and x* the direction (world), ``d = R' x*``: a ``LookAtTask`` at a point infinitely far
-    away. Two rows [rad], of which the norm is the angle t between the two; with ``half_angle`` one inequality row,
-    ``t <= half_angle``: a cup that may tilt that much. The turn about the axis stays free. An axis that points the
-    opposite way is turned round about a fixed axis.
+    With R the frame's rotation and x* the direction (world), ``d = R' x*`` is the direction in the frame's axes. The
+    rows are those of a ``LookAtTask`` at a point infinitely far away: two [rad], whose norm is the angle t between the
+    axis and d. With ``half_angle`` there is one inequality row, ``t <= half_angle``: a cup that may tilt that much. The
+    turn about the axis stays free. An axis that points the opposite way is turned round about a fixed axis.
 
     Args:
         robot: the robot.

@@ -41,7 +41,7 @@ class ContactTask(PlaneTask):
 
     with a the frame's axis that stands on the plane and b one across it, in world axes. The last three are the sines of
     the tilts and of the turn about the normal, so angles have to stay below 90 degrees, as those of a contact do. Two
-    feet in contact and a robot of the right size make ``hard=True`` feasible; rows that contradict each other do not.
+    feet may be ``hard=True`` where the robot can keep both contacts at once; otherwise the status is INFEASIBLE.
 
     A contact holds motions, no forces: nothing keeps a real foot from lifting or slipping but a slow motion.
 
@@ -153,7 +153,7 @@ class ContactTask(PlaneTask):
     def _tilt(
         self, axis: Float[Array, "3"], turn: Float[Array, "3 3"], axes: Float[Array, "3 3"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
-        """Return the sines of the tilts (and of the spin if held), and their derivatives by the angular velocity."""
+        """Return the sines of the tilts (and of the spin if held), and their rates per unit angular velocity."""
         standing = dot(turn, axis)
         error, derivative = dot(axes[:2], standing), cross(standing, axes[:2])
         if self.anchor is None:

@@ -126,7 +126,7 @@ def fraction_to_damp(
 
 
 def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the bound for rows that are linear in the joints: 0."""
+    """Return 0: rows that are linear in the joints have no curvature, whatever their weighted pull."""
     return jnp.zeros((), pull.dtype)
 
 

@@ -101,7 +101,7 @@ class FunctionTask(Task):
 
     @property
     def function(self) -> Function:
-        """Return the function with its current numbers."""
+        """Return the user's function with the task's present numbers put back into it."""
         return put_together(self.numbers, self.structure)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:

@@ -87,7 +87,7 @@ class PointingTask(FramedTask):
 
     @property
     def bounded(self) -> bool:
-        """Return whether the task is a cone."""
+        """Return whether the task is an inequality, which keeps the axis in a cone."""
         return self.half_angle is not None
 
     def pointing_rows(

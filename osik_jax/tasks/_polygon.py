@@ -140,7 +140,7 @@ def hull(points: np.ndarray) -> Polygon | None:
 
 
 def _merge_collinear(vertices: np.ndarray) -> np.ndarray:
-    """Remove, one by one, the vertex nearest to the line through its neighbours while one is too near."""
+    """Remove vertices that lie almost on the line through their neighbours, the nearest first, until none is left."""
     while len(vertices) >= 3:
         before, after = np.roll(vertices, 1, 0), np.roll(vertices, -1, 0)
         chord, arm = after - before, vertices - before

@@ -34,7 +34,7 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
     Args:
         value: the pose.
         dtype: of the result.
-        rest: what a rotation alone has as its position, and a position alone as its rotation; None: it has to be given.
+        rest: position and rotation where the value has only the other part; None: the value has to have that part.
 
     Raises:
         TypeError: no numbers.

@@ -61,7 +61,7 @@ class Look:
 
 
 def given_look(look: str | Path | Look | None) -> Look | None:
-    """Return the look of a URDF that is given by its file or name, and other looks as they are."""
+    """Return the look that a URDF's file or name stands for; return a ``Look`` or None unchanged."""
     return read_look(look) if isinstance(look, str | os.PathLike) else look
 
 

@@ -29,7 +29,7 @@ def factor_active_rows(problem: LevelProblem, active: Int[Array, " h"], rank_tol
     Args:
         problem: the level.
         active: -1 at the lower bound, 1 at the upper, 0 inactive. (h,)
-        rank_tol: the part of a unit row outside the span of the others below which it is dependent.
+        rank_tol: a unit row is dependent if less than this of its length lies outside the span of the others.
     """
     n = len(problem.x)
     is_active = active != 0

@@ -109,7 +109,10 @@ def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances)
 
 
 def _rows_to_freeze(problem: LevelProblem, found: _Determined) -> Float[Array, "k n"]:
-    """Return these rows at unit length (own rows relative to the longest), so that one rank tolerance fits all."""
+    """Return the rows that lower levels must not change, so scaled that one rank tolerance fits all.
+
+    Hard rows have unit length; the level's own rows are divided by the length of the longest.
+    """
     level, n = problem.level, len(problem.x)
     rows = jnp.argsort(~found.frozen, stable=True)[:n]
     length = jnp.where(found.frozen, problem.length, 1.0)[rows]

@@ -95,7 +95,8 @@ def factor_least_squares(
 
     With P that null space's projector, C = A P the rows in the cost and ``C' = Q R`` by pivoted QR, the cost
     ``1/2 |slack + A d|^2 + 1/2 damping |x + d|^2`` over ``d = Q y - P x`` is a least-squares problem of the size of R:
-    ``[R'; sqrt(damping) I] y = [C x - slack; 0]``. Without damping ``d = Q y``: directions that no row moves stay.
+    ``[R'; sqrt(damping) I] y = [C x - slack; 0]``. Without damping ``d = Q y`` with
+    ``R' y = -slack``: the step has no part in directions that change no row.
 
     Args:
         problem: the level.

@@ -75,10 +75,10 @@ def _least_change(
     below: Sequence[tuple[Array, Damping]],
     rank_tol: Array | float,
 ) -> Float[Array, " n"]:
-    """Return the motion of a level that changes the rows of lower levels least, in their order of priority.
+    """Return the motion of a level that changes the rows of lower levels least, the higher of these first.
 
     Args:
-        change: the smallest one.
+        change: the level's motion of least norm, to which a motion in ``free`` is added.
         free: projector onto the null space of the level.
         below: rows and damping of the levels below, the lowest first.
         rank_tol: relative length under which a row counts as dependent.

@@ -154,7 +154,7 @@ def dual_basis(projector: Float[Array, "n n"], active: Int[Array, " n"]) -> Floa
 
 @dual_basis.defjvp
 def _dual_basis_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Any]) -> tuple[Array, Array]:
-    """Differentiate by Golub and Pereyra's formula (``solvers/_inverses.py``) for a matrix of full column rank."""
+    """Return ``dual_basis`` and its derivative, by Golub and Pereyra's formula (``solvers/_inverses.py``)."""
     projector, active = primals
     dual = dual_basis(projector, active)
     columns, moved = (jnp.where(active != 0, matrix, 0.0) for matrix in (projector, tangents[0]))

@@ -24,9 +24,9 @@ from ._problem import QP, active_bounds
 
 @cache
 def with_derivative(backend: Backend) -> Callable[[Array, Array, Array, QP], tuple[Array, Array]]:
-    """Return the function of x, y, the active set and the problem that returns x and y with their derivatives.
+    """Return a function of x, y, the active set and the problem that returns x and y with a derivative of their own.
 
-    These are the derivatives of the minimiser and of its row multipliers with respect to the problem's data. The KKT
+    Differentiated, it gives the derivatives of the minimiser and of its row multipliers by the problem's data. The KKT
     systems of the derivative are solved by ``backend``.
     """
 

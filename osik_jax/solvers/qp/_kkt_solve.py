@@ -140,9 +140,10 @@ def solve_kkt(
 def kkt_inverse(
     qp: QP, active: Int[Array, " n_and_p"]
 ) -> Callable[[Float[Array, " n_and_p"]], Float[Array, " n_and_p"]]:
-    """Return the map from r and -g to dx and dy of ``solve_kkt``; 0 for fixed variables and inactive rows.
+    """Return a function that solves the KKT system of ``solve_kkt``, from (r, -g) to (dx, dy).
 
-    One step of iterative refinement: its residuals use products with A, which lose fewer digits than A'WA.
+    Fixed variables and inactive rows get 0. It takes one step of iterative refinement, with residuals from A, which
+    lose fewer digits than those from A'WA.
     """
     factor = factorize(qp, qp.cost.hessian(), active)
     n = len(factor.free)

@@ -41,7 +41,7 @@ class QP(eqx.Module):
 
     @property
     def equality(self) -> Bool[Array, " n_and_p"]:
-        """Return which constraints are equalities: the known ones, and those with equal bounds, (n + p,)."""
+        """Return which constraints are equalities: those declared so, and those with equal bounds, (n + p,)."""
         equal = self.lower == self.upper
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 

@@ -169,7 +169,7 @@ class BatchView(Served):
         return drag
 
     def _retarget(self, name: str, lane: int, target: Any, *, together: bool, owner: int | None) -> None:
-        """Set one robot's target; move the other robots' targets by the same displacement and rotation."""
+        """Set the target of the robot in a lane; if ``together``, move those of the others by the same displacement."""
         own: Any = self._tasks[lane][name]
         new = jax.tree.map(np.asarray, own.replace(target=target).target)
         others: list[Any] = [tasks[name] for tasks in self._tasks]

@@ -76,7 +76,9 @@ def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
 
 
 def find_hands(robot: Robot) -> tuple[str, ...]:
-    """Return a frame of the left and of the right hand; without sides, a frame named like a hand, or the tip.
+    """Return one frame of the left and one of the right hand.
+
+    Where no names tell sides, return one frame that is named like a hand, else the tip of the robot.
 
     Of several frames of one kind, the one that most joints move.
     """

@@ -27,7 +27,7 @@ _FORMAT = "osik-jax session 1"
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """Controller of a live view with its switches.
+    """Tasks and limits of a live view, each of which can be switched off, with their robot and scheme.
 
     ``osik_jax.solve(session.robot, q, session.active_tasks, scheme=session.scheme, limits=session.active_limits,
     dt=session.dt)`` is a step of it.
@@ -35,7 +35,7 @@ class Session:
     Attributes:
         robot: the robot.
         tasks: all tasks by name, switched off or not.
-        scheme: how they share the robot.
+        scheme: how the tasks are combined: by weights or by priorities.
         limits: all limits, switched off or not: those given, then the robot's own that they do not replace.
         dt: time of a step [s].
         q: where the robot starts. (nq,)

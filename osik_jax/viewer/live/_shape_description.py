@@ -1,4 +1,4 @@
-"""Shapes and pairs of a ``CollisionAvoidanceLimit`` as plain data and as Python."""
+"""Shapes and pairs of a ``CollisionAvoidanceLimit`` as plain data, and as the text of a Python program."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def rebuild_shape(described: Mapping[str, Any]) -> CollisionShape:
 
 
 def shape_python(described: Mapping[str, Any]) -> str:
-    """Return the expression that makes a shape, up to rounding."""
+    """Return Python text that makes the described shape, with its numbers rounded."""
     position, turn, size = (np.asarray(described[k]) for k in ("position", "rotation", "size"))
     kind, frame = described["shape"], f"frame={described['frame']!r}"
     if kind == "box":

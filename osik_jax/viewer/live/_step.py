@@ -1,4 +1,4 @@
-"""Control step as one compiled program with replaceable numbers."""
+"""Control step, compiled once: targets, gains and weights are arguments, so new ones compile nothing."""
 
 from __future__ import annotations
 
