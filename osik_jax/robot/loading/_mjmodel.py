@@ -155,7 +155,7 @@ def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "geom", 
     return tuple(name or free_name(f"{kind}{k}", given) for k, name in enumerate(given))
 
 
-def free_name(name: str, taken: Collection[str]) -> str:
+def free_name(name: str, taken: Collection[str | None]) -> str:
     """Return the name, followed by as many underscores as make it differ from those taken."""
     while name in taken:
         name += "_"
