@@ -6,9 +6,10 @@
 //   pairs(n, f)          f(a, b) for all a <= b < n
 //   columns(a, b, f)     f(c) for packs of columns: c.load(row), c.store(row, pack)
 //   narrow_columns(a, b, f)  the same with smaller packs, for an f that works on several at once
-//   sum, count, most, best   reductions of f(i); every thread gets the result
+//   sum, count           of f(i); every thread gets the result, as of the next two
+//   most, best           the largest f(i); the largest f(i) with its index i
 //   dot, axpy, forward, backward, reflect   vector operations of the whole team
-//   scaled_copy, scaled_rows   a row, or rows, that get their padding
+//   scaled_copy, scaled_rows   copies of a row, or of rows, times factors, with zeros in the padding
 //   rows_times, weighted_gram, largest   products of all rows with a vector, and with each other; the largest product
 // The functions own_... are those of one thread, for use inside f.
 //
