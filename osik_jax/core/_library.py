@@ -48,7 +48,7 @@ def core() -> Core:
         return Core(None, None, "the core is switched off by OSIK_CORE_LIBRARY=none")
     if named:
         return Core(ctypes.CDLL(named), Path(named), f"the core is {named}, as OSIK_CORE_LIBRARY says")
-    reasons = []
+    reasons, remedy = [], _REMEDY
     for level in reversed(_build.levels()):  # the one that runs everywhere tells what the processor can do
         path = _build.library_path(level)
         try:
@@ -59,13 +59,13 @@ def core() -> Core:
         library.osik_sources.restype = ctypes.c_char_p
         if library.osik_sources().decode() != _build.fingerprint():
             reasons.append(f"{path.name} was built from other sources")
+            remedy = _REBUILD
             continue
         if level == "x86_64" and library.osik_has_x86_64_v3():
             fast = _build.library_path("x86_64_v3")
             if fast.exists():
                 return Core(ctypes.CDLL(str(fast)), fast, f"{fast.name}: this processor has AVX2 and FMA")
         return Core(library, path, f"{path.name}: the instruction set {level}")
-    remedy = _REBUILD if any("other sources" in reason for reason in reasons) else _REMEDY
     slower = "Methods run in plain JAX: the answers are the same, and come more slowly"
     return Core(None, None, f"no compiled core: {'; '.join(reasons)}. {slower}; {remedy}")
 

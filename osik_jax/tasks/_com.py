@@ -20,11 +20,12 @@ from ..kinematics import Kinematics, center_of_mass
 from ..kinematics._forward import body_masses, moving_center
 from ..kinematics._kernels import Call, center_arguments
 from ..robot import Robot
+from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority, equality_rows
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 
 class ComTask(Task):
@@ -169,28 +170,19 @@ class ComTask(Task):
         check_bounds(self.lower, self.upper)
 
 
-def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
-    """Return the fields of ``TaskRows`` for a task with a target; ``lower`` is used for both bounds."""
-    rows = task._plain_rows(robot, kinematics)
-    fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
-    return *fields, rows.squared_lengths()
+def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> Fields:
+    return fields_of(task._plain_rows(robot, kinematics))
 
 
-def _fields_by_kernel(call: Call, task: ComTask, robot: Robot, kinematics: Kinematics) -> tuple[Array, ...]:
-    """Return the fields of ``_fields`` for a batch of robots, computed by the core."""
+def _fields_by_kernel(call: Call, task: ComTask, robot: Robot, kinematics: Kinematics) -> Fields:
+    """Return the fields of the rows of a batch of robots, computed by the core."""
     assert task.target is not None and task.target_velocity is not None and not isinstance(task.gain, AdaptiveGain)
-    given, integers, lanes = center_arguments(robot, kinematics)
-    m, nv = len(task.axes), robot.tree.nv
+    given, integers, _ = center_arguments(robot, kinematics)
     weight = task.weight if task.weight.ndim == 2 else task.weight[:, None]
-    weight = jnp.broadcast_to(weight, (len(weight), m))
+    weight = jnp.broadcast_to(weight, (len(weight), len(task.axes)))
     numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
-    lanes = max(lanes, len(numbers))
     options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
-    shapes = (lanes, m), (lanes, m, nv), (lanes, m), (lanes,), (lanes, m), (lanes, nv), (lanes, m)
-    error, rows, wanted, curvature, pull, levers, squares = call(
-        "center_rows", [(shape, float) for shape in shapes], *given, options, numbers
-    )
-    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
+    return fields_by_core(call, "center_rows", robot.tree.nv, weight, *given, options, numbers)
 
 
 _by_kernel = by_kernel(_fields, _fields_by_kernel)

@@ -17,11 +17,12 @@ from ..kinematics import Kinematics
 from ..kinematics._forward import moving_frames
 from ..kinematics._kernels import Call, dof_columns
 from ..robot import Robot
+from ._core_rows import Fields, equality_rows, fields_by_core
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
-from ._pose import Fields, PoseTask, fields_of, goal_arguments, pose_fields, shapes_of
+from ._pose import PoseTask, goal_arguments, pose_fields
 from ._targets import PoseLike
-from ._task import DEFAULT_GAIN, TaskRows, equality_rows
+from ._task import DEFAULT_GAIN, TaskRows
 
 
 class FrameTask(PoseTask):
@@ -153,7 +154,7 @@ def _fields_by_kernel(call: Call, task: FrameTask, robot: Robot, kinematics: Kin
     place = dof_columns(tree)[1][None], robot.frame_position[:, frame], robot.frame_rotation[:, frame]
     integers = np.concatenate([[body], tree.moves[body], options]).astype(np.int32)
     given = *jax.tree.leaves(kinematics), side_by_side(*place, *goal), integers
-    return fields_of(call("frame_rows", shapes_of(task, tree.nv, given), *given), weight)
+    return fields_by_core(call, "frame_rows", tree.nv, weight, *given)
 
 
 _by_kernel = by_kernel(_fields, _fields_by_kernel)

@@ -17,13 +17,14 @@ from ..execution._backends import Backend
 from ..execution._computed import by_kernel, side_by_side
 from ..kinematics._kernels import Call
 from ..robot import Robot
+from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._targets import Pose, PoseLike, as_pose
-from ._task import TaskRows, check_priority, equality_rows
+from ._task import TaskRows, check_priority
 from ._twist import pose_log, seen_from
 
 _ROWS = {
@@ -216,21 +217,16 @@ class PoseTask(FramedTask):
         check_bounds(self.lower, self.upper)
 
 
-Fields = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
-
-
 def pose_fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:
     """Return the arguments of ``equality_rows`` for a pose task."""
-    rows = task._plain_rows(position, rotation, jacobian)
-    fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
-    return *fields, rows.squared_lengths()
+    return fields_of(task._plain_rows(position, rotation, jacobian))
 
 
 def _fields_by_kernel(call: Call, task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:
     """Return ``pose_fields`` for a batch of frames, computed by the core."""
     numbers, options, weight = goal_arguments(task)
     given = position, rotation, jacobian, side_by_side(*numbers), options
-    return fields_of(call("pose_rows", shapes_of(task, jacobian.shape[-1], given), *given), weight)
+    return fields_by_core(call, "pose_rows", jacobian.shape[-1], weight, *given)
 
 
 def goal_arguments(task: PoseTask) -> tuple[tuple[Array, ...], np.ndarray, Float[Array, "lanes m"]]:
@@ -240,20 +236,6 @@ def goal_arguments(task: PoseTask) -> tuple[tuple[Array, ...], np.ndarray, Float
     weight = jnp.concatenate([both[:, i, None] for i in np.flatnonzero(task.kept)], 1)
     options = np.array([*task.kept, task.axes == "frame", task.orientation_jacobian == "geometric"], np.int32)
     return (*task.target, task.target_velocity, weight, task.gain), options, weight
-
-
-def shapes_of(task: PoseTask, nv: int, given: tuple[Any, ...]) -> list[tuple[tuple[int, ...], Any]]:
-    """Return the shapes and types of the core's results for these arguments."""
-    count, lanes = sum(task.kept), max(len(a) for a in given if jnp.issubdtype(a.dtype, jnp.floating))
-    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (lanes, count)
-    return [(shape, float) for shape in shapes]
-
-
-def fields_of(results: list[Array], weight: Float[Array, "lanes m"]) -> Fields:
-    """Return the arguments of ``equality_rows`` from the core's results."""
-    error, rows, wanted, *rest = results
-    curvature, pull, levers, squares = rest
-    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
 
 
 _by_kernel = by_kernel(pose_fields, _fields_by_kernel)

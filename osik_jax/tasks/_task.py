@@ -215,21 +215,6 @@ def check_priority(priority: int) -> int:
     return int(priority)
 
 
-def equality_rows(
-    error: Array,
-    jacobian: Array,
-    wanted: Array,
-    weight: Array,
-    curvature: Array,
-    pull: Array,
-    levers: Array,
-    squares: Array,
-) -> TaskRows:
-    """Return the rows of an equality from their fields, as the compiled core computes them."""
-    fields = error, jacobian, wanted, wanted, weight, curvature, pull, levers
-    return TaskRows(*fields, is_equality=True, squares=squares)
-
-
 def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
     """Return ``rate (bound - value)``; an infinite bound stays infinite at rate 0, with gradients of 0."""
     free = jnp.isinf(bound)
