@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,17 @@ USER_ERRORS = (OSError, KeyError, ValueError, ImportError)
 
 class CommandError(Exception):
     """Something that the user can set right; told in one line."""
+
+
+def refuse(command: Any, wrong: bool, names: Sequence[str], place: str) -> None:
+    """Raise CommandError if options of these names are given (other than their defaults) where they are ``wrong``.
+
+    ``place``: what they go with.
+    """
+    defaults = {field.name: field.default for field in dataclasses.fields(command)}
+    given = [f"--{name.replace('_', '-')}" for name in names if getattr(command, name) != defaults[name]]
+    if wrong and given:
+        raise CommandError(f"{', '.join(given)} {'goes' if len(given) == 1 else 'go'} with {place}")
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .._errors import OsikValueError
-from ._messages import told
+from ._messages import refuse, told
 from ._robots import read_robot
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ _COLUMNS = {
     "off\n[deg]": "segment_angle_deg_mean",
 }
 _MOST_ROWS, _MOST_NOTES = 50, 10
+_LIVE = ("look_ahead", "iterations", "budget")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,6 +98,7 @@ class Retarget:
 
     def run(self) -> int:
         """Run the command; return the exit code."""
+        _check(self)
         if self.fit is not None:
             _fit(self, self.fit)
             return 0
@@ -123,6 +125,18 @@ class Retarget:
         return 0
 
 
+def _check(command: Retarget) -> None:
+    """Raise an error for options that have no meaning beside the others."""
+    stream = command.live and command.clip == "-"
+    refuse(command, command.live, ("fit", "source", "smooth"), "whole clips, not with --live")
+    refuse(command, command.fit is not None, ("source",), "motions, not with --fit, which takes clips of people")
+    refuse(command, command.fit is not None, ("fps", "smooth", "balance", "report"), "motions, not with --fit")
+    refuse(command, not command.live, _LIVE, "--live")
+    refuse(command, command.source is not None, ("unit", "up", "trim", "mapping"), "a person's clip, not with --source")
+    refuse(command, command.source is None, ("source_fps", "source_profile"), "--source")
+    refuse(command, stream, ("fps", "unit", "up", "trim", "report"), "a file, not with -")
+
+
 def _reader(command: Retarget) -> Reader:
     """Return the function that reads a clip as the command says."""
     from ..retargeting._load import Reader
@@ -143,10 +157,6 @@ def _fit(command: Retarget, file: Path) -> None:
     from ..retargeting._command import fit_to_file
 
     with told():
-        if command.source is not None:
-            raise OsikValueError("--fit takes clips of people, not --source")
-        if command.live:
-            raise OsikValueError("--fit goes with whole clips, not with --live")
         if not os.path.isdir(command.clip):
             raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
         found, learned, held_out = fit_to_file(
@@ -243,10 +253,6 @@ def _retarget_live(command: Retarget) -> None:
 
     console = Console()
     with told():
-        if command.source is not None:
-            raise OsikValueError("--source goes with whole clips, not with --live")
-        if command.smooth:
-            raise OsikValueError("--smooth goes with whole clips, not with --live")
         if os.path.isdir(command.clip):
             raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
         profile = _profile(command.profile)
@@ -313,7 +319,7 @@ def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
     """Return a robot by name or file; one that comes with the package is as it is."""
     from ..robot.loading import ROBOTS
 
-    return read_robot(source, "auto" if source in ROBOTS else base)
+    return read_robot(source, "auto" if source in ROBOTS and base == "floating" else base)
 
 
 def _profile(file: str | None) -> Profile | None:

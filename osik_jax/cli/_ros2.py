@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
-from ._messages import CommandError, told
+from ._messages import CommandError, refuse, told
 from ._robots import read_robot
 
 if TYPE_CHECKING:
@@ -54,6 +54,10 @@ class Ros2:
             settings = Settings() if self.config is None else read_settings(self.config)
             if (self.robot is None) == (settings.controller is None):
                 raise CommandError("give --robot, or a controller in the settings of --config")
+            refuse(self, self.robot is None, ("base",), "--robot, not with a controller, which has its own")
+            moving = ("domain", "loopback", "duration", "record")
+            refuse(self, self.replay is not None, moving, "a robot that moves, not with --replay")
+            refuse(self, self.replay is None, ("tolerance",), "--replay")
             robot = None if self.robot is None else read_robot(self.robot, self.base)
             controller = Controller(robot, settings)
             return self._lead(dds, controller) if self.replay is None else self._replay(dds, controller)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ._messages import CommandError, told
+from ._messages import CommandError, refuse, told
 from ._robots import FLOATING, read_robot
 
 if TYPE_CHECKING:
@@ -50,10 +50,13 @@ class View:
         with told():
             if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):
                 raise CommandError("--html goes with a motion.npz")
+            saved = self.file is not None and self.file.suffix == ".json"
+            refuse(self, saved, ("robot", "base"), "a robot or a motion, not with a session, which has its own")
+            refuse(self, self.file is not None, ("support",), "a robot to drag, not with a file")
             _server.import_viser()
             _server.check_port(self.host, 0 if self.html is not None else self.port)
             source = RobotSource(self.robot, FLOATING[self.base])
-            if self.file is not None and self.file.suffix == ".json":
+            if self.file is not None and saved:
                 view = _open.open_session(self.file, host=self.host, port=self.port)
             else:
                 robot = read_robot(source.robot, self.base)

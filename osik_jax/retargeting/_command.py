@@ -48,7 +48,7 @@ def fit_to_file(
     motions = []
     for name, path in clips_in(folder).items():
         try:
-            motions.append(reader(path))
+            motions.append(reader.in_folder(path))
         except (ValueError, KeyError) as error:
             raise type(error)(f"{name}: {error.args[0]}") from error
     held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]

@@ -104,7 +104,7 @@ def retarget_folder(
             # longest first: shorter clips can then use the program compiled for longer ones
             todo = [name for name in files if name not in work.found]
             for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
-                advance(work.add(name, partial(reader, files[name]), mapping, fps))
+                advance(work.add(name, partial(reader.in_folder, files[name]), mapping, fps))
             for done in work.rest():
                 advance(done)
         summary = _summary(work.found, work.failed, [*files])

@@ -77,11 +77,16 @@ class Reader:
     fps: float | None = None
 
     def __call__(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read one clip; ``unit`` applies to BVH files only."""
+        """Read one clip."""
         if self.source is not None:
             return SourceMotion.load(path, self.source, profile=self.profile, fps=self.fps)
-        unit = self.unit if path.suffix.lower() == ".bvh" else None
-        return load_motion(path, unit=unit, up=self.up, trim=self.trim)
+        return load_motion(path, unit=self.unit, up=self.up, trim=self.trim)
+
+    def in_folder(self, path: Path) -> HumanMotion | SourceMotion:
+        """Read one of the clips of a folder, where ``unit`` is that of the BVH files and ``fps`` that of the CSVs."""
+        ending = path.suffix.lower()
+        unit, fps = self.unit if ending == ".bvh" else None, self.fps if ending == ".csv" else None
+        return dataclasses.replace(self, unit=unit, fps=fps)(path)
 
     def options(self) -> dict[str, Any]:
         """Return the options that change what the reader returns, as numbers and strings."""

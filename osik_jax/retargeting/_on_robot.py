@@ -82,6 +82,8 @@ class OnRobot:
         needed = tuple(dict.fromkeys(role for limb in limbs for role in limb))
         if isinstance(motion, HumanMotion):
             return find_roles(motion.joint_names, mapping, needed)
+        if mapping is not None:
+            raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
         missing = self._lacks(motion.seen)
         if missing:
             raise OsikValueError(f"the robot that is followed has no {', '.join(missing)}")

@@ -109,7 +109,7 @@ class Retargeter(OnRobot):
     ) -> Retargeted:
         """Retarget one clip; see the function ``retarget``."""
         if (other := self._for(motion)) is not self:
-            return other.retarget(motion, fps=fps)
+            return other.retarget(motion, mapping=mapping, fps=fps)
         clip = self._prepared(motion, mapping, fps)
         return self._made(clip, len(clip.start))
 
@@ -280,7 +280,7 @@ def retarget(
     Args:
         robot: robot with limbs of a person (``guess_profile``), z up at home.
         motion: clip of a person, or of another robot (``SourceMotion``).
-        mapping: role to joint name of the clip. None: by common names.
+        mapping: role to joint name of a person's clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
         profile: as in ``Retargeter``.
         acceleration: as in ``Retargeter``.
@@ -289,8 +289,8 @@ def retarget(
         max_iterations: as in ``Retargeter``.
 
     Raises:
-        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot has no limbs of a
-            person.
+        ValueError: the clip has fewer than three frames or lacks a needed joint, the robot has no limbs of a person,
+            or ``mapping`` comes with a robot's motion.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(

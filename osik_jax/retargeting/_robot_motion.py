@@ -65,15 +65,17 @@ class RobotMotion:
 
         Args:
             path: the file, ``.npz`` or ``.csv``.
-            joint_names: joints of a CSV's columns; a ``.npz`` contains them.
-            fps: frame rate of a CSV [1/s]; a ``.npz`` contains it.
+            joint_names: joints of a CSV's columns; not with a ``.npz``, which contains them.
+            fps: frame rate of a CSV [1/s]; not with a ``.npz``, which contains it.
 
         Raises:
             FileNotFoundError: no such file.
-            ValueError: the file is broken, or a CSV comes without ``joint_names`` and ``fps``.
+            ValueError: the file is broken, a CSV comes without ``joint_names`` and ``fps``, or a ``.npz`` with them.
         """
         source = Path(path)
         if source.suffix.lower() != ".csv":
+            if joint_names is not None or fps is not None:
+                raise OsikValueError(f"{source}: joint_names and fps go with a CSV; a .npz has its own")
             arrays = load_arrays(source)
             missing = [name for name in ("fps", "qpos", "joint_names") if name not in arrays]
             if missing:

@@ -65,14 +65,13 @@ class SourceMotion:
             path: the file; a CSV has the robot's joints in MuJoCo's order.
             robot: the robot that moves.
             profile: its profile; None: a bundled one or a guess.
-            fps: frame rate of a CSV [1/s].
+            fps: frame rate of a CSV [1/s]; not with a ``.npz``, which contains it.
 
         Raises:
             FileNotFoundError, ValueError, KeyError: as of ``RobotMotion.load`` and ``SourceMotion``.
         """
-        table = Path(path).suffix.lower() == ".csv"
-        names = joints_in_mujoco_order(robot) if table else None
-        motion = RobotMotion.load(path, joint_names=names, fps=fps if table else None)
+        names = joints_in_mujoco_order(robot) if Path(path).suffix.lower() == ".csv" else None
+        motion = RobotMotion.load(path, joint_names=names, fps=fps)
         return cls(robot, motion, profile, Path(path).stem)
 
     @property

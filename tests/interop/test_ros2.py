@@ -160,8 +160,8 @@ class TestStart:
         run.tick(to_hand(run, [0.3, 0.4, -0.2]))
         run.ticks(500)
         q = run.positions()
-        speed = np.diff(q, axis=0) * settings.rate
-        change = np.diff(speed, axis=0) * settings.rate
+        speed = np.diff(q, axis=0) / settings.dt
+        change = np.diff(speed, axis=0) / settings.dt
         assert np.abs(speed).max() <= 0.8 + 1e-9 and np.abs(speed).max() > 0.79
         assert np.abs(change).max() <= 6.0 + 1e-6 and np.abs(change).max() > 5.9
         lower, upper = np.asarray(arm.position_lower), np.asarray(arm.position_upper)
@@ -192,6 +192,9 @@ class TestStart:
         osik.save_controller(tmp_path / "c.json", arm, tasks, scheme=osik.NullSpace(), dt=0.01, source="arm7")
         controller = Controller(None, Settings(controller=str(tmp_path / "c.json")))
         assert controller.dt == 0.01 and controller.frames == ("hand",)
+        for robot, rate in ((arm, None), (None, 200.0)):
+            with pytest.raises(ValueError, match="has its own robot and rate"):
+                Controller(robot, Settings(controller=str(tmp_path / "c.json"), rate=rate))
         run = started(controller)
         run.tick(to_hand(run, [1.5, 1.0, 0.0]))
         run.ticks(300)

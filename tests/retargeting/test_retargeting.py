@@ -485,10 +485,24 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         (["DANCE", "--mapping", "left_hip=Hip"], "no joint of the clip 'Hip'"),
         (["DANCE", "--unit", "yard"], "no unit 'yard'"),
         (["DANCE", "--fit", "robot.toml"], "--fit takes a folder of clips"),
+        (["DANCE", "--fit", "robot.toml", "--source", "g1"], "--source goes with motions, not with --fit, which takes"),
+        (
+            ["DANCE", "--fit", "robot.toml", "--fps", "30", "--report"],
+            "--fps, --report go with motions, not with --fit",
+        ),
+        (["DANCE", "--look-ahead", "0.1", "--budget", "0.01"], "--look-ahead, --budget go with --live"),
+        (["m.npz", "--source", "nao", "--unit", "cm", "--no-trim"], "--unit, --trim go with a person's clip, not with"),
+        (["DANCE", "--source-fps", "30"], "--source-fps goes with --source"),
+        (["-", "--live", "--up", "y"], "--up goes with a file, not with -"),
+        (["NPZ", "--unit", "cm"], "unit goes with BVH files"),
+        (["NPZ", "--source", "nao", "--source-fps", "30"], "joint_names and fps go with a CSV"),
+        (["DANCE", "--base", "fixed"], "--base goes with a file; nao is what it is"),
     ],
 )
 def test_the_command_refuses_in_one_line(arguments, message, dance, tmp_path, capsys):
-    arguments = [str(dance) if word == "DANCE" else word for word in arguments]
+    files = {"DANCE": str(dance), "NPZ": str(tmp_path / "clip.npz")}
+    np.savez(files["NPZ"], fps=30.0, qpos=np.zeros((3, 7)), joint_names=[])
+    arguments = [files.get(word, word) for word in arguments]
     assert cli.main(["retarget", *arguments, "--out", str(tmp_path / "out")]) == 2
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1 and message in lines[0]

@@ -9,7 +9,7 @@ from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.retargeting import Profile, Retargeter, RobotMotion, SourceMotion, load_motion, report
+from osik_jax.retargeting import Profile, Retargeter, RobotMotion, SourceMotion, load_motion, report, retarget
 from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._load import Reader
 from osik_jax.retargeting._roles import HAND, LIMBS, NEEDED
@@ -131,6 +131,10 @@ def test_other_rates_and_tables(nao, danced, tmp_path):
     np.testing.assert_allclose(SourceMotion.load(table, nao, fps=30.0).motion.qpos, first.motion.qpos, atol=1e-8)
     with pytest.raises(ValueError, match="a CSV holds numbers alone; say joint_names and fps"):
         SourceMotion.load(table, nao)
+    with pytest.raises(ValueError, match="joint_names and fps go with a CSV"):
+        SourceMotion.load(file, nao, fps=60.0)
+    with pytest.raises(ValueError, match="mapping names joints of a person's clip"):
+        retarget(nao, fast, mapping={"left_hip": "hip"})
     assert cli.main(["retarget", str(table), "--source", "nao", "--source-fps", "30", "--no-animation",
                      "--out", str(tmp_path / "out")]) == 0  # fmt: skip
     assert len(RobotMotion.load(tmp_path / "out" / "motion.npz").qpos) == len(first.q)

@@ -19,6 +19,7 @@ from osik_jax.cli import main
 from osik_jax.retargeting._robot_motion import in_mujoco_order
 from osik_jax.viewer import export_html, serve, serve_batch
 from osik_jax.viewer._parts import Part, robot_parts
+from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._playback import read_motion
 from osik_jax.viewer.live._readout import error_text, joint_table
 from osik_jax.viewer.live._stance import sole_polygon, standing
@@ -174,6 +175,8 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             (["--port", "0", str(tmp_path / "motion.npz")], "another robot"),
             (["--port", "0", "--support", "l_soul"], "l_sole"),
             (["--html", str(tmp_path / "page.html")], "--html goes with a motion.npz"),
+            (["session.json", "--robot", "ur5", "--base", "fixed"], "--robot, --base go with a robot or a motion, not"),
+            (["motion.npz", "--support", "l_sole"], "--support goes with a robot to drag, not with a file"),
             (
                 [str(tmp_path / "motion.npz"), "--robot", "arm7", "--html", str(tmp_path / "no" / "page.html")],
                 "No such file",
@@ -182,6 +185,21 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             assert main(["view", "--no-browser", *arguments]) == 2
             error = capsys.readouterr().err
             assert told in error and error.count("\n") == 1 and error.startswith("osik: ")
+
+
+def test_what_a_session_has_is_not_given_beside_it() -> None:
+    session = default_session(ARM)
+    parts: dict[str, Any] = dict(
+        tasks={"posture": osik.PostureTask(ARM)},
+        scheme=osik.NullSpace(),
+        limits=osik.no_limits,
+        dt=0.005,
+        q0=np.asarray(ARM.q0),
+        source="arm7",
+    )
+    for name, part in parts.items():
+        refuses(ValueError, f"its own {name}: leave out", serve, session, port=0, **{name: part})
+    refuses(ValueError, "its own tasks, scheme, limits, dt, q0, source: ", serve, session, port=0, **parts)
 
 
 def test_without_viser_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ class Settings:
     """Settings of ``osik ros2``, with their bounds.
 
     Attributes:
-        rate: control steps a second [Hz].
+        rate: control steps a second [Hz]. Default: 200, or that of the controller, beside which none is given.
         frames: frames that get a topic for targets. Default: the hands, or the frames of the controller's tasks.
         support: frames that stand on the ground, for a floating-base robot. Default: frames named like feet.
         controller: a file of ``osik.save_controller``; its tasks, scheme and limits take the place of the default ones.
@@ -51,7 +51,7 @@ class Settings:
         topics: names of topics.
     """
 
-    rate: float = 200.0
+    rate: float | None = None
     frames: tuple[str, ...] = ()
     support: tuple[str, ...] = ()
     controller: str | None = None
@@ -73,6 +73,8 @@ class Settings:
     def __post_init__(self) -> None:
         for name in ("rate", "speed", "acceleration", "following_error", "state_timeout", "max_age", "clutch_scale"):
             value = getattr(self, name)
+            if name == "rate" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < math.inf:
                 raise OsikValueError(f"{name} is {value!r}; it is a positive number")
         if self.commands not in ("trajectory", "positions"):
@@ -86,7 +88,7 @@ class Settings:
     @property
     def dt(self) -> float:
         """Return the length of a control step [s]."""
-        return 1.0 / self.rate
+        return 1.0 / (200.0 if self.rate is None else self.rate)
 
 
 def read_settings(path: str | os.PathLike[str]) -> Settings:

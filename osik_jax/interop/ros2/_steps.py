@@ -56,12 +56,12 @@ class Steps:
     """Tasks, scheme and limits of a robot, and their compiled programs.
 
     Args:
-        robot: the robot; that of the settings' controller takes its place.
+        robot: the robot; None where the settings name a controller's file.
         settings: the settings.
 
     Raises:
         FileNotFoundError, KeyError, TypeError, ValueError: the controller's file cannot be read, a frame does not
-            exist, or there is nothing to lead or to stand on.
+            exist, there is nothing to lead or to stand on, or something is given that the controller's file has.
     """
 
     def __init__(self, robot: Robot | None, settings: Settings):
@@ -69,6 +69,8 @@ class Steps:
         limits: tuple[Limit, ...] = ()
         self.dt = settings.dt
         if settings.controller is not None:
+            if robot is not None or settings.rate is not None:
+                raise OsikValueError("the settings' controller has its own robot and rate: leave them out")
             self.robot, tasks, self.scheme, limits, self.dt = load_controller(settings.controller)
             self.task_names = _tasks_of_frames(tasks, settings.frames)
             at_start = set(self.task_names.values())

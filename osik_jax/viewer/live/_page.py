@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._errors import OsikValueError
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
@@ -136,7 +137,7 @@ def serve(
     *,
     scheme: Scheme | None = None,
     limits: Limits | None = None,
-    dt: float = 0.005,
+    dt: float | None = None,
     q0: Float[Array, " nq"] | None = None,
     look: str | Path | Look | None = None,
     source: RobotSource | str | None = None,
@@ -150,11 +151,11 @@ def serve(
     ``view.wait()`` keeps a program going until Ctrl-C.
 
     Args:
-        robot: the robot, or a session of ``load_session``, which has all but ``look`` and the page's address.
+        robot: the robot; or a session, alone with ``look`` and the page's address: it has the rest.
         tasks: by name. Frame tasks and centres of mass that have a target get a handle to drag.
         scheme: as in ``osik_jax.solve``.
         limits: as in ``osik_jax.solve``.
-        dt: time of a step, and period of the loop [s].
+        dt: time of a step, and period of the loop [s]. Default: 0.005.
         q0: configuration at the start [m, rad]; default: ``robot.q0``. (nq,)
         look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         source: name or file of the robot, which sessions then keep.
@@ -176,9 +177,10 @@ def serve(
     Raises:
         ImportError: viser is not installed (the extra ``viewer``).
         OSError: the port is in use.
-        TypeError, ValueError: as in ``osik_jax.solve``.
+        TypeError, ValueError: as in ``osik_jax.solve``; parts of a controller beside a session.
     """
     if isinstance(robot, Session):
+        _check_alone(tasks=tasks, scheme=scheme, limits=limits, dt=dt, q0=q0, source=source)
         session = robot
     else:
         tasks = {} if tasks is None else tasks
@@ -189,7 +191,7 @@ def serve(
             tasks=dict(tasks),
             scheme=scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme,
             limits=checked_limits(robot, limits) or (),
-            dt=dt,
+            dt=0.005 if dt is None else dt,
             q=np.asarray(start),
             source=RobotSource(source) if isinstance(source, str) else source,
         )
@@ -197,6 +199,16 @@ def serve(
     check_tasks(session.tasks, session.robot)
     checked_limits(session.robot, session.limits)
     return LiveView(session, look=given_look(look), host=host, port=port).opened(open_browser)
+
+
+def _check_alone(**parts: Any) -> None:
+    """Raise ValueError if a part of a controller is given beside a session, which has all of them."""
+    given = [name for name, part in parts.items() if part is not None]
+    if given:
+        raise OsikValueError(
+            f"a session has its own {', '.join(given)}: leave out what is given beside it, or change the session by "
+            "dataclasses.replace(session, ...), where q0 is called q"
+        )
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:
