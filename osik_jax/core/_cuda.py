@@ -130,6 +130,7 @@ _METHODS = {
     "center_rows": "find_center_rows",
     "pose_rows": "find_pose_rows",
     "frame_rows": "find_frame_rows",
+    "chain_steps": "advance_chain",
 }
 
 

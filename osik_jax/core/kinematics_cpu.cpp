@@ -1,7 +1,7 @@
 // XLA's calls of kinematics and of rows of tasks on a CPU, in double precision.
 #include <vector>
 
-#include "kinematic_calls.hpp"
+#include "chain_search.hpp"
 #include "xla.hpp"
 
 using namespace osik;
@@ -26,6 +26,7 @@ template <void (*method)(const Lanes&)> void of_lanes(const xla::Call& call) { m
 }  // namespace
 
 extern "C" {
+void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Lanes>>>(frame); }
 void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Lanes>>>(frame); }
 void* osik_moving_frames(xla::CallFrame* frame) { return xla::handle<of_lanes<move_frames<Lanes>>>(frame); }
 void* osik_center_of_mass(xla::CallFrame* frame) { return xla::handle<of_lanes<move_centers<Lanes>>>(frame); }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,7 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt
 
+from ..core import _library
+from ..execution._computed import by_kernel
 from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobian
+from ._chain_kernel import advanced
 from ._error import rotation_error
 from ._linear import solve_positive, solve_with_pivots
 from ._minimum import minimum
@@ -104,6 +108,12 @@ class ChainSearch(eqx.Module):
 
     def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
+        if _library.installed():
+            return jax.vmap(partial(_by_kernel, steps=steps), (None, 0, 0))(self, x, goal)
+        return self.advance_plain(x, goal, steps)
+
+    def advance_plain(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
+        """Return what ``advance`` does, by plain JAX."""
         turned = lanes_last(goal)
 
         def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
@@ -226,6 +236,14 @@ class ChainSearch(eqx.Module):
         ]
         score = jnp.maximum(sizes[0] / self.tolerance[0], sizes[1] / self.tolerance[1])
         return Errors(sizes[0], sizes[1], score, cost)
+
+
+def _one_lane(search: ChainSearch, x: Float[Array, " n"], goal: Goal, *, steps: int) -> tuple[Array, Array, Errors]:
+    found = search.advance_plain(x[None], jax.tree.map(lambda a: a[None], goal), steps)
+    return jax.tree.map(lambda a: a[0], found)
+
+
+_by_kernel = by_kernel(_one_lane, partial(advanced, damping=(_DAMPING, _LEAST_DAMPING)))
 
 
 def _times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "n lanes"]) -> Float[Array, "m lanes"]:

@@ -42,12 +42,19 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
         ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
             length becomes NaN.
     """
+    quaternion, valid = _unit_quaternion(given)
+    _refuse(valid, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
+    return quaternion
+
+
+# one program each: on a GPU, a program for each of their operations takes milliseconds
+@jax.jit
+def _unit_quaternion(given: Float[Array, "*B 4"]) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
     squared = jnp.sum(given**2, -1, keepdims=True)
     valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
-    _refuse(valid[..., 0], given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
     safe = jnp.where(valid, given, jnp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
     length = jnp.sqrt(jnp.sum(safe**2, -1, keepdims=True))
-    return jnp.where(valid, safe / length, jnp.nan)
+    return jnp.where(valid, safe / length, jnp.nan), valid[..., 0]
 
 
 @_evaluated
@@ -58,19 +65,22 @@ def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B
         ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
             becomes NaN if it is traced.
     """
+    rotation, valid = _nearest_rotation(given)
+    _refuse(valid, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
+    return rotation
+
+
+@jax.jit
+def _nearest_rotation(given: Float[Array, "*B 3 3"]) -> tuple[Float[Array, "*B 3 3"], Bool[Array, "*B"]]:
     eye = jnp.eye(3, dtype=given.dtype)
     residual = jnp.max(jnp.abs(_product(given, jnp.swapaxes(given, -1, -2)) - eye), (-1, -2), keepdims=True)
     first, second, third = (given[..., k, :] for k in range(3))
     right_handed = jnp.sum(jnp.cross(first, second) * third, -1)[..., None, None] > 0.0
     valid = (residual <= (1.0 + ROUNDED) ** 2 - 1.0) & right_handed
-    _refuse(valid[..., 0, 0], given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
     exact = residual <= _EXACT * float(jnp.finfo(given.dtype).eps)
-    seen = concrete(exact)
-    if seen is not None and seen.all():
-        return given
     safe = jnp.where(valid, given, eye)
     rotation = jax.lax.cond(jnp.all(exact), lambda matrix: matrix, _nearest, safe)
-    return jnp.where(valid, jnp.where(exact, safe, rotation), jnp.nan)
+    return jnp.where(valid, jnp.where(exact, safe, rotation), jnp.nan), valid[..., 0, 0]
 
 
 def _nearest(matrix: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:

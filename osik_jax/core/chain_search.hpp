@@ -1,0 +1,178 @@
+// Steps of a search for poses of frames that hinges and slides carry: ChainSearch.advance of inverse/_chain_search.py,
+// with chain_kinematics and jacobian of inverse/_chain.py. Arguments and results as in inverse/_chain_kernel.py.
+//
+//   x <- clip(x - J' (J J' + damping I)^-1 e),   damping = share |e|^2 + least length^2
+//
+// J without the columns of joints at a limit beyond which the step would lead.
+#pragma once
+#include "kinematic_calls.hpp"
+
+namespace osik {
+
+// The larger one; NaN if one is.
+template <class Real> OSIK_FN Real most(Real a, Real b) { return a != a || a > b ? a : b; }
+
+template <class Call> struct ChainSearch {
+  using Real = typename Call::Real;
+  using In = typename Call::In;
+  using V = Vec3<Real>;
+  using M = Mat3<Real>;
+  struct Errors {
+    Real position, orientation, score, cost;
+  };
+  int n, joints, frames, m, rows;                  // coordinates, joints, frames, rows of all frames and those that count
+  bool near;                                       // whether what the frames leave free goes towards `start`
+  const int *parent, *hinge, *coordinate, *end;    // [joints]: parent or `joints` for the world, ...; [frames] last joint
+  const int *carries, *row;                        // [frames, joints] flags; [m] number among those that count or -1
+  In constant, first, second, offset, axis, anchor, tip, factor;  // [joints, 12] thrice, [joints], [joints, 3] twice,
+                                                                  // [frames, 12], [joints]
+  In lower, upper, start, numbers;                 // [n] thrice; length, tolerances, enough, share and least of damping
+  Real *pose, *turned, *point, *e, *gram;          // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
+  Real *tips, *J, *x, *home;                       // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
+
+  static OSIK_FN int space(int n, int joints, int frames) {
+    return 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1);
+  }
+  ChainSearch(const int* sizes, int n, int frames, Real* next) : n(n), frames(frames), m(6 * frames) {
+    Reader<const int*> integers{sizes};
+    joints = *integers.take(1), rows = *integers.take(1), near = *integers.take(1);
+    parent = integers.take(joints), hinge = integers.take(joints), coordinate = integers.take(joints);
+    end = integers.take(frames), carries = integers.take(frames * joints), row = integers.take(m);
+    Reader<Real*> space{next};
+    pose = space.take(12 * joints), turned = space.take(3 * joints), point = space.take(3 * joints);
+    tips = space.take(3 * frames), e = space.take(m), gram = space.take(m * m);
+    J = space.take(n * m), x = space.take(n), home = space.take(n);
+  }
+  void read(In given) {
+    Reader<In> at{given};
+    constant = at.take(12 * joints), first = at.take(12 * joints), second = at.take(12 * joints);
+    offset = at.take(joints), axis = at.take(3 * joints), anchor = at.take(3 * joints), tip = at.take(12 * frames);
+    factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at;
+  }
+
+  // Rotation and position of a pose [3, 4].
+  template <class At> static M turn_of(At a) { return {V::of(a), V::of(a + 4), V::of(a + 8)}; }
+  template <class At> static V place_of(At a) { return {a[3], a[7], a[11]}; }
+  M turn_of_joint(int joint) const { return joint < joints ? turn_of(pose + 12 * joint) : M::identity(); }
+  V place_of_joint(int joint) const { return joint < joints ? place_of(pose + 12 * joint) : V{0, 0, 0}; }
+
+  void place() {
+    for (int j = 0; j < joints; ++j) {
+      const Real angle = (coordinate[j] < 0 ? 0 : x[coordinate[j]] * factor[j]) + offset[j], half = sin(Real(0.5) * angle);
+      const Real f = hinge[j] ? sin(angle) : angle, g = hinge[j] ? 2 * half * half : 0;
+      Real local[12];
+      for (int i = 0; i < 12; ++i)
+        local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
+      const M before = turn_of_joint(parent[j]), turn = before * turn_of(local + 0);
+      const V at = before * place_of(local + 0) + place_of_joint(parent[j]);
+      Real* to = pose + 12 * j;
+      turn.a.put(to), turn.b.put(to + 4), turn.c.put(to + 8);
+      to[3] = at.x, to[7] = at.y, to[11] = at.z;
+      (turn * V::of(axis + 3 * j)).put(turned + 3 * j), (turn * V::of(anchor + 3 * j) + at).put(point + 3 * j);
+    }
+  }
+  // Errors of the frames, and e.
+  Errors compare(In goal) {
+    const Real length = numbers[0];
+    Errors found{0, 0, 0, 0};
+    for (int f = 0; f < frames; ++f) {
+      const M carrier = turn_of_joint(end[f]), turn = carrier * turn_of(tip + 12 * f);
+      const V at = carrier * place_of(tip + 12 * f) + place_of_joint(end[f]);
+      at.put(tips + 3 * f);
+      const V linear = at - V::of(goal + 12 * f), angular = rotation_log(turn * M::of(goal + (12 * f + 3)).transposed());
+      const Real off[] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
+      Real squares[2] = {0, 0};
+      for (int i = 0; i < 6; ++i) {
+        const int own = row[6 * f + i];
+        if (own < 0) continue;
+        e[own] = off[i] * (i < 3 ? 1 : length);
+        squares[i / 3] += off[i] * off[i], found.cost += e[own] * e[own];
+      }
+      found.position = most(found.position, sqrt(squares[0])), found.orientation = most(found.orientation, sqrt(squares[1]));
+    }
+    found.score = most(found.position / numbers[1], found.orientation / numbers[2]);
+    return found;
+  }
+  // The column of J of a coordinate: [rows], the derivative of e.
+  void differentiate(int dof, Real* column) const {
+    for (int f = 0; f < frames; ++f) {
+      V linear{0, 0, 0}, angular{0, 0, 0};
+      for (int j = 0; j < joints; ++j) {
+        if (coordinate[j] != dof || !carries[f * joints + j]) continue;
+        const V own = factor[j] * V::of(turned + 3 * j);
+        linear = linear + (hinge[j] ? cross(own, V::of(tips + 3 * f) - V::of(point + 3 * j)) : own);
+        if (hinge[j]) angular = angular + numbers[0] * own;
+      }
+      const Real off[] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
+      for (int i = 0; i < 6; ++i)
+        if (row[6 * f + i] >= 0) column[row[6 * f + i]] = off[i];
+    }
+  }
+  // Solve gram y = e by elimination, of which the lower triangle is given; y in place of e.
+  void eliminate() {
+    for (int k = 0; k < rows; ++k) {
+      Real* const pivot = gram + k * rows;
+      for (int i = k + 1; i < rows; ++i) {
+        Real* const own = gram + i * rows;
+        const Real ratio = own[k] / pivot[k];
+        for (int j = k + 1; j <= i; ++j) own[j] -= ratio * gram[j * rows + k];
+        e[i] -= ratio * e[k];
+      }
+    }
+    for (int k = rows - 1; k >= 0; --k) {
+      for (int i = k + 1; i < rows; ++i) e[k] -= gram[i * rows + k] * e[i];
+      e[k] /= gram[k * rows + k];
+    }
+  }
+  // The errors at x, and the next point in its place.
+  Errors step(In goal) {
+    place();
+    const Errors found = compare(goal);
+    const Real damping = numbers[4] * found.cost + numbers[5] * numbers[0] * numbers[0];
+    for (int a = 0; a < rows; ++a)
+      for (int b = 0; b <= a; ++b) gram[a * rows + b] = a == b ? damping : 0;
+    for (int j = 0; j < n; ++j) {
+      Real *column = J + j * rows, gradient = 0;
+      differentiate(j, column);
+      for (int a = 0; a < rows; ++a) gradient += column[a] * e[a];
+      const bool is_stopped = (x[j] <= lower[j] && gradient > 0) || (x[j] >= upper[j] && gradient < 0);
+      for (int a = 0; a < rows && is_stopped; ++a) column[a] = 0;
+      home[j] = near && !is_stopped ? start[j] - x[j] : 0;
+      for (int a = 0; a < rows; ++a)
+        for (int b = 0; b <= a; ++b) gram[a * rows + b] += column[a] * column[b];
+    }
+    for (int j = 0; j < n && near; ++j)
+      for (int a = 0; a < rows; ++a) e[a] += J[j * rows + a] * home[j];
+    if (!near && found.score <= numbers[3]) return found;
+    eliminate();
+    for (int j = 0; j < n; ++j) {
+      Real to = x[j] + home[j];
+      for (int a = 0; a < rows; ++a) to -= J[j * rows + a] * e[a];
+      x[j] = to < lower[j] ? lower[j] : to > upper[j] ? upper[j] : to;
+    }
+    return found;
+  }
+};
+
+template <class Call> void advance_chain(const Call& call) {
+  using Real = typename Call::Real;
+  const int n = call.size(0, 1), frames = call.size(1, 1), *integers = call.integers(3);
+  typename Call::Space space(ChainSearch<Call>::space(n, integers[1], frames));
+  ChainSearch<Call> search(integers + 1, n, frames, space.data());
+  call.each_lane([&](int lane) {
+    search.read(call.in(2, lane));
+    auto x = call.in(0, lane);
+    auto here = call.out(0, lane), there = call.out(1, lane), errors = call.out(2, lane);
+    Real* at = search.x;
+    typename ChainSearch<Call>::Errors found{};
+    for (int j = 0; j < n; ++j) at[j] = x[j];
+    for (int step = 0; step < integers[0]; ++step) {
+      if (step + 1 == integers[0])
+        for (int j = 0; j < n; ++j) here[j] = at[j];
+      found = search.step(call.in(1, lane));
+    }
+    for (int j = 0; j < n; ++j) there[j] = at[j];
+    errors[0] = found.position, errors[1] = found.orientation, errors[2] = found.score, errors[3] = found.cost;
+  });
+}
+}  // namespace osik
