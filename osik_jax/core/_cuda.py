@@ -164,6 +164,10 @@ def _lanes_source(
     parameters += [f"Real* r{k}" for k in range(len(results))]
     widest = max(shape[-1] for shape in results if shape)
     space = max(4 * given[0][1], 3 * widest)  # of the centre of mass: numbers of bodies, and of dofs
+    if method == "chain_steps":  # as ChainSearch::space, the joints counted by the numbers of the chain
+        n, frames = given[0][1], given[1][1]
+        joints = (given[2][1] - 12 * frames - 3 * n) // 44
+        space = 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1)
     return (
         text_of("lanes_cuda.hpp")
         + f"using namespace osik;\nusing Real = {'float' if single else 'double'};\nstruct Sizes {{\n"

@@ -1,9 +1,9 @@
-// A call of kinematic_calls.hpp on a GPU. A lane is one robot of the batch, and has one thread.
+// A call of kinematic_calls.hpp or chain_search.hpp on a GPU. A lane is one robot of the batch, and has one thread.
 //
 // The lanes are the fastest axis of every array that is not shared, so that the threads of a warp read neighbours. The
 // text that includes this file defines Real, the sizes, and SPACE (core/_cuda.py: call_lanes).
 #pragma once
-#include "kinematic_calls.hpp"
+#include "chain_search.hpp"
 
 namespace osik {
 

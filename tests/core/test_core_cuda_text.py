@@ -20,6 +20,8 @@ NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 PLACED = (2, 3, 3), (2, 3, 3, 3), (2, 7, 3), (2, 7, 3), (2, 7, 3)
 """Kinematics of three bodies and seven dofs."""
 POSE = (2, 3), (2, 3, 3), (2, 6, 7), (1, 25), (8,)
+CHAIN = (2, 7), (2, 1, 12), (1, 347), (38,)
+"""Steps of a search for the pose of a frame that seven joints carry."""
 ROWS = (6,), (6, 7), (6,), (), (6,), (7,), (6,)
 """Rows of a pose task or of one on the centre of mass, for seven dofs."""
 
@@ -45,6 +47,7 @@ TEXTS = {
     "centre of mass": lambda: _cuda._lanes_source("center_rows", True, (*PLACED, (1, 50), (9,), (2, 9)), (6,), ROWS),
     "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 44), (16,)), (6,), ROWS),
     "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
+    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((7,), (7,), (4,))),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 
