@@ -16,6 +16,9 @@ problems that it cannot solve. A scheme's backend is that of its whole step.
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
     "core"    CPUs and CUDA: any robot, any precision
 
+    of inverse kinematics                     steps of searches for poses of frames that hinges and slides carry
+    "core"    CPUs and CUDA: any robot, any precision
+
     of retargeting                            iterations of a plan                a plan's banded systems
     "core"                                    CPUs: any robot, any precision      CPUs: inside the former
                                                                                   CUDA: float32, about 40 dofs at most

@@ -143,7 +143,7 @@ def inverse_kinematics(
         found = searched(robot, problem.goals, settings, seeds * (1 + restarts), steps, **start)
     if not (traced or np.all(found.converged)):
         found = dataclasses.replace(found, advice=advice(robot, route.asked(settings)))
-    return jax.tree.map(jnp.asarray, found if problem.many else jax.tree.map(lambda a: a[0], found))
+    return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 
 def default_seeds(coordinates: int, every: bool) -> int:

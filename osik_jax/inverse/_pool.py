@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..execution._lanes import first_set
+
 CHECK = 4
 """Steps between two looks at how the lanes are doing."""
 _TRIAL = 8
@@ -149,7 +151,7 @@ def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Arra
     turn = jnp.cumsum(free, dtype=jnp.int32) - 1  # of each free lane among them
     before = jnp.where(state.cursor > 0, rank[jnp.maximum(state.cursor - 1, 0)], 0)
     some = jnp.maximum(count, 1)
-    chosen = jnp.searchsorted(rank, (before + turn) % some + 1).astype(jnp.int32)
+    chosen = first_set(wanting, targets)[(before + turn) % some]
     seed = state.started[jnp.minimum(chosen, targets)] + turn // some
     takes = free & (count > 0) & (seed < jnp.take(seeds, chosen, mode="clip"))
     target = jnp.where(takes, chosen, state.lanes.target)

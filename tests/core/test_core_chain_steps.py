@@ -1,0 +1,85 @@
+"""Steps of searches for poses by the compiled core, against plain JAX."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from core_checks import needs_core
+
+import osik_jax as osik
+from osik_jax.inverse._chain_problem import ChainRoute, Settings, chain_search
+from osik_jax.inverse._chain_search import ChainSearch, Goal
+
+TREE = """<mujoco><compiler angle="radian"/><worldbody>
+<body><joint name="lift" type="slide" axis="0 0.6 0.8" range="-1 1"/><geom size="0.1"/>
+<body pos="0 0 0.3"><joint name="turn" axis="0 1 1" pos="0.1 0 0" range="-2 2"/><joint name="stiff" axis="1 0 0"/>
+<geom size="0.1"/>
+<body pos="0.3 0 0" euler="0.2 0.3 0.5"><joint name="one" axis="0 1 0" range="-1 2"/><geom size="0.1"/>
+<site name="a" pos="0.2 0 0.1"/></body>
+<body pos="-0.3 0 0"><joint name="two" axis="0 1 0" range="-2 2"/><geom size="0.1"/>
+<site name="b" pos="0 0.2 0" euler="0 1.5 0"/></body></body></body></worldbody>
+<equality><joint joint1="two" joint2="one" polycoef="0.2 -1.5 0 0 0"/></equality></mujoco>"""
+"""A tree with a slide, two joints of one body, of which one is locked, and a joint that follows another."""
+
+LANES = 40
+
+
+def made(name: str) -> tuple[osik.Robot, dict[str, tuple[bool, ...]]]:
+    """A robot, and of some of its frames the rows that count."""
+    pose, position = (True,) * 6, (True,) * 3 + (False,) * 3
+    if name == "tree":
+        robot = osik.Robot.from_mjcf(TREE, locked_joints={"stiff": 0.4})
+        return robot, {"a": (False, True, True, True, False, True), "b": position}
+    robot = osik.load_robot(name)
+    return robot, {robot.frame_names[-1]: pose} if name == "arm7" else {"l_gripper": pose, "r_gripper": position}
+
+
+@needs_core
+@pytest.mark.parametrize("near", [False, True])
+@pytest.mark.parametrize("name", ["arm7", "nao", "tree"])
+def test_steps_are_those_of_plain_jax(name, near, rng):
+    robot, wanted = made(name)
+    route, low = ChainRoute(tuple(wanted), tuple(wanted.values())), np.asarray(robot.position_lower)
+    high, tolerance = np.asarray(robot.position_upper), np.array([1e-3, 1e-2])
+    limits = jnp.where(jnp.isfinite(low), 0.5 * low, low), jnp.where(jnp.isfinite(high), 0.5 * high, high)
+    search = chain_search(robot, route, Settings(robot.q0, *limits, 0, tolerance, 64), warm=False, near=near)
+
+    def poses(q):
+        return osik.forward_kinematics(robot, q).frame_poses(robot, route.frames)
+
+    goal = Goal(*jax.vmap(poses)(robot.q0 + 0.8 * rng.standard_normal((LANES, robot.nq))))
+    goal = goal._replace(position=goal.position.at[0, 0, 0].set(jnp.nan))  # harms its own lane alone
+    x, stopped = search.begin(jnp.arange(LANES), goal), 0
+    for steps in (1, 4, 4, 4):
+        expected = jax.jit(ChainSearch.advance_plain, static_argnums=3)(search, x, goal, steps)
+        found = jax.jit(ChainSearch.advance, static_argnums=3)(search, x, goal, steps)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a[1:], b[1:], rtol=1e-8, atol=1e-8)
+            np.testing.assert_array_equal(jnp.isnan(a[0]), jnp.isnan(b[0]))
+        _, x, errors = expected
+        stopped = jnp.sum((x == search.lower) | (x == search.upper))
+    assert stopped > 0 or near
+    assert jnp.median(errors.cost[1:]) > 0.0
+
+
+@needs_core
+def test_robots_of_a_batch_have_their_own_chains(rng):
+    robot, wanted = made("arm7")
+    route = ChainRoute(tuple(wanted), tuple(wanted.values()))
+    shares = jnp.array([1.0, 1.2, 0.9])
+    robots = jax.vmap(lambda a: dataclasses.replace(robot, body_position=a * robot.body_position))(shares)
+    x = rng.standard_normal((3, LANES, 7))
+    goal = Goal(rng.standard_normal((3, LANES, 1, 3)), np.broadcast_to(np.eye(3), (3, LANES, 1, 3, 3)))
+
+    def one(robot, x, goal, advance):
+        settings = Settings(robot.q0, robot.position_lower, robot.position_upper, 0, np.array([1e-3, 1e-2]), 64)
+        return advance(chain_search(robot, route, settings, warm=False, near=False), x, goal, 3)
+
+    found, expected = (
+        jax.vmap(lambda *a, advance=advance: one(*a, advance))(robots, x, goal)
+        for advance in (ChainSearch.advance, ChainSearch.advance_plain)
+    )
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
