@@ -1,4 +1,4 @@
-"""A right hand grasps as a person, beside dex-retargeting if it is installed: python -m benchmarks.hands [--help].
+"""A hand grasps as a person, beside dex-retargeting if it is installed: python -m benchmarks.hands [--help].
 
 Grasps are made of a hand's bones and angles of its joints: from the open hand to each grasp and back, while the hand is
 carried and turned. Fingertips are those of MuJoCo's kinematics of the URDF; the distance is to the person's,
@@ -14,6 +14,7 @@ import re
 import tempfile
 import time
 import warnings
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import jax
@@ -44,7 +45,6 @@ GRASPS = {
 }  # fmt: skip
 """Bends of each finger from the knuckle outwards; of the thumb first its opposition [rad]."""
 FRAMES = 40
-SCALE = 1.28
 
 
 def hand(bends: dict[str, tuple[float, ...]]) -> dict[str, np.ndarray]:
@@ -84,7 +84,7 @@ class Fingertips:
 
     def __init__(self, urdf: str, profile: Profile):
         spec = mujoco.MjSpec.from_string(urdf)
-        spec.compiler.fusestatic, spec.compiler.balanceinertia = False, True
+        spec.compiler.fusestatic, spec.compiler.boundmass, spec.compiler.boundinertia = False, 1e-6, 1e-9
         self.model, self.profile = spec.compile(), profile
         self.data = mujoco.MjData(self.model)
         self.tips = [role for role in profile.keypoints if role.endswith("_4")]
@@ -103,7 +103,7 @@ class Fingertips:
         return np.array(out)
 
 
-def peer(urdf: str, profile: Profile, vectors: np.ndarray) -> tuple[list[str], np.ndarray, float]:
+def peer(urdf: str, profile: Profile, vectors: np.ndarray, scale: float) -> tuple[list[str], np.ndarray, float]:
     """Joint names, motion and seconds a frame of dex-retargeting for vectors from wrist to tips. (F, tips, 3)."""
     from dex_retargeting.retargeting_config import RetargetingConfig  # pyright: ignore[reportMissingImports]
 
@@ -117,32 +117,50 @@ def peer(urdf: str, profile: Profile, vectors: np.ndarray) -> tuple[list[str], n
     path.write_text(text, encoding="utf-8")
     tips = [profile.keypoints[role][0] for role in profile.keypoints if role.endswith("_4")]
     count = len(tips)
+    leaders = [
+        str(joint.get("name"))
+        for joint in ElementTree.fromstring(urdf).findall("joint")
+        if joint.get("type") in ("revolute", "prismatic") and joint.find("mimic") is None
+    ]
     made = RetargetingConfig(
-        type="vector", urdf_path=str(path), target_joint_names=None, target_origin_link_names=["person_wrist"] * count,
+        type="vector", urdf_path=str(path), target_joint_names=leaders,
+        target_origin_link_names=["person_wrist"] * count,
         target_task_link_names=tips, target_link_human_indices=np.array([[0] * count, range(1, count + 1)]),
-        scaling_factor=SCALE, low_pass_alpha=1.0,
+        scaling_factor=scale, low_pass_alpha=1.0,
     ).build()  # fmt: skip
     began = time.process_time()
     q = np.array([made.retarget(own) for own in vectors])
     return list(made.joint_names), q, (time.process_time() - began) / len(vectors)
 
 
+def speeds_of(urdf: str, joints: list[str]) -> np.ndarray:
+    """Greatest speeds of joints by the text of a URDF [rad/s]."""
+    limits = {str(joint.get("name")): joint.find("limit") for joint in ElementTree.fromstring(urdf).findall("joint")}
+    found = [np.inf if (own := limits[name]) is None else float(own.get("velocity", "inf")) for name in joints]
+    return np.array([speed if speed > 0.0 else np.inf for speed in found])
+
+
 def main() -> None:
     """Prints the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("robot", nargs="?", default="allegro", help="a right hand by name, or a URDF")
+    parser.add_argument("robot", nargs="?", default="allegro", help="a hand by name, or a URDF")
+    parser.add_argument("--fps", type=float, default=30.0, help="frames a second: a grasp takes 40, less is slower")
+    parser.add_argument("--left", action="store_true", help="the hand is a left one")
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", True)
     file = Path(options.robot) if options.robot.endswith(".urdf") else example_urdf(options.robot)
-    urdf = re.sub(r"<(visual|collision)\b.*?</\1>", "", file.read_text(encoding="utf-8"), flags=re.S)
+    urdf = re.sub(r"<(visual|collision|inertial)\b.*?</\1>", "", file.read_text(encoding="utf-8"), flags=re.S)
     robot = osik.Robot.from_urdf(file, floating_base=False)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", osik.OsikWarning)
-        profile = dataclasses.replace(guess_profile(robot), scale=SCALE)
+        profile = guess_profile(robot)
     own, tips = Retargeter(robot, profile=profile), Fingertips(urdf, profile)
-    rows: dict[str, list[tuple[np.ndarray, float, float]]] = {"osik-jax": []}
-    for motion in grasps():
+    rows: dict[str, list[tuple[np.ndarray, float, float, float]]] = {"osik-jax": []}
+    for motion in grasps(options.fps):
+        if options.left:
+            motion = dataclasses.replace(motion, positions=motion.positions * [1.0, -1.0, 1.0])
+        scale = own._build.scale(own._prepared(motion, None, None).person)
         points = {name: motion.positions[:, k] for k, name in enumerate(motion.joint_names)}
         turn = own._build.facing @ np.swapaxes(palm_axes(points), 1, 2)
         seen = np.stack([np.einsum("fij,fj->fi", turn, points[tip] - points["wrist"]) for tip in tips.tips], 1)
@@ -152,21 +170,24 @@ def main() -> None:
         spent = (time.process_time() - began) / motion.frames
         motions = {"osik-jax": (list(result.motion.joint_names), result.motion.qpos, spent)}
         if importlib.util.find_spec("dex_retargeting") is not None:
-            motions["dex-retargeting"] = peer(urdf, profile, seen)
+            motions["dex-retargeting"] = peer(urdf, profile, seen, scale)
         for name, (joints, q, seconds) in motions.items():
-            off = 1e3 * np.linalg.norm(tips.at(joints, q) - SCALE * seen, axis=-1)
+            off = 1e3 * np.linalg.norm(tips.at(joints, q) - scale * seen, axis=-1)
             low, high = np.array([tips.model.joint(joint).range for joint in joints]).T
+            fast = float((np.abs(np.diff(q, axis=0)) * options.fps / speeds_of(urdf, joints)).max())
             over = max(0.0, float((low - q).max()), float((q - high).max()))
-            rows.setdefault(name, []).append((off, over, seconds))
+            rows.setdefault(name, []).append((off, over, fast, seconds))
     fingers = [k for k, tip in enumerate(tips.tips) if not tip.startswith("thumb")]
     print(
-        f"| | {', '.join(GRASPS)}: fingers at the grasp [mm] | all tips, all frames [mm] | beyond [rad] | ms a frame |"
+        f"| | {', '.join(GRASPS)}: fingers at the grasp [mm] | all tips, all frames [mm] | worst [mm] "
+        "| beyond [rad] | speed [of the limit] | ms a frame |"
     )
-    print("|---" * 5 + "|")
+    print("|---" * 7 + "|")
     for name, found in rows.items():
-        middle = ", ".join(f"{off[FRAMES // 2, fingers].mean():.1f}" for off, _, _ in found)
-        mean, over = np.mean([off for off, _, _ in found]), max(over for _, over, _ in found)
-        print(f"| {name} | {middle} | {mean:.1f} | {over:.3f} | {1e3 * np.mean([s for _, _, s in found]):.2f} |")
+        middle = ", ".join(f"{off[FRAMES // 2, fingers].mean():.1f}" for off, *_ in found)
+        off, (over, fast) = np.array([one[0] for one in found]), np.max([one[1:3] for one in found], 0)
+        spent = 1e3 * np.mean([seconds for *_, seconds in found])
+        print(f"| {name} | {middle} | {off.mean():.1f} | {off.max():.1f} | {over:.3f} | {fast:.2f} | {spent:.2f} |")
 
 
 if __name__ == "__main__":

@@ -43,10 +43,10 @@ _LONG = 15
 """Number of frames of contact beyond which a contact point gets a larger weight. A pull of 1 per frame, as that of a
 limb 1 rad off, then moves the point by at most ``_LONG^2 / 4`` over ``Weights.stance``, which is 0.06 mm.
 """
-_AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
-"""Shares of a joint's range: a leg joint within 1 % of an end, or an arm joint within 5 % (a GR3's elbow extends 3 %
-beyond straight), starts from a bent position. That position is 1 rad from the end, or the middle of the range if
-nearer.
+_AT_END, _ARM_AT_END, _FINGER_AT_END, _BENT = 0.01, 0.05, 0.25, 1.0
+"""Shares of a joint's range: a leg joint within 1 % of an end, an arm joint within 5 % (a GR3's elbow extends 3 %
+beyond straight), or a finger's within 25 % (a LEAP's extend up to 21 %) starts from a bent position. That position is
+1 rad from the end, or the middle of the range if nearer.
 """
 
 
@@ -348,7 +348,8 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     """Return the home configuration with limb joints that are at an end of their range moved inside it. (nq,).
 
     A straight limb that bends to one side only is singular. The range bound blocks its hinge, and a rotation of the
-    hinge does not move the limb's end to first order, so the solver cannot bend it.
+    hinge does not move the limb's end to first order, so the solver cannot bend it. A finger that bends backwards too
+    would stay bent to that side.
     """
     q = np.array(robot.q0)
     scalar, index = scalar_layout(robot)
@@ -356,7 +357,8 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     legs = [end.endswith(("knee", "ankle")) for _, end in profile.followed]
     bodies = [robot.tree.frame_bodies[robot.tree.frame(frame)] for frame in ends]
     each = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).astype(bool)
-    moves, at_end = each.any(0), np.where(each[legs].any(0), _AT_END, _ARM_AT_END)
+    outer = _FINGER_AT_END if profile.is_hand else _ARM_AT_END
+    moves, at_end = each.any(0), np.where(each[legs].any(0), _AT_END, outer)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     for dof in np.flatnonzero(scalar & moves & np.isfinite(upper - lower)):
         width, home = upper[dof] - lower[dof], q[index[dof]]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
+import jax.numpy as jnp
 import numpy as np
 
-from ..kinematics import Kinematics
+from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._home import home_kinematics
 from ..robot import Robot
+from ..robot._joint_selection import scalar_layout
 from ._goals import Weights
 from ._limbs import ORIGIN, Chain, find_end
 from ._profile import Place, Profile
@@ -26,13 +29,19 @@ _WORDS = {
 hand's have two letters (``rh_FFJ4``).
 """
 _BASE = r"palm|hand|wrist|base"
-_HAND = r"hand|palm|finger|thumb"
+_HAND = r"hand|palm|finger|thumb|(?:^|_)f\d"
+_TIPS = ("tip", "head|end|tool|tcp")
+"""Names of frames at the end of a finger, the preferred ones first."""
 _MOST_WRIST, _LEAST_FINGERS, _LEAST_JOINTS, _LARGEST = 2, 3, 2, 0.4
 """Bounds of what counts as a hand: two joints before the palm at most, three fingers of two joints at least, and joints
 within 0.4 m of each other.
 """
 _SAME = 2e-3
 """Joints nearer to each other than this [m] are one knuckle."""
+_APART, _SIDE, _FLEXED = 1e-2, 5e-3, 0.3
+"""Least distance between the last joints of two fingers of one branch [m], of the thumb from the middle of the other
+knuckles along them [m], and the angle by which fingers are bent to see where the palm is [rad].
+"""
 _LIMB = 100.0
 """Weight of a hand's reaches. With a body's, posture pulls tips off by a millimetre, and the damping of the plan's
 steps (1 at least) outweighs the rows of fingers: a tip out of reach ends the iterations before the others are there.
@@ -43,20 +52,24 @@ def guess_hand(robot: Robot) -> Profile | None:
     """Return the profile of a robot hand with a fixed base, or None if the robot is none.
 
     Fingers are told by their names. Without names the thumb is the finger that points most away from the others, and
-    the others are in order from its side. The wrist is the palm's joint, else a frame of the palm that is
-    about as far behind the middle knuckle as that finger is long, else the point there.
+    the others are in order from its side; with the thumb in their middle, it is a right hand. The wrist is the palm's
+    joint, else a frame of the palm that is about as far behind the middle knuckle as that finger is long, else the
+    point there.
     """
     tree = robot.tree
-    if robot.floating_base or not any(re.search(_HAND, name, re.IGNORECASE) for name in tree.frame_names):
+    names = *tree.frame_names, *tree.joint_names
+    if robot.floating_base or not any(re.search(_HAND, name, re.IGNORECASE) for name in names):
         return None
     kinematics = home_kinematics(robot)
     palm, chains = _palm(robot, kinematics)
-    if len(chains) < _LEAST_FINGERS or len(chains) > len(FINGERS):
+    if not chains:
         return None
     keypoints: dict[str, Place] = {}
     points: dict[str, np.ndarray] = {}
-    tips = [find_end(robot, kinematics, chain, len(chain.bodies) - 1) for chain in chains]
-    for finger, k in _named(robot, chains, np.array([at for _, at in tips])).items():
+    tips = [
+        find_end(robot, kinematics, chain, len(chain.bodies) - 1, patterns=_TIPS, least_share=0.0) for chain in chains
+    ]
+    for finger, k in _named(robot, chains, [place for place, _ in tips], np.array([at for _, at in tips])).items():
         knuckles = _knuckles(chains[k])
         for joint, i in enumerate(knuckles, 1):
             keypoints[f"{finger}_{joint}"] = tree.body_names[chains[k].bodies[i]], ORIGIN
@@ -67,25 +80,40 @@ def guess_hand(robot: Robot) -> Profile | None:
 
 
 def _palm(robot: Robot, kinematics: Kinematics) -> tuple[int, list[Chain]]:
-    """Return the body that the most fingers begin at, and the fingers; none if the robot is no hand."""
+    """Return the body that the most fingers begin at, the last of several, and the fingers; none if it is no hand."""
     tree, position = robot.tree, np.asarray(kinematics.body_position)
-    own = _joints_of(robot)
-    best: tuple[int, list[Chain]] = (0, [])
-    for palm in range(len(tree.body_parents)):
-        above = np.flatnonzero(tree.descendants[:, palm])
-        if sum(own[b] for b in above) > _MOST_WRIST:
-            continue
-        chains = []
-        for child in (b for b, parent in enumerate(tree.body_parents) if parent == palm and b != palm):
-            below = np.flatnonzero(tree.descendants[child])
-            last = max(below, key=lambda b: (sum(own[np.flatnonzero(tree.descendants[:, b])]), -b))
-            bodies = [int(b) for b in np.flatnonzero(tree.descendants[:, last] & tree.descendants[child]) if own[b]]
-            if sum(own[bodies]) >= _LEAST_JOINTS:
-                chains.append(Chain(tuple(bodies), position[bodies]))
-        if len(chains) > len(best[1]):
+    own, found = _joints_of(robot), []
+    above = own @ tree.descendants  # joints that move each body
+    for palm in np.flatnonzero(above <= _MOST_WRIST).tolist():
+        fingers = [bodies for child in _children(robot, palm) for bodies in _fingers(robot, own, position, child)]
+        chains = [
+            Chain(bodies, position[list(bodies)])
+            for bodies in fingers
+            if own[list(bodies)].sum() >= _LEAST_JOINTS and above[bodies[0]] - own[bodies[0]] <= _MOST_WRIST
+        ]
+        if _LEAST_FINGERS <= len(chains) <= len(FINGERS):
             at = np.concatenate([chain.anchors for chain in chains])
-            best = (palm, chains) if np.ptp(at, axis=0).max() < _LARGEST else best
-    return best
+            found += [(palm, chains)] if np.ptp(at, axis=0).max() < _LARGEST else []
+    first, most = max(found, key=lambda one: len(one[1]), default=(0, []))
+    inside = [one for one in found if len(one[1]) == len(most) and tree.descendants[first, one[0]]]
+    return max(inside, key=lambda one: above[one[0]], default=(first, most))
+
+
+def _children(robot: Robot, body: int) -> list[int]:
+    return [b for b, parent in enumerate(robot.tree.body_parents) if parent == body and b != body]
+
+
+def _fingers(robot: Robot, own: np.ndarray, position: np.ndarray, body: int) -> list[tuple[int, ...]]:
+    """Return the bodies with joints of the fingers from a body on: of each branch, or of the one with the most joints.
+
+    A branch has two joints or more, and ends apart from the others; else it is a bar of a finger's mechanism.
+    """
+    below = [bodies for child in _children(robot, body) for bodies in _fingers(robot, own, position, child)]
+    fingers = [bodies for bodies in below if own[list(bodies)].sum() >= _LEAST_JOINTS]
+    ends = [position[bodies[-1]] for bodies in fingers]
+    if len(ends) > 1 and min(_away(a, b) for a, b in itertools.combinations(ends, 2)) > _APART:
+        return fingers
+    return [((body,) if own[body] else ()) + max(below, key=lambda bodies: own[list(bodies)].sum(), default=())]
 
 
 def _joints_of(robot: Robot) -> np.ndarray:
@@ -93,10 +121,10 @@ def _joints_of(robot: Robot) -> np.ndarray:
     return np.bincount(np.asarray(robot.tree.joint_bodies, int), minlength=len(robot.tree.body_parents))
 
 
-def _named(robot: Robot, chains: list[Chain], tips: np.ndarray) -> dict[str, int]:
-    """Return the index of each finger's chain, in the order of ``FINGERS``."""
+def _named(robot: Robot, chains: list[Chain], places: list[Place], tips: np.ndarray) -> dict[str, int]:
+    """Return the index of each finger's chain, in the order of ``FINGERS``; ``places`` are those of the tips."""
     tree, found = robot.tree, {}
-    parts = [[tree.body_names[b] for b in chain.bodies] for chain in chains]
+    parts = [[*(tree.body_names[b] for b in chain.bodies), tip] for chain, (tip, _) in zip(chains, places, strict=True)]
     for chain, names in zip(chains, parts, strict=True):
         names += [n for n, body in zip(tree.joint_names, tree.joint_bodies, strict=True) if body in chain.bodies]
     for finger, word in _WORDS.items():
@@ -111,8 +139,23 @@ def _named(robot: Robot, chains: list[Chain], tips: np.ndarray) -> dict[str, int
     others = [k for k in range(len(chains)) if k != thumb]
     from_middle = first - first[others].mean(0)
     across = np.linalg.svd(from_middle[others])[2][0]
-    side = from_middle @ (across if across @ from_middle[thumb] >= 0.0 else -across)
+    towards = across @ from_middle[thumb]
+    if abs(towards) < _SIDE:
+        bends = _bent(robot, [places[k] for k in others]) - tips[others]
+        towards = np.cross(across, along[others].sum(0)) @ bends.sum(0)
+    side = from_middle @ (across if towards >= 0.0 else -across)
     return dict(zip(FINGERS, [thumb, *sorted(others, key=lambda k: -side[k])], strict=False))
+
+
+def _bent(robot: Robot, places: list[Place]) -> np.ndarray:
+    """Return points in the world [m] with all hinges turned from home into the larger part of their ranges. (k, 3)."""
+    scalar, index = scalar_layout(robot)
+    hinges, q = scalar & np.asarray(robot.tree.turning), np.array(robot.q0)
+    room = np.asarray(robot.position_upper) + np.asarray(robot.position_lower) - 2.0 * q[index]
+    q[index[hinges]] += _FLEXED * np.sign(np.where(np.isfinite(room), room, 0.0))[hinges]
+    kinematics = forward_kinematics(robot, jnp.asarray(q))
+    positions, rotations = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
+    return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
 
 
 def _away(a: np.ndarray, b: np.ndarray) -> float:
@@ -132,7 +175,9 @@ def _wrist(robot: Robot, kinematics: Kinematics, palm: int, points: dict[str, np
     if _joints_of(robot)[palm]:
         return _frame(robot, palm), ORIGIN
     names = zip(robot.tree.frame_names, robot.tree.frame_bodies, strict=True)
+    fingers = re.compile("|".join(_WORDS.values()), re.IGNORECASE)
     named = [name for name, body in names if body == palm and re.search(_BASE, name, re.IGNORECASE)]
+    named = [name for name in named if not fingers.search(name)]
     length, at = float(np.linalg.norm(along)), {name: kinematics.frame_pose(robot, name) for name in named}
     far = {name: _away(np.asarray(position), knuckle) for name, (position, _) in at.items()}
     behind = {name: _away(np.asarray(at[name][0]), knuckle - along) for name in named if far[name] > 0.5 * length}

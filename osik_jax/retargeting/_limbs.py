@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -13,7 +14,7 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..robot._tree import BALL, HINGE
-from ._link_shapes import mesh_vertices
+from ._link_shapes import SHAPES, geom_points
 from ._profile import Place, Point
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
@@ -207,23 +208,42 @@ def _hand(robot: Robot, arm: Chain) -> int:
     return len(arm.bodies) - 1
 
 
-def find_end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tuple[Place, np.ndarray]:
-    """Return the end of an arm's last link as a place and in the world [m]: a hand frame, else its far end."""
+def find_end(
+    robot: Robot,
+    kinematics: Kinematics,
+    arm: Chain,
+    last: int,
+    *,
+    patterns: Sequence[str] = _HANDS,
+    least_share: float = _LEAST_FOREARM,
+) -> tuple[Place, np.ndarray]:
+    """Return the end of the last link of an arm or finger as a place and in the world [m].
+
+    It is a named frame, else the link's far end.
+
+    Args:
+        robot: the robot.
+        kinematics: at home.
+        arm: the arm or finger.
+        last: index of its last joint.
+        patterns: names of frames at the end, the preferred ones first.
+        least_share: least distance of such a frame from the last joint, as a share of the upper arm.
+    """
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
-    least = _LEAST_FOREARM * float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
+    upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
     names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
-    for pattern in _HANDS:
+    for pattern in patterns:
         at = {
             name: np.asarray(kinematics.frame_pose(robot, name)[0])
             for name in names
             if re.search(pattern, name, re.IGNORECASE)
         }
         far = {name: float(np.linalg.norm(place - anchor)) for name, place in at.items()}
-        far = {name: length for name, length in far.items() if length > max(least, _SAME)}
+        far = {name: length for name, length in far.items() if length > max(least_share * upper, _SAME)}
         if far:
             nearest = min(far, key=lambda name: (far[name], name))
             return (nearest, ORIGIN), at[nearest]
-    most = _MOST_FOREARM / _LEAST_FOREARM * least if least > 0.0 else np.inf  # no upper arm to compare with
+    most = _MOST_FOREARM * upper if upper > 0.0 else np.inf  # no upper arm to compare with
     end = _far_end(robot, body, anchor, most)
     position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, _name(robot, body)))
     x, y, z = np.round((end - position) @ rotation, 6).tolist()
@@ -231,13 +251,15 @@ def find_end(robot: Robot, kinematics: Kinematics, arm: Chain, last: int) -> tup
 
 
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:
-    """Return the end of a body along the line from its joint to its middle, by its meshes, else by its masses [m].
+    """Return the end of a body along the line from its joint to its middle [m].
+
+    It is that of its meshes; without them, that of its other shapes or masses, whichever is farther.
 
     Args:
         robot: the robot.
         body: index of the body; bodies fixed to it are included.
         anchor: position of its joint in the world [m]. (3,)
-        most: largest length accepted from masses [m].
+        most: largest length accepted without meshes [m].
     """
     model = robot.mj_model
     data = mujoco.MjData(model)
@@ -245,12 +267,15 @@ def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.nda
     mujoco.mj_kinematics(model, data)
     own = model.body(robot.tree.body_names[body]).id
     fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[own]]
-    points = _vertices(model, data, fixed)
-    if len(points):
+    geoms = np.flatnonzero(np.isin(model.geom_bodyid, fixed) & np.isin(model.geom_type, SHAPES))
+    meshes = geoms[model.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_MESH]
+    if len(meshes):
+        points = _points(model, data, meshes)
         return _farthest(points, points.mean(0), anchor, np.inf)
     masses = model.body_mass[fixed]
     middle = masses @ data.xipos[fixed] / max(float(masses.sum()), 1e-12)
-    return _farthest(np.concatenate([_rod(model, data, b) for b in fixed]), middle, anchor, most)
+    points = np.concatenate([_points(model, data, geoms), *(_rod(model, data, b) for b in fixed)])
+    return _farthest(points, middle, anchor, most)
 
 
 def _farthest(points: np.ndarray, middle: np.ndarray, anchor: np.ndarray, most: float) -> np.ndarray:
@@ -259,11 +284,12 @@ def _farthest(points: np.ndarray, middle: np.ndarray, anchor: np.ndarray, most: 
     return anchor + np.clip(((points - anchor) @ along).max(), 0.0, most) * along
 
 
-def _vertices(model: mujoco.MjModel, data: mujoco.MjData, bodies: list[int]) -> Float[np.ndarray, "k 3"]:
-    """Return the mesh vertices of some bodies in the world [m]."""
+def _points(model: mujoco.MjModel, data: mujoco.MjData, geoms: np.ndarray) -> Float[np.ndarray, "k 3"]:
+    """Return the vertices of mesh geoms, and the corners of boxes around others, in the world [m]."""
     out = [np.zeros((0, 3))]
-    for geom in np.flatnonzero((model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & np.isin(model.geom_bodyid, bodies)):
-        out.append(data.geom_xpos[geom] + mesh_vertices(model, int(geom)) @ data.geom_xmat[geom].reshape(3, 3).T)
+    for geom in geoms:
+        body = model.geom_bodyid[geom]
+        out.append(data.xpos[body] + geom_points(model, int(geom)) @ data.xmat[body].reshape(3, 3).T)
     return np.concatenate(out)
 
 

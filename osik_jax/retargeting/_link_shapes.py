@@ -75,7 +75,7 @@ def by_shapes(robot: Robot, body: int) -> Extent | None:
 
     Mesh files that the model does not contain are read from disk; unreadable files are left out.
     """
-    clouds = [_geom_points(robot.mj_model, geom) for geom in _solid_geoms(robot.mj_model, body)]
+    clouds = [geom_points(robot.mj_model, geom) for geom in _solid_geoms(robot.mj_model, body)]
     clouds += _unread_points(robot, body)
     if not clouds:
         return None
@@ -90,11 +90,10 @@ def by_shapes(robot: Robot, body: int) -> Extent | None:
 
 def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
     solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    kinds = (*_HALVES, int(_GEOM.mjGEOM_MESH))
-    return np.flatnonzero(solid & (model.geom_bodyid == body) & np.isin(model.geom_type, kinds)).tolist()
+    return np.flatnonzero(solid & (model.geom_bodyid == body) & np.isin(model.geom_type, SHAPES)).tolist()
 
 
-def _geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
+def geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
     """Return the corners of the box around a geom, or the vertices of a mesh, in the body's frame [m]."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     if kind in _HALVES:
@@ -133,3 +132,5 @@ _HALVES = {
     int(_GEOM.mjGEOM_BOX): np.array,
 }
 """Half lengths of the box around a geom [m], from MuJoCo's sizes."""
+SHAPES = (*_HALVES, int(_GEOM.mjGEOM_MESH))
+"""Kinds of geoms with a size."""
