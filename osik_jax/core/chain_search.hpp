@@ -58,8 +58,8 @@ template <class Call> struct ChainSearch {
 
   void place() {
     for (int j = 0; j < joints; ++j) {
-      const Real angle = (coordinate[j] < 0 ? 0 : x[coordinate[j]] * factor[j]) + offset[j], half = sin(Real(0.5) * angle);
-      const Real f = hinge[j] ? sin(angle) : angle, g = hinge[j] ? 2 * half * half : 0;
+      const Real angle = (coordinate[j] < 0 ? 0 : x[coordinate[j]] * factor[j]) + offset[j], half = Real(0.5) * angle;
+      const Real s = sin(half), f = hinge[j] ? 2 * s * cos(half) : angle, g = hinge[j] ? 2 * s * s : 0;
       Real local[12];
       for (int i = 0; i < 12; ++i)
         local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
@@ -108,8 +108,9 @@ template <class Call> struct ChainSearch {
         if (row[6 * f + i] >= 0) column[row[6 * f + i]] = off[i];
     }
   }
-  // Solve gram y = e by elimination, of which the lower triangle is given; y in place of e.
-  void eliminate() {
+  // Solve gram y = e by elimination, of which the lower triangle is given; y in place of e. ROWS: 0 or known before.
+  template <int ROWS> void eliminate() {
+    const int rows = ROWS ? ROWS : this->rows;
     for (int k = 0; k < rows; ++k) {
       Real* const pivot = gram + k * rows;
       for (int i = k + 1; i < rows; ++i) {
@@ -125,7 +126,8 @@ template <class Call> struct ChainSearch {
     }
   }
   // The errors at x, and the next point in its place.
-  Errors step(In goal) {
+  template <int ROWS> Errors step(In goal) {
+    const int rows = ROWS ? ROWS : this->rows;
     place();
     const Errors found = compare(goal);
     const Real damping = numbers[4] * found.cost + numbers[5] * numbers[0] * numbers[0];
@@ -144,7 +146,7 @@ template <class Call> struct ChainSearch {
     for (int j = 0; j < n && near; ++j)
       for (int a = 0; a < rows; ++a) e[a] += J[j * rows + a] * home[j];
     if (!near && found.score <= numbers[3]) return found;
-    eliminate();
+    eliminate<ROWS>();
     for (int j = 0; j < n; ++j) {
       Real to = x[j] + home[j];
       for (int a = 0; a < rows; ++a) to -= J[j * rows + a] * e[a];
@@ -169,7 +171,7 @@ template <class Call> void advance_chain(const Call& call) {
     for (int step = 0; step < integers[0]; ++step) {
       if (step + 1 == integers[0])
         for (int j = 0; j < n; ++j) here[j] = at[j];
-      found = search.step(call.in(1, lane));
+      found = search.rows == 6 ? search.template step<6>(call.in(1, lane)) : search.template step<0>(call.in(1, lane));
     }
     for (int j = 0; j < n; ++j) there[j] = at[j];
     errors[0] = found.position, errors[1] = found.orientation, errors[2] = found.score, errors[3] = found.cost;
