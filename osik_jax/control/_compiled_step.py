@@ -23,11 +23,11 @@ from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._kernels import dof_columns, tree_integers
 from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
-from ..numerics._constants import FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
+from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..robot import Robot
 from ..robot._balls import independent_balls
 from ..robot._joint_selection import dofs_of, is_scalar, scalar_layout
-from ..schemes import HierarchicalQP, Scheme, WeightedQP
+from ..schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ..solvers.hqp import Tolerances
 from ..tasks import AdaptiveGain, ComTask, FrameTask, PostureTask, RelativeFrameTask, Task
 from ..tasks._com import axis_numbers
@@ -36,6 +36,7 @@ from ._solution import Solution
 _SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
 _LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
 _POSE, _CENTER, _POSTURE = range(3)
+_WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
 
 
@@ -60,8 +61,9 @@ def is_compiled(
 
 def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
     """Return the first part of a step that the core does not know, in words; None if it knows all."""
-    if type(scheme) not in (WeightedQP, HierarchicalQP):
-        return f"the scheme {type(scheme).__name__}"
+    if _kind(scheme) is None:
+        method = f" with method={scheme.method!r}" if type(scheme) is NullSpace else ""
+        return f"the scheme {type(scheme).__name__}{method}"
     if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
         return f"a {type(scheme).__name__} with max_iterations"
     for limit in limits:
@@ -71,6 +73,13 @@ def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits
             return "the limit ConfigurationLimit of a robot with ball joints"
     reasons = ((name, _unknown(robot, task)) for name, task in tasks.items())
     return next((f"the task {name!r}, which {reason}" for name, reason in reasons if reason), None)
+
+
+def _kind(scheme: Scheme) -> int | None:
+    """Return the core's number of a scheme (``StepScheme``), None for one that it does not know."""
+    if type(scheme) is NullSpace:
+        return {"classical": _CLASSICAL, "saturated": _SATURATED}.get(scheme.method)
+    return {WeightedQP: _WEIGHTED, HierarchicalQP: _HIERARCHICAL}.get(type(scheme))
 
 
 def _unknown(robot: Robot, task: Task) -> str | None:
@@ -145,8 +154,8 @@ class Layout:
     """
 
     def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme) -> None:
-        self.robot, self.tasks, self.scheme = robot, tasks, scheme
-        nv, by_weight = robot.nv, isinstance(scheme, WeightedQP)
+        self.robot, self.tasks, self.kind = robot, tasks, _kind(scheme)
+        nv, by_weight = robot.nv, self.kind == _WEIGHTED
         self.parts = {name: _rows_of(robot, task) for name, task in tasks.items()}
         self.count = count = {name: rows for name, (_, rows, _) in self.parts.items()}
         self.rows = sum(count.values())
@@ -159,7 +168,8 @@ class Layout:
         self.level = level = {name: ranks.index(task.priority) for name, task in tasks.items()}
         self.of_level = [sum(count[name] for name in tasks if level[name] == k) for k in range(len(ranks))] + [0]
         mixed = {level[name] for name in tasks if bounded[name]}
-        self.hard = [(k, row) for k in sorted(mixed) for row in range(self.of_level[k])]
+        projects = self.kind in (_CLASSICAL, _SATURATED)  # no rows of a level bind those below; a step has no labels
+        self.hard = [(k, row) for k in sorted(mixed) for row in range(self.of_level[k]) if not projects]
         intervals, dense = (
             sum(count[name] for name in tasks if bounded[name] == flag and not single[name]) for flag in (True, False)
         )
@@ -167,7 +177,8 @@ class Layout:
         if by_weight:
             self.labels, self.sizes = [(nv + intervals,)], (dense, intervals, 0, 0, 20 * (nv + intervals))
         else:
-            self.labels, self.sizes = [(levels, h), (levels, longest)], (longest, 0, levels, h, 10 * (nv + longest))
+            self.labels = [] if projects else [(levels, h), (levels, longest)]
+            self.sizes = longest, 0, levels, h, 10 * (nv + (2 if projects else longest))
 
     def integers(self, places: Mapping[int, tuple[int, int, int]], given: tuple[Any, ...], box: int) -> np.ndarray:
         """Return what ``Step`` in ``core/step.hpp`` reads.
@@ -178,15 +189,16 @@ class Layout:
             box: number of the leaf with the lower bounds of the box, before that of the upper ones; -1: by the limits.
         """
         robot, q, tasks, scheme, limits, dt, _ = given
-        tree, nv, by_weight = self.robot.tree, self.robot.nv, isinstance(scheme, WeightedQP)
-        of_limits = [] if box >= 0 else [_leaves_of_limit(limit) for limit in limits if type(limit) is not NoLimits]
+        tree, nv, by_weight = self.robot.tree, self.robot.nv, self.kind == _WEIGHTED
+        of_limits = [_leaves_of_limit(limit) for limit in limits if type(limit) in (ConfigurationLimit, VelocityLimit)]
         bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
         nq, *of_tree = tree_integers(tree)
         scalar, place = scalar_layout(self.robot)
-        numbers = [not by_weight, len(places), nq, self.robot.nq, bodies, joints, full, nv, len(tasks)]
+        numbers = [self.kind, len(places), nq, self.robot.nq, bodies, joints, full, nv, len(tasks)]
         numbers += [len(of_limits), self.rows, *self.sizes]
         numbers += [number for leaf in sorted(places) for number in places[leaf]]
         numbers += [q, dt, scheme.damping, scheme.curvature_damping, box, box + 1]
+        numbers += [getattr(scheme, name, -1) for name in ("potential_gain", "margin", "rank_tolerance")]
         numbers += [robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
         numbers += [robot.joint_position, robot.joint_axis, robot.body_mass, robot.body_com]
         numbers += [robot.frame_position, robot.frame_rotation]
@@ -207,10 +219,12 @@ class Layout:
     def constants(self, dtype: Any) -> np.ndarray:
         """Return what ``StepData`` has under this name."""
         tree = self.robot.tree
-        if isinstance(self.scheme, WeightedQP):
+        if self.kind == _WEIGHTED:
             tolerances = [FEASIBILITY, KKT_TOLERANCE[dtype]]
-        else:
+        elif self.kind == _HIERARCHICAL:
             tolerances = list(Tolerances(rank=HIERARCHY_RANK[dtype]))
+        else:
+            tolerances = [ENTRY_ROUNDOFF * jnp.finfo(dtype).eps]
         return np.concatenate([tree.qpos_source[1], dof_columns(tree)[1], [jnp.finfo(dtype).max, *tolerances]])
 
 

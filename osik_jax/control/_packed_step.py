@@ -17,7 +17,7 @@ from ..tasks import Task
 from ._compiled_step import Layout, unknown_part
 from ._units import configuration_units, velocity_units
 
-VERSION = 1
+VERSION = 2
 """Version of a file's section ``core`` and of the layout in it; ``SECTION`` in ``core/c/controller.cpp`` is the same
 number. It grows when either changes.
 """

@@ -322,14 +322,14 @@ template <class Team> struct ClassicalProjection : NullSpace<Team> {
     move();
     this->narrow_box();
   }
-  // the secondary motion in what the levels leave, the projector onto that, and the answer
+  // the secondary motion in what the levels leave, the projector onto that (null: it is not needed), and the answer
   OSIK_METHOD void end(const double* given, double* x, double* projector) {
     double *secondary = this->WORK, *coordinates = this->COORDINATES;
     t.each(0, n, [&](int i) { secondary[i] = given[i]; });
     t.each(0, n - first, [&](int j) { coordinates[j] = t.own_dot(Z + (first + j) * ld, secondary, 0, n); });
     Base::Algebra::combine(t, this->free_basis(), coordinates, MOTION, ld, n - first, 0, n, false);
     move();
-    this->write_projector(projector);
+    if (projector) this->write_projector(projector);
     t.each(0, n, [&](int i) { x[i] = X[i]; });
   }
 };

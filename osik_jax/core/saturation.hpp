@@ -41,7 +41,7 @@ struct SaturationProblem {
 
 // The results of one problem. Sides are -1 (lower), 1 (upper) or 2 (pinned), 0 for none.
 struct SaturationAnswer {
-  double *x, *projector, *scales;                        // [n], [n, n], [L]
+  double *x, *projector, *scales;                        // [n], [n, n] or null, [L]
   int *ended, *sides, *blocking, *blockers, *active, *report;  // [L], [L, n], [L, n], [L], [n], [2] done, changes
 };
 
@@ -635,7 +635,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
       const bool away = at * at == 1 && fabs(X[i] - its_bound) > BOUND_DISTANCE * (1.0 + fabs(its_bound));
       to.x[i] = X[i], to.active[i] = away ? 0 : at;
     });
-    this->write_projector(to.projector);
+    if (to.projector) this->write_projector(to.projector);
     t.once([&] { to.report[0] = done, to.report[1] = all_changes; });
   }
 };

@@ -1,6 +1,6 @@
 // One control step in one call: what control/_step.py defines, for the tasks that control/_compiled_step.py takes.
 //
-//   configuration -> bodies -> rows of all tasks -> damping -> weighted QP or hierarchy -> certificate -> velocity
+//   configuration -> bodies -> rows of all tasks -> damping -> the scheme's solver -> certificate -> velocity
 //
 // The rows of task k are rows first .. first + m of the matrix of all rows. The weighted scheme has the equalities of
 // frames and of the centre of mass first (`dense` rows), then the inequalities (`intervals`), then the equalities of
@@ -10,11 +10,12 @@
 #include <vector>
 
 #include "certificates.hpp"
+#include "saturation.hpp"
 #include "task_rows.hpp"
 
 namespace osik {
 
-enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1 };
+enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1, CLASSICAL = 2, SATURATED = 3 };  // the last two: NullSpace
 enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2 };
 enum StepLimit { SPEED = 0, RANGE = 1 };  // in the order in which they narrow the box
 enum StepStatus { SOLVED = 0, MAX_ITERATIONS = 1, INFEASIBLE = 2, NUMERICAL_ERROR = 3 };
@@ -22,6 +23,10 @@ enum StepStatus { SOLVED = 0, MAX_ITERATIONS = 1, INFEASIBLE = 2, NUMERICAL_ERRO
 // Sizes of a step; m, p, L and h are those of QPSizes and Sizes.
 struct StepSizes {
   int scheme, leaves, nq, given, bodies, joints, dofs, nv, tasks, limits, rows, m, p, L, h, max_iterations;
+
+  int labels() const {  // for the next warm start
+    return scheme == WEIGHTED ? nv + p : scheme == HIERARCHICAL ? L * (h + m) : 0;
+  }
 };
 
 // An array of numbers of one lane. A scalar is each entry of an array that it stands for.
@@ -84,7 +89,8 @@ class Step {
   Tree<const double*> tree;
   DofColumns<const double*> columns;
   const Place* places;
-  const int *of_step, *of_robot;                      // leaves: q, dt, damping, curvature damping, box; those of the robot
+  const int *of_step, *of_robot;                      // leaves: q, dt, damping, curvature damping, box, those of
+                                                      // NullSpace: potential gain, margin, rank tolerance; the robot's
   const int *source, *owner, *turning, *scalar;       // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
   const int *limits;                                  // [limits, 5] kind and leaves of each
   const int *row_counts, *level_of_hard, *row_of_hard;
@@ -103,7 +109,7 @@ class Step {
     s = *reinterpret_cast<const StepSizes*>(take(sizeof(StepSizes) / sizeof(int)));
     const int R = s.rows, nv = s.nv;
     places = reinterpret_cast<const Place*>(take(3 * s.leaves));
-    of_step = take(6), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
+    of_step = take(9), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
     tree.bodies = s.bodies, tree.joints = s.joints, tree.dofs = s.dofs;
     tree.parents = take(s.bodies), tree.types = take(s.joints), tree.owners = take(s.joints), source = take(s.nq);
     columns = {s.dofs, nv, take(s.dofs), nullptr};
@@ -113,7 +119,7 @@ class Step {
     for (Numbers* v : {&error, &low, &high, &weight, &pull}) v->resize(R + 8);
     levers.resize(s.tasks * nv), curvature.resize(s.tasks), below.resize(4 * s.bodies), zeros.resize(R + 1);
     bounds.resize(s.tasks), parts.resize(larger(R + 3 * s.tasks, s.bodies) + 8), lower.resize(nv), upper.resize(nv), low_speed.resize(nv), high_speed.resize(nv);
-    no_labels.resize(s.L * s.h + s.L * s.m + nv + s.p);
+    no_labels.resize(s.labels());
     double *body = poses.data(), *dof = body + 12 * s.bodies;
     placed = {body, body + 3 * s.bodies, dof, dof + 3 * s.dofs, dof + 6 * s.dofs};
     for (int k = 0; k < s.tasks; ++k) {
@@ -131,17 +137,19 @@ class Step {
 
   // clean: whether no number of the arrays is NaN
   void take(const StepData& d, const StepResult& to, bool clean) {
-    const int n = s.nv, labels = s.scheme == WEIGHTED ? n + s.p : s.L * (s.h + s.m);
+    const int n = s.nv;
     const bool valid = find_rows(d, clean);
-    std::fill(to.integers, to.integers + 3 + labels, 0);
+    std::fill(to.integers, to.integers + 3 + s.labels(), 0);
+    if (s.scheme == CLASSICAL || s.scheme == SATURATED) to.integers[2] = s.L - 1;
+    if (s.scheme == CLASSICAL) to.integers[1] = s.L - 1;
     int status = NUMERICAL_ERROR;
     Certificate found{false, d.constants[s.nq + s.dofs]};
     if (valid) {
-      found = s.scheme == WEIGHTED ? solve_weighted(d, to) : solve_hierarchy(d, to);
+      found = s.scheme == WEIGHTED ? solve_weighted(d, to) : s.scheme == HIERARCHICAL ? solve_hierarchy(d, to) : solve_null_space(to);
       status = !(found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n)) ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
     }
     for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
-      to.numbers[j] = nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE, upper[j] > -INFINITE ? upper[j] : INFINITE);
+      to.numbers[j] = s.scheme == CLASSICAL ? 0 : nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE, upper[j] > -INFINITE ? upper[j] : INFINITE);
     to.integers[0] = status;
     report(to, status == NUMERICAL_ERROR ? d.constants[s.nq + s.dofs] : found.residual);
   }
@@ -193,7 +201,8 @@ class Step {
   }
   // A bound of the solver's: where they are the wrong way round, both are in the middle (solvers/_box.py).
   static double order(double low, double high, int side) { return low > high ? 0.5 * (low + high) : side < 0 ? low : high; }
-  // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given. What depends on NaN is NaN.
+  // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given. What depends on NaN is NaN. The classical
+  // projection has no box, whatever its bounds are.
   bool find_box(const double* given) {
     const int nv = s.nv;
     for (int j = 0; j < nv; ++j) lower[j] = of_step[4] < 0 ? -INFINITE : leaf(of_step[4]).at[j];
@@ -204,6 +213,7 @@ class Step {
       const bool of_speed = limit[0] == SPEED;
       const Leaf low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
       valid &= of_speed || all_finite(gain.at, gain.size);
+      if (of_step[4] >= 0) continue;
       auto reach = [&](double bound, double at, double inward, int j) {  // rounded inward
         const double way = bound - at;
         return fabs(bound) < INFINITE ? gain[j] * (way + inward * RANGE_ROUNDOFF * EPSILON * fabs(way)) / dt : bound;
@@ -223,7 +233,7 @@ class Step {
       }
     }
     for (int j = 0; j < nv; ++j) {
-      valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= lower[j] <= upper[j];
+      if (s.scheme != CLASSICAL) valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= lower[j] <= upper[j];
       low_speed[j] = order(lower[j], upper[j], -1), high_speed[j] = order(lower[j], upper[j], 1);
     }
     return valid;
@@ -290,7 +300,7 @@ class Step {
       }
     }
     for (int i = 0; i < m; ++i) {
-      const bool counts = task.weight[i] > 0 || s.scheme == HIERARCHICAL;  // a row of weight 0 has no bounds
+      const bool counts = task.weight[i] > 0 || s.scheme != WEIGHTED;  // a row of weight 0 has no bounds
       task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
       takes &= task.weight[i] >= 0 || counts || task.bounded || task.diagonal;
       if (task.bounded && counts && task.rows.lower[i] > task.rows.upper[i]) ordered = false;
@@ -447,13 +457,10 @@ class Step {
     }
   }
 
-  // ---- the hierarchy (schemes/_hierarchical.py)
+  // ---- levels (schemes/_scheme.py)
   Numbers level_rows, level_lower, level_upper, hard, hard_lower, hard_upper, dampings, bends, found_numbers;
   std::vector<int> equality, pinned, found_labels;
-  std::vector<char> hierarchy_space;
-  std::vector<Hierarchy<Team>> hierarchy;
 
-  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, row_counts, level_of_hard, row_of_hard}; }
   // the rows of all levels, their weights' roots multiplied in, and the hard ones among them
   void add_levels() {
     const int n = s.nv;
@@ -492,6 +499,12 @@ class Step {
       for (int j = 0; j < s.nv; ++j) own[j] *= factor;
     }
   }
+
+  // ---- the hierarchy (schemes/_hierarchical.py)
+  std::vector<char> hierarchy_space;
+  std::vector<Hierarchy<Team>> hierarchy;
+
+  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, row_counts, level_of_hard, row_of_hard}; }
   Certificate solve_hierarchy(const StepData& d, const StepResult& to) {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     add_levels();
@@ -515,6 +528,88 @@ class Step {
     return found;
   }
 
+  // ---- the projections (schemes/_null_space.py)
+  Numbers targets, separate, scales;  // [L, n] only the last level has a target; damping of each level [3, L]; [L]
+  std::vector<int> projection_labels;
+  std::vector<ClassicalProjection<Team>> projection;
+  std::vector<Saturation<Team>> saturation;
+
+  double of_scheme(int k) const { return *leaf(of_step[k]).at; }
+  // descent of the joint-limit potential (limit_potential_gradient); returns whether it is finite
+  bool find_descent(double* out) {
+    const double potential_gain = of_scheme(6), margin = of_scheme(7);
+    double *from = center.data(), *to = from + s.nv;
+    int count = 0;
+    for (int j = 0; j < s.nv; ++j) {
+      from[j] = -INFINITE, to[j] = INFINITE;
+      for (const int* limit = limits; limit < limits + 5 * s.limits && scalar[j] >= 0; limit += 5)
+        if (limit[0] == RANGE) from[j] = larger(from[j], leaf(limit[1])[j]), to[j] = least(to[j], leaf(limit[2])[j]);
+      count += from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j];
+    }
+    for (int j = 0; j < s.nv; ++j) {
+      double gradient = 0;
+      if (from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j]) {
+        const double span = to[j] - from[j], at = nearest(leaf(of_step[0]).at[scalar[j]], from[j] + margin * span, to[j] - margin * span);
+        gradient = span * (2 * at - to[j] - from[j]) / (2 * count * square(to[j] - at) * square(at - from[j]));
+      }
+      out[j] = -potential_gain * gradient;
+    }
+    return all_finite(out, s.nv);
+  }
+  Certificate solve_null_space(const StepResult& to) {
+    const int n = s.nv, L = s.L, m = s.m, own = L - 1;  // the last level has no rows: the secondary motion
+    double *x = to.numbers, *secondary = &targets[own * n], scale = 1;
+    add_levels();
+    add_dampings();
+    if (!find_descent(secondary) || !all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n)) return {false, INFINITE};
+    if (s.scheme == CLASSICAL) {
+      projection[0].rank_tol = of_scheme(8);
+      projection[0].begin();
+      for (int k = 0; k < own; ++k)
+        projection[0].solve_level({&level_rows[k * m * n], &level_lower[k * m], &level_upper[k * m], &bends[k * n], &equality[k * m],
+                                   dampings[3 * k], dampings[3 * k + 1], dampings[3 * k + 2], row_counts[k], n, 1});
+      projection[0].end(secondary, x, nullptr);
+      return {true, first_residual(x, x, 1)};
+    }
+    for (int k = 0; k < 3 * L; ++k) separate[k % 3 * L + k / 3] = dampings[k];
+    remove_roundoff();
+    const double* each = separate.data();
+    int *sides = found_labels.data(), report[2];
+    const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
+                              targets.data(), low_speed.data(), high_speed.data(), equality.data(), of_scheme(8), s.max_iterations, L, m};
+    saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
+                            sides + 2 * L + 2 * L * n, report});
+    to.integers[1] = report[1], to.integers[2] += report[1];
+    for (int j = 0; j < n; ++j) center[j] = nearest(0, lower[j], upper[j]);
+    return {report[0] != 0, first_residual(x, center.data(), scales[0])};
+  }
+  // entries that are roundoff of their row are 0 (solvers/null_space/_padding.py)
+  void remove_roundoff() {
+    const int n = s.nv;
+    for (int i = 0; i < s.L * s.m; ++i) {
+      double* row = &level_rows[i * n];
+      double largest = 0;
+      for (int j = 0; j < n; ++j) largest = larger(largest, fabs(row[j]));
+      for (int j = 0; j < n; ++j) row[j] = fabs(row[j]) <= tolerances[0] * largest ? 0 : row[j];
+    }
+  }
+  // Largest entry of the gradient of what the first level misses of its motion from `start` at this scale.
+  double first_residual(const double* x, const double* start, double scale) {
+    const int n = s.nv;
+    double *gradient = &separate[3 * s.L], largest = 0;
+    for (int j = 0; j < n; ++j) gradient[j] = 0;
+    for (const Task& task : tasks)
+      for (int i = 0; i < task.m && task.level == 0; ++i) {
+        const double *row = task.rows.jacobian + i * n, begun = Team::own_dot(row, start, 0, n);
+        const double off = begun - nearest(begun, task.rows.lower[i], task.bounded ? task.rows.upper[i] : task.rows.lower[i]);
+        const double missed = larger(task.weight[i], 0.0) * (Team::own_dot(row, x, 0, n) - begun + scale * off);
+        for (int j = 0; j < n; ++j) gradient[j] += missed * row[j];
+      }
+    for (int j = 0; j < n; ++j)
+      if (s.scheme == CLASSICAL || lower[j] != upper[j]) largest = larger(largest, fabs(gradient[j]));
+    return largest <= LARGEST_DOUBLE ? largest : LARGEST_DOUBLE;
+  }
+
   void begin_solvers() {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     center.resize(3 * n + 8), above.resize(n);
@@ -529,9 +624,20 @@ class Step {
     level_rows.resize(L * m * n + 8), level_lower.assign(L * m, -INFINITE), level_upper.assign(L * m, INFINITE);
     hard.resize((h - n) * n + 8), hard_lower.resize(h), hard_upper.resize(h), equality.resize(L * m), pinned.resize(h);
     dampings.resize(3 * L), bends.resize(L * n), found_numbers.resize(L * h + 2 * L + 1);
-    found_labels.resize(n + L * h + L * m + L), hierarchy_space.resize(Hierarchy<Team>::bytes(sizes()));
-    dampings[3 * L - 3] = 1;  // the last level has no rows: the smallest velocity
-    hierarchy.emplace_back(sizes(), hierarchy_space.data());
+    found_labels.resize(n + L * (2 + larger(h, n) + larger(m, n)));
+    if (s.scheme == HIERARCHICAL) {
+      dampings[3 * L - 3] = 1;  // the last level has no rows: the smallest velocity
+      hierarchy_space.resize(Hierarchy<Team>::bytes(sizes()));
+      hierarchy.emplace_back(sizes(), hierarchy_space.data());
+      return;
+    }
+    targets.resize(L * n), separate.resize(3 * L + n), scales.resize(L);
+    auto begin = [&]<class Method>(std::vector<Method>& method, int rows) {
+      solver_space.resize(Method::doubles(n, rows)), projection_labels.resize(Method::integers(n, rows));
+      method.emplace_back(n, rows, solver_space.data(), projection_labels.data());
+    };
+    if (s.scheme == CLASSICAL) begin(projection, m);
+    else begin(saturation, m > n ? m : n);  // joints that stop a level are factored like rows
   }
 
   // slack and error of each row, in the order of the tasks' names; what is not finite is 0

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,19 @@ from osik_jax.core import _build
 from osik_jax.core._library import core
 
 SOURCES = _build.FOLDER / "c"
-STORED = Path(__file__).parents[1] / "data" / "controller_1.json"
+STORED = Path(__file__).parents[1] / "data" / "controller_2.json"
 COMPILER = shutil.which(os.environ.get("CXX") or "c++")
 COUNT = 10_000
 pytestmark = [
     pytest.mark.slow,  # half a minute of compiling
     pytest.mark.skipif(COMPILER is None, reason="THE C LIBRARY IS NOT TESTED: no C++ compiler"),
 ]
-SCHEMES = {"weighted": osik.WeightedQP, "hierarchy": osik.HierarchicalQP}
+SCHEMES = {
+    "weighted": osik.WeightedQP,
+    "hierarchy": osik.HierarchicalQP,
+    "null-space": osik.NullSpace,
+    "saturated": partial(osik.NullSpace, method="saturated"),
+}
 
 
 def run(*command: Any, **options: Any) -> str:
@@ -123,7 +129,7 @@ def nao() -> tuple[osik.Robot, dict[str, osik.Task]]:
     return robot, {**feet, "com": com, "hand": hand, "rest": osik.PostureTask(robot, priority=3)}
 
 
-@pytest.mark.variants(release=["arm-hierarchy", "nao-weighted"])
+@pytest.mark.variants(release=["arm-hierarchy", "nao-weighted", "arm-null-space", "nao-saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("make", [arm, nao], ids=["arm", "nao"])
 def test_ten_thousand_steps_are_those_of_python(built, tmp_path, make: Callable[[], Any], scheme):
@@ -236,7 +242,7 @@ def test_other_files_are_refused_with_the_reason(built, tmp_path):
         "cut off at its end": (text[:-2], "not as osik_jax.save_controller wrote it"),
         "older": (text[:section] + "\n}\n", "an older osik_jax wrote it: save it again"),
         "edited": (text[:weight] + text[weight:].replace("1.0", "2.0", 1), "in place of editing it"),
-        "newer": (signed(text.replace('"core": {"version": 1', '"core": {"version": 2')), "another release"),
+        "newer": (signed(text.replace('"core": {"version": 2', '"core": {"version": 3')), "another release"),
         "a part less": (signed(text.replace('"numbers"', '"number"')), 'no "numbers"'),
         "no JSON": (signed(text.replace('"numbers": [', '"numbers": [x')), "cannot be read"),
     }
@@ -248,7 +254,9 @@ def test_other_files_are_refused_with_the_reason(built, tmp_path):
     refuses(ValueError, "none.json: it cannot be read", Controller, built, tmp_path / "none.json")
     robot, tasks = arm()
     hand, frame = tasks["hand"], osik.FrameTask
-    lacking: dict[str, dict[str, Any]] = {"the scheme NullSpace": dict(scheme=osik.NullSpace())}
+    lacking: dict[str, dict[str, Any]] = {
+        "the scheme NullSpace with method='reverse'": dict(scheme=osik.NullSpace(method="reverse"))
+    }
     lacking["a WeightedQP with max_iterations"] = dict(scheme=osik.WeightedQP(max_iterations=3))
     lacking["the limit AccelerationLimit"] = dict(limits=[osik.AccelerationLimit(robot, {"*": 5.0})])
     fields: list[dict[str, Any]] = [dict(hard=True), dict(gain=osik.AdaptiveGain(2.0, 1.0, 3.0)), dict(error="se3")]

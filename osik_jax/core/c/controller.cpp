@@ -14,7 +14,7 @@
 using namespace osik;
 
 namespace {
-constexpr int SECTION = 1;  // VERSION in control/_packed_step.py
+constexpr int SECTION = 2;  // VERSION in control/_packed_step.py
 constexpr char FORMAT[] = "{\n \"format\": \"osik-jax controller ", CORE[] = ",\n \"core\": ", CHECK[] = ",\n \"checksum\": ";
 constexpr double ROUNDED = 0.02, EXACT = 64 * EPSILON,  // numerics/_rotations.py
                  SHORTEST = 1e-14;                      // squared length of a quaternion that has a direction
@@ -101,7 +101,7 @@ struct osik_controller {
     std::memcpy(&sizes, layout.data(), sizeof sizes);
     step = std::make_unique<Step>(layout.data(), int(layout.size()));
     // status, iterations and factorizations, then labels of the active set
-    integers.resize(3 + (sizes.scheme == WEIGHTED ? sizes.nv + sizes.p : sizes.L * (sizes.h + sizes.m)));
+    integers.resize(3 + sizes.labels());
     result.resize(sizes.nv + 2 + 2 * sizes.rows), moved.resize(sizes.nv), initial[OSIK_VELOCITY].resize(sizes.nv);
     arrays[0] = numbers.data();
   }
