@@ -57,10 +57,13 @@ class ChainRoute(NamedTuple):
     Attributes:
         frames: names.
         rows: of each frame, those that count: x, y, z, rotation about x, y, z.
+        by_core: whether the compiled core takes the steps where it is installed: not in a user's program, which may be
+            exported.
     """
 
     frames: tuple[str, ...]
     rows: tuple[tuple[bool, ...], ...]
+    by_core: bool = True
 
     @property
     def starts_anew(self) -> bool:
@@ -95,7 +98,7 @@ class ChainRoute(NamedTuple):
 
 def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
     """Return the search for configurations of a robot whose frames hinges and slides carry."""
-    frames, rows = route
+    frames, rows, by_core = route
     layout = chain_layout(robot.tree, frames)
     chain = make_chain(robot, frames, layout)
     coordinates = np.array(layout.dofs, int)
@@ -107,6 +110,7 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
     length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, *box)[0]))
     return ChainSearch(
         rows=rows,
+        by_core=by_core,
         turns=turns,
         chain=chain,
         lower=lower,

@@ -60,6 +60,7 @@ class ChainSearch(eqx.Module):
 
     Attributes:
         rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
+        by_core: whether the compiled core takes the steps where it is installed (static).
         turns: of each coordinate, whether a whole turn of it changes no pose (static).
         chain: geometry.
         lower: of the chain's coordinates, -inf where free. (n,)
@@ -79,6 +80,7 @@ class ChainSearch(eqx.Module):
     """
 
     rows: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+    by_core: bool = eqx.field(static=True)
     turns: tuple[bool, ...] = eqx.field(static=True)
     chain: Chain
     lower: Float[Array, " n"]
@@ -108,7 +110,7 @@ class ChainSearch(eqx.Module):
 
     def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
-        if _library.installed():
+        if self.by_core and _library.installed():
             return jax.vmap(partial(_by_kernel, steps=steps), (None, 0, 0))(self, x, goal)
         return self.advance_plain(x, goal, steps)
 

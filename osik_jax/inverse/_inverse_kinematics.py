@@ -23,7 +23,7 @@ from ..tasks import Task
 from ..tasks._targets import PoseLike
 from ._advice import advice
 from ._branches import Coordinates, with_all
-from ._chain_problem import Settings
+from ._chain_problem import ChainRoute, Settings
 from ._host import in_chunks
 from ._problem import read_problem
 from ._run import explored, searched
@@ -130,8 +130,10 @@ def inverse_kinematics(
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
     settings = Settings(home, lower, upper, key, tolerance, seeds, problem.parts)
-    start: dict[str, Any] = dict(route=route, warm=q0 is not None, go_on=closest)
     traced = _is_traced((robot, problem.goals, settings))
+    if traced and isinstance(route, ChainRoute):
+        route = route._replace(by_core=False)
+    start: dict[str, Any] = dict(route=route, warm=q0 is not None, go_on=closest)
     if all and traced:
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     if traced or nearest or all:

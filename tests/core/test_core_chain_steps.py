@@ -42,7 +42,7 @@ def made(name: str) -> tuple[osik.Robot, dict[str, tuple[bool, ...]]]:
 def test_steps_are_those_of_plain_jax(name, near, rng):
     robot, wanted = made(name)
     route, low = ChainRoute(tuple(wanted), tuple(wanted.values())), np.asarray(robot.position_lower)
-    high, tolerance = np.asarray(robot.position_upper), np.array([1e-3, 1e-2])
+    high, tolerance = np.asarray(robot.position_upper), jnp.array([1e-3, 1e-2])
     limits = jnp.where(jnp.isfinite(low), 0.5 * low, low), jnp.where(jnp.isfinite(high), 0.5 * high, high)
     search = chain_search(robot, route, Settings(robot.q0, *limits, 0, tolerance, 64), warm=False, near=near)
 
@@ -71,15 +71,13 @@ def test_robots_of_a_batch_have_their_own_chains(rng):
     shares = jnp.array([1.0, 1.2, 0.9])
     robots = jax.vmap(lambda a: dataclasses.replace(robot, body_position=a * robot.body_position))(shares)
     x = rng.standard_normal((3, LANES, 7))
-    goal = Goal(rng.standard_normal((3, LANES, 1, 3)), np.broadcast_to(np.eye(3), (3, LANES, 1, 3, 3)))
+    goal = Goal(rng.standard_normal((3, LANES, 1, 3)), jnp.broadcast_to(jnp.eye(3), (3, LANES, 1, 3, 3)))
 
-    def one(robot, x, goal, advance):
-        settings = Settings(robot.q0, robot.position_lower, robot.position_upper, 0, np.array([1e-3, 1e-2]), 64)
-        return advance(chain_search(robot, route, settings, warm=False, near=False), x, goal, 3)
+    def both(robot, x, goal):
+        settings = Settings(robot.q0, robot.position_lower, robot.position_upper, 0, jnp.array([1e-3, 1e-2]), 64)
+        search = chain_search(robot, route, settings, warm=False, near=False)
+        return search.advance(x, goal, 3), search.advance_plain(x, goal, 3)
 
-    found, expected = (
-        jax.vmap(lambda *a, advance=advance: one(*a, advance))(robots, x, goal)
-        for advance in (ChainSearch.advance, ChainSearch.advance_plain)
-    )
+    found, expected = jax.vmap(both)(robots, x, goal)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

@@ -312,3 +312,14 @@ class TestMistakes:
         refuses(ValueError, "seeds is 0", find, {"hand": np.eye(4)}, seeds=0)
         refuses(ValueError, "have to be finite", find, {"hand": np.full((2, 3), np.nan)})
         refuses(TypeError, "all=True counts", jax.jit(lambda p: find({"hand": p}, all=True).q), jnp.zeros(3))
+
+
+def test_a_program_with_searches_can_be_exported(planar):
+    def solve(position):
+        return osik.inverse_kinematics(planar, {"tip": position}, seeds=8, steps=12).q
+
+    position = jnp.array([0.5, 0.4, 0.0])
+    exported = jax.export.export(jax.jit(solve))(position)
+    found = jax.export.deserialize(exported.serialize()).call(position)
+    np.testing.assert_allclose(found, jax.jit(solve)(position), atol=1e-12)
+    np.testing.assert_allclose(mujoco_pose(planar, found, "tip")[0], position, atol=POSITION)
