@@ -235,7 +235,7 @@ def _leaves_of_limit(limit: Any) -> list[Any]:
 
 
 def _leaves_of_task(task: Any) -> list[Any]:
-    """Return the leaves of a task in the order of ``Step::add_task``, -1 for none."""
+    """Return the leaves of a task in the order of ``StepRows::add_task``, -1 for none."""
     lower, upper, own = task.lower, task.upper, task.target
     if _polygon(task):
         upper, own = task.polygon.offsets, (task.polygon.normals, task.polygon.vertices)
