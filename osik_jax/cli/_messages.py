@@ -42,9 +42,7 @@ def notes() -> Iterator[None]:
     def show(message: Warning | str, category: type[Warning], *where: Any, **options: Any) -> None:
         if not issubclass(category, OsikWarning):
             return told(message, category, *where, **options)
-        text = str(message).replace("floating_base=False", "--base fixed")
-        text = text.replace("floating_base=True", "--base floating")
-        print(f"osik: note: {text}", file=sys.stderr)
+        print(f"osik: note: {_as_options(str(message))}", file=sys.stderr)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", OsikWarning)
@@ -59,7 +57,12 @@ def told() -> Iterator[None]:
         yield
     except USER_ERRORS as error:
         text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
-        raise CommandError(" ".join(text.split())) from error
+        raise CommandError(_as_options(" ".join(text.split()))) from error
+
+
+def _as_options(text: str) -> str:
+    """Return a message with arguments of Python as options of the command line."""
+    return text.replace("floating_base=False", "--base fixed").replace("floating_base=True", "--base floating")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Notes of a report: bounds that are violated, and clips with almost no contacts."""
+"""Notes of a report: violated bounds, clips that are too fast for the joints, and clips with almost no contacts."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ _BOUNDS = {
 }
 """Figures of a report, the largest value where bounds hold, and the note for a larger value."""
 _LEAST_STANDING = 0.2
+_OFTEN, _OFF = 0.5, 4.0
+"""Share of frames with a joint at its speed limit, and mean angle between segments [deg], above both of which a clip is
+too fast.
+"""
 
 
 def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]:
@@ -25,8 +29,15 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
         figures: figures of ``report``.
         balance: requested margin of the centre of mass inside the support polygon [m]; None: none.
     """
+    limited, angle = figures["joints"]["at_speed_limit_share"], figures["tracking"]["segment_angle_deg_mean"]
+    out = []
+    if limited > _OFTEN and angle > _OFF:
+        out.append(
+            f"segments are {angle:.1f} deg off, and in {100.0 * limited:.0f} % of the frames a joint is at its largest "
+            "speed: slow down the clip, or check the speed limits in the robot's file"
+        )
     found = [(figures[group][name], most, text) for (group, name), (most, text) in _BOUNDS.items()]
-    out = [
+    out += [
         f"a bound gave way: {text.format(value)}" for value, most, text in found if value is not None and value > most
     ]
     margin = figures["balance"]["com_margin_mm_min"]

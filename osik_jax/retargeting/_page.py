@@ -11,13 +11,13 @@ from urllib.parse import quote
 import numpy as np
 
 from ._contact import stretches
-from ._report import joint_tracks
+from ._report import AT_SPEED, joint_tracks
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
-_AT_END, _AT_SPEED, _OFF, _MOST_JOINTS = 0.01, 0.97, 1e-3, 8
+_AT_END, _OFF, _MOST_JOINTS = 0.01, 1e-3, 8
 """Share of a joint's range within which it counts as at its end, share of its speed limit from which it counts as at
 that, distance from the plan that counts [rad or m], and joints that the panel lists.
 """
@@ -111,7 +111,7 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts.append("<h2>Limits</h2>")
     strips = {
         "a joint at an end of its range": ends.any(1),
-        "a joint at its speed limit": (speed > _AT_SPEED * fastest).any(1),
+        "a joint at its speed limit": (speed > AT_SPEED * fastest).any(1),
         "limits keep it from the plan": np.asarray(result.off_plan > _OFF),
     }
     parts.append(_lines(strips, "#d97b1f"))

@@ -20,21 +20,25 @@ from ._retargeted import Retargeted
 from ._robot_motion import in_model
 from ._roles import CHAINS, SIDES
 
-JUMP = 15.0
-"""A change of joint speed from one frame to the next that counts as a jump [rad/s]."""
+JUMP, AT_SPEED = 15.0, 0.97
+"""A change of joint speed from one frame to the next that counts as a jump [rad/s], and the share of its speed limit at
+which a joint counts as at the limit: a plan stays below 98 %.
+"""
 
 
 def report(result: Retargeted) -> dict[str, Any]:
     """Return the figures of a motion, recomputed by MuJoCo: lengths in mm, angles in rad except ``segment_angle_deg``.
 
-    ``joints``: largest excess beyond ranges and speed limits, accelerations and jerks (``rms``: root mean square
-    over joints and frames), and frames with a speed jump over 15 rad/s. ``feet``: distance of contact points from
+    ``joints``: largest excess beyond ranges and speed limits, share of frames with a joint at its speed limit,
+    accelerations and jerks (``rms``: root mean square over joints and frames), and frames with a speed jump over
+    15 rad/s. ``feet``: distance of contact points from
     their landing place (``slip``), their height (``float``), and depth of soles below the floor. ``balance``: in
     double support, the share of frames with the centre of mass over the support polygon, and its least distance
     inside the edge (negative outside). ``shapes``: depth of overlaps between the profile's capsules. ``tracking``:
     keypoint errors per limb, at the scale that fits each limb best, and the angle between the person's segments and
     the robot's. ``touches``: distance of joints from their place on what they hold. ``notes``: sentences on
-    violated bounds and on clips whose feet stand in less than 20 % of the frames.
+    violated bounds, on clips that are too fast for the joints, and on clips whose feet stand in less than 20 % of the
+    frames.
     """
     places = find_places(result.robot, result.profile, in_model(result.robot, result.q))
     figures = {
@@ -69,6 +73,7 @@ def _joints(result: Retargeted) -> dict[str, Any]:
     return {
         "beyond_range_max": float(max(0.0, (low - q).max(), (q - high).max())),
         "speed_over_limit_max": float((np.abs(speed) / fast).max()),
+        "at_speed_limit_share": float((np.abs(speed) > AT_SPEED * fast).any(1).mean()),
         "acceleration_max": float(change.max() * fps),
         "acceleration_max_joint": names[worst],
         "acceleration_rms": _rms(change) * fps,

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import mujoco
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from small_robots import quietly
 
 import osik_jax as osik
-from osik_jax.retargeting import HumanMotion, Profile, Retargeter, guess_profile
+from osik_jax.retargeting import HumanMotion, Profile, Retargeter, guess_profile, report
 from osik_jax.retargeting._person import palm_axes
 
 KNUCKLES = dict(thumb=(0.02, 0.04, 0.03), index=(0.0, 0.03, 0.1), middle=(0.0, 0.0, 0.1), ring=(0.0, -0.03, 0.095),
@@ -102,6 +103,16 @@ def test_joints_that_follow_do_as_the_file_says_and_the_wrist_is_no_part_of_the_
         np.testing.assert_allclose(own[f"{name}_intermediate_joint"], 1.06 * leads + 0.3, atol=1e-9)
         np.testing.assert_allclose(own[f"{name}_distal_joint"], 0.5 * leads, atol=1e-9)
         assert leads.min() >= 0.0 and leads.max() <= 1.6 and np.ptp(leads) > 0.3
+
+
+def test_a_hand_that_is_too_slow_for_its_clip_is_told():
+    robot, _ = coupled_hand()
+    profile, motion = quietly(guess_profile, robot), person((1.0, 1.0, 0.6))
+    slow = eqx.tree_at(lambda robot: robot.velocity_limit, robot, 0.02 * robot.velocity_limit)
+    quick, late = (report(Retargeter(own, profile=profile).retarget(motion)) for own in (robot, slow))
+    assert quick["joints"]["at_speed_limit_share"] == 0.0 and not quick["notes"]
+    assert late["joints"]["at_speed_limit_share"] > 0.5 and late["joints"]["speed_over_limit_max"] <= 1.0 + 1e-6
+    assert any("at its largest speed" in note for note in late["notes"])
 
 
 def test_a_palm_that_folds_has_all_five_fingers():

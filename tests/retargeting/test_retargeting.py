@@ -478,7 +478,7 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),
         (["DANCE", "--smooth", "0.1", "--live"], "--smooth goes with whole clips, not with --live"),
         (["DANCE", "--robot", "none.urdf"], "no such file: none.urdf"),
-        (["DANCE", "--robot", "arm7"], "floating_base=True"),
+        (["DANCE", "--robot", "arm7"], "--base floating"),
         (["DANCE", "--profile", "none.toml"], "profiles that come with the package: nao, g1, talos"),
         (["DANCE", "--acceleration", "0"], "acceleration is 0.0; it has to be more than 0"),
         (["DANCE", "--mapping", "left_hip"], "--mapping takes ROLE=NAME; got left_hip"),
