@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -10,9 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..execution._workers import cores
+
 _CHUNK = {"cpu": 1024}
 _OTHER_CHUNK = 65536
-"""Targets that run together. Shapes are powers of two up to here, so that few programs are compiled."""
+_FEW = {"cpu": 32}
+"""Targets that run together: of all, and of some whose answers do not depend on the others. Shapes are powers of two up
+to here, so that few programs are compiled.
+"""
 _MOST_LANES = {"cpu": 128}
 _OTHER_LANES = 131072
 """Searches that go on together: as many as a core's cache holds, or as keep a GPU busy."""
@@ -51,11 +55,16 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
         out = function(jax.tree.map(lambda a: a[number], goals), np.arange(size) < here)
         return jax.tree.map(lambda a: a[:here], jax.device_get(out))
 
+    return _side_by_side(run, starts)
+
+
+def _side_by_side(run: Callable[[int], Any], starts: range) -> Any:
+    """Return the results of all chunks one after another; on a CPU they are computed in a thread on each core."""
     if len(starts) == 1 or jax.default_backend() != "cpu":
         parts = [run(start) for start in starts]
     else:
         first = run(0)  # compiles
-        with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
+        with ThreadPoolExecutor(cores()) as threads:
             parts = [first, *threads.map(run, starts[1:])]
     return jax.tree.map(lambda *own: np.concatenate(own), *parts) if len(parts) > 1 else parts[0]
 
@@ -68,10 +77,16 @@ def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
         function: of pytrees with the targets in front.
         args: what it is called with for all targets.
     """
-    number = np.flatnonzero(chosen)
-    size = _power_of_two(len(number))
-    here = np.pad(number, (0, size - len(number)), mode="edge")
-    out = jax.device_get(function(*jax.tree.map(lambda a: np.asarray(a)[here], args)))
+    number, args = np.flatnonzero(chosen), jax.device_get(args)
+    size = min(_power_of_two(len(number)), _FEW.get(jax.default_backend(), _OTHER_CHUNK))
+
+    def run(start: int) -> Any:
+        some = number[start : start + size]
+        here = np.pad(some, (0, size - len(some)), mode="edge")
+        out = jax.device_get(function(*jax.tree.map(lambda a: a[here], args)))
+        return jax.tree.map(lambda a: a[: len(some)], out)
+
+    out = _side_by_side(run, range(0, len(number), size))
     place = np.zeros(len(chosen), int)
     place[number] = np.arange(len(number))
     return jax.tree.map(lambda a: a[place], out)
