@@ -19,7 +19,7 @@ _LEAST_QUATERNION = 1e-8
 
 def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
     """Return ``q0`` (or ``base``) with the named joints set, unchecked."""
-    q = jnp.asarray(robot.q0 if base is None else base)
+    q = robot.q0 if base is None else jnp.asarray(base, robot.q0.dtype)
     coefficient = robot.tree.qpos_source[1]
     for name, value in joints.items():
         joint = robot.tree.joint(name)
@@ -35,7 +35,7 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
 
 def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"], name: str) -> None:
     """Raise an error for an invalid q, see ``Robot.check_configuration``."""
-    tree, shape = robot.tree, jnp.shape(q)
+    tree, shape = robot.tree, np.shape(q)
     if shape != (tree.nq,):
         raise OsikValueError(
             f"{name} has shape {shape}, this robot's configurations have shape ({tree.nq},): {tree.dof_owners}. "

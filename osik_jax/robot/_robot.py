@@ -229,13 +229,15 @@ class Robot(RobotModel):
 
         Raises:
             KeyError: no such joint, or it is locked.
-            ValueError: a free or ball joint, which no single number sets.
+            ValueError: a free or ball joint, which no single number sets; ``base`` is no configuration of this robot.
 
         Warns:
             OsikWarning: a joint is more than 0.5 rad or 0.5 m outside its range, as degrees are.
         """
+        if base is not None:
+            self.check_configuration(base, "base")
         q = with_joints(self, joints, base)
-        if q.shape == (self.nq,):
+        if q.shape == (self.nq,):  # not a stack of robots
             warn_of_far_joints(self, q, "configuration")
         return q
 
