@@ -345,7 +345,8 @@ template <class Team> struct Hierarchy {
     slack_norm = sqrt(square);
     root_cost = sqrt(square + damping * t.dot(X, X, 0, n));
   }
-  OSIK_FN double gradient_roundoff() const { return longest * step_tol * (longest * x_max + root_cost); }
+  OSIK_FN double slack_roundoff() const { return step_tol * (longest * x_max + root_cost); }
+  OSIK_FN double gradient_roundoff() const { return longest * slack_roundoff(); }
   OSIK_FN double sign_tolerance() const { return multiplier_tol * gradient_norm + gradient_roundoff(); }
   OSIK_FN bool is_stationary() const {
     return residual <= STATIONARITY_TOL * (multiplier_tol * longest * root_cost + gradient_roundoff());
@@ -665,9 +666,9 @@ template <class Team> struct Hierarchy {
   OSIK_METHOD int freeze(const Answer& to) {
     const int at = level * m, hard_at = level * h;
     evaluate();
-    const double force_tol = sign_tolerance() + damping * sqrt(t.dot(X, X, 0, n));
-    const bool same_cost = 0 == t.count(0, rows, [&](int a) {
-      const double slack_tol = multiplier_tol * (ROW_NORM[a] * x_max + root_cost);
+    const double force_tol = sign_tolerance() + damping * sqrt(t.dot(X, X, 0, n)), roundoff = slack_roundoff();
+    const bool same_cost = 0 == t.count(0, rows, [&](int a) {  // a short row has the roundoff of the longest one
+      const double slack_tol = larger(multiplier_tol * (ROW_NORM[a] * x_max + root_cost), roundoff);
       const int now = EQUALITY[a] || fabs(SLACK[a]) > slack_tol, other = now != IN_COST[a];
       IN_COST[a] = now;
       to.in_cost[at + a] = now ? (SLACK[a] > 0.0 ? 1 : -1) : 0;

@@ -19,7 +19,7 @@ from ._implicit_diff import ActiveSets
 from ._padding import LevelProblem
 from ._primal_active_set import PrimalState
 from ._problem import Tolerances, WorkingSet
-from ._working_set_solve import gradient_roundoff
+from ._working_set_solve import gradient_roundoff, slack_roundoff
 
 
 class CascadeState(NamedTuple):
@@ -97,7 +97,9 @@ def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances)
     value = apply(level.matrix, end.x)
     slack = value - jnp.clip(value, level.lower, level.upper)
     root_cost = problem.root_cost(end.x, slack)
-    slack_tol = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + root_cost)
+    # a short row has the roundoff of the longest one
+    short = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + root_cost)
+    slack_tol = jnp.maximum(short, slack_roundoff(problem, end.x, slack, tolerances))
     in_cost = problem.is_equality | (jnp.abs(slack) > slack_tol)
     gradient = problem.gradient(end.x, jnp.where(in_cost, slack, 0.0))
     force = jnp.abs(end.multiplier) * problem.length
