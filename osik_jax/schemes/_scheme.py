@@ -84,8 +84,7 @@ class VelocityProblem(eqx.Module):
         of_rest = self._bounds(rest)
         if not equal:
             return safe_norm(of_rest), safe_norm(of_rest)
-        # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks;
-        # weights and Jacobians are NaN where the step is not valid, and times NaN a derivative of 0 is NaN
+        # what each row adds to its task's distance and stiffness: few operations whatever the number of tasks
         divisor, pull = (
             jnp.concatenate([jnp.broadcast_to(a, own.error.shape) for own, a in zip(equal, of_each, strict=True)])
             for of_each in (
@@ -95,7 +94,7 @@ class VelocityProblem(eqx.Module):
         )
         weight, error = (jnp.concatenate([getattr(own, field) for own in equal]) for field in ("weight", "error"))
         squared = jnp.concatenate([own.squared_lengths() for own in equal])
-        weight, squared = (jnp.where(jnp.isnan(a), 0.0, a) for a in (weight, squared))
+        weight, squared = _or_zeros(weight), _or_zeros(squared)
         # both terms of the quotient have the weight as a factor: that of the pull alone is infinite for a small weight
         parts = jnp.stack([error * quotient(weight * pull, divisor), weight * squared])
         of_task = np.repeat(np.eye(len(equal), dtype=bool), [len(own.error) for own in equal], axis=1)
@@ -155,8 +154,10 @@ class VelocityProblem(eqx.Module):
         """
         loops = [name for name in above if self.rows[name].closes_loop]
         rows = [self.rows[name] for name in names]
-        linear = [own.weight * own.pull for own in rows if own.dofs is not None]
-        curved = [apply(own.jacobian.T, own.weight * own.pull) for own in rows if own.dofs is None]
+        linear = [_or_zeros(own.weight) * own.pull for own in rows if own.dofs is not None]
+        curved = [
+            apply(_or_zeros(own.jacobian.T), _or_zeros(own.weight) * own.pull) for own in rows if own.dofs is None
+        ]
         parts = [
             safe_norm(jnp.concatenate(forces)) * self._bending(by)
             for forces, by in ((linear, above), (curved, loops))
@@ -167,9 +168,8 @@ class VelocityProblem(eqx.Module):
     def _bending(self, names: Sequence[str]) -> Float[Array, ""]:
         """Return the curvature of tasks for a unit force in the joints: that for a unit residual, over their norm."""
         rows = [self.rows[name] for name in names]
-        squared = jnp.concatenate([own.weight * own.squared_lengths() for own in rows])
-        # NaN where the step is not valid, and times NaN a derivative of 0 is NaN
-        size = positive_root(jnp.sum(jnp.where(jnp.isnan(squared), 0.0, squared)))
+        squared = jnp.concatenate([_or_zeros(own.weight) * _or_zeros(own.squared_lengths()) for own in rows])
+        size = positive_root(jnp.sum(squared))
         return quotient(greatest(self.bends(names)), jnp.where(size > 0.0, size, 1.0))
 
     def bends(self, names: Iterable[str]) -> Float[Array, " nv"]:
@@ -212,6 +212,11 @@ class VelocityProblem(eqx.Module):
             ends = np.cumsum([len(rows.error) for rows in dense.values()])[:-1]
             values |= dict(zip(dense, jnp.split(together, ends), strict=True))
         return {name: values[name] - jnp.clip(values[name], r.lower, r.upper) for name, r in self.rows.items()}
+
+
+def _or_zeros(a: Array) -> Array:
+    """Return the numbers with 0 for the NaN of a step that is not valid: factors of NaN have the derivative NaN."""
+    return jnp.where(jnp.isnan(a), 0.0, a)
 
 
 def _joined(first: Level, second: Level) -> Level:

@@ -191,6 +191,26 @@ def test_derivatives_are_those_of_plain_jax(scheme):
     assert_close(found, wanted, 1e-9 * (1.0 + max(float(jnp.abs(a).max()) for a in wanted)))
 
 
+@pytest.mark.variants(slow=["weighted", "hierarchy", "saturated"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_share(scheme):
+    robot = osik.load_robot("arm7")
+    tasks = {"hand": osik.FrameTask(robot, frames_of(robot)[0]), "rest": osik.PostureTask(robot, priority=2)}
+
+    @jax.jit
+    @partial(jax.grad, has_aux=True)
+    def gradient(shared: Any, q: Any, counts: Any) -> Any:
+        moved = eqx.tree_at(lambda robot: robot.body_position, robot, shared)
+        found = jax.vmap(lambda q: _step.step(moved, q, tasks, SCHEMES[scheme](), None, DT))(q)
+        return jnp.sum(counts[:, None] * jnp.sin(found.velocity)), found.status
+
+    q = lanes_of(robot)
+    wanted, _ = gradient(robot.body_position, q, jnp.ones(LANES).at[3].set(0.0))
+    found, status = gradient(robot.body_position, q.at[3, 2].set(jnp.nan), jnp.ones(LANES))
+    assert float(jnp.abs(wanted).max()) > 1e-2 and int(status[3]) == 3
+    assert_close(found, wanted, 1e-12 * float(jnp.abs(wanted).max()))
+
+
 @pytest.mark.variants(slow=["weighted", "null-space"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
