@@ -466,7 +466,7 @@ def test_joints_without_a_place_in_q_are_named():
 def test_a_configuration_begins_at_one_of_the_same_robot_whatever_its_type():
     robot = Robot.from_urdf(ARM, floating_base=False)
     refuses(ValueError, r"base has shape \(3,\)", robot.configuration, {"a": 0.1}, base=np.zeros(3))
-    q = robot.configuration({"b": 0.25}, base=[0, 0])
+    q = robot.configuration({"b": 0.25}, base=np.zeros(2, int))
     assert q.dtype == robot.q0.dtype and q.tolist() == [0.0, 0.25]
 
 
