@@ -43,10 +43,14 @@ _LONG = 15
 """Number of frames of contact beyond which a contact point gets a larger weight. A pull of 1 per frame, as that of a
 limb 1 rad off, then moves the point by at most ``_LONG^2 / 4`` over ``Weights.stance``, which is 0.06 mm.
 """
-_AT_END, _ARM_AT_END, _FINGER_AT_END, _BENT = 0.01, 0.05, 0.25, 1.0
-"""Shares of a joint's range: a leg joint within 1 % of an end, an arm joint within 5 % (a GR3's elbow extends 3 %
-beyond straight), or a finger's within 25 % (a LEAP's extend up to 21 %) starts from a bent position. That position is
-1 rad from the end, or the middle of the range if nearer.
+_AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
+"""Shares of a joint's range: a leg joint within 1 % of an end, or an arm joint within 5 % (a GR3's elbow extends 3 %
+beyond straight), starts from a bent position. That position is 1 rad from the end, or the middle of the range if
+nearer.
+"""
+_LEANS, _FINGER_AT_END = 0.3, 0.25
+"""A finger's joint that bends backwards by 0.3 rad or more, and by less than 25 % of its range (a LEAP's by 0.31 to
+0.51 rad), starts 0.3 rad forward.
 """
 
 
@@ -357,14 +361,15 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     legs = [end.endswith(("knee", "ankle")) for _, end in profile.followed]
     bodies = [robot.tree.frame_bodies[robot.tree.frame(frame)] for frame in ends]
     each = np.asarray(independent_columns(robot.tree, jnp.asarray(robot.tree.moves[bodies], float))).astype(bool)
-    outer = _FINGER_AT_END if profile.is_hand else _ARM_AT_END
-    moves, at_end = each.any(0), np.where(each[legs].any(0), _AT_END, outer)
+    moves, at_end = each.any(0), np.where(each[legs].any(0), _AT_END, _ARM_AT_END)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     for dof in np.flatnonzero(scalar & moves & np.isfinite(upper - lower)):
-        width, home = upper[dof] - lower[dof], q[index[dof]]
+        width, below, above = upper[dof] - lower[dof], q[index[dof]] - lower[dof], upper[dof] - q[index[dof]]
         inside = min(_BENT, 0.5 * width)
-        if home - lower[dof] < at_end[dof] * width:
+        if below < at_end[dof] * width:
             q[index[dof]] = lower[dof] + inside
-        elif upper[dof] - home < at_end[dof] * width:
+        elif above < at_end[dof] * width:
             q[index[dof]] = upper[dof] - inside
+        elif profile.is_hand and _LEANS <= min(below, above) < _FINGER_AT_END * width:
+            q[index[dof]] += _LEANS if below < above else -_LEANS
     return q
