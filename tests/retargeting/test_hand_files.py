@@ -84,8 +84,9 @@ def coupled_hand():
     for f, at in KNUCKLES.items():
         name = "pinky" if f == "little" else f
         links = [f"{name}_{part}" for part in ("proximal", "intermediate", "distal")]
-        couple = dict(couple=[(1.06, 0.3), (0.5, 0.0)], tip=f"{name}_tip", turn=TURNS[f])
-        parts.append(finger("thumb_base", np.array(at) - mount, [f"{own}_joint" for own in links], links, **couple))
+        joints, couple, turn = [f"{own}_joint" for own in links], [(1.06, 0.3), (0.5, 0.0)], TURNS[f]
+        place = np.array(at) - mount
+        parts.append(finger("thumb_base", place, joints, links, couple=couple, tip=f"{name}_tip", turn=turn))
     return loaded(*parts)
 
 
