@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from ..viewer._look import Look
 
 _AT_END, _OFF, _MOST_JOINTS = 0.01, 1e-3, 8
-"""Share of a joint's range within which it counts as at its end, share of its speed limit from which it counts as at
-that, distance from the plan that counts [rad or m], and joints that the panel lists.
+"""Share of a joint's range within which it counts as at its end, distance from the plan that counts [rad or m], and
+joints that the panel lists.
 """
 _FIGURES = {
     "segments off, mean [deg]": ("tracking", "segment_angle_deg_mean"),

@@ -30,15 +30,14 @@ def report(result: Retargeted) -> dict[str, Any]:
     """Return the figures of a motion, recomputed by MuJoCo: lengths in mm, angles in rad except ``segment_angle_deg``.
 
     ``joints``: largest excess beyond ranges and speed limits, share of frames with a joint at its speed limit,
-    accelerations and jerks (``rms``: root mean square over joints and frames), and frames with a speed jump over
-    15 rad/s. ``feet``: distance of contact points from
-    their landing place (``slip``), their height (``float``), and depth of soles below the floor. ``balance``: in
-    double support, the share of frames with the centre of mass over the support polygon, and its least distance
-    inside the edge (negative outside). ``shapes``: depth of overlaps between the profile's capsules. ``tracking``:
-    keypoint errors per limb, at the scale that fits each limb best, and the angle between the person's segments and
-    the robot's. ``touches``: distance of joints from their place on what they hold. ``notes``: sentences on
-    violated bounds, on clips that are too fast for the joints, and on clips whose feet stand in less than 20 % of the
-    frames.
+    accelerations and jerks (``rms``: root mean square over joints and frames), and frames with a speed jump over 15
+    rad/s. ``feet``: distance of contact points from their landing place (``slip``), their height (``float``), and depth
+    of soles below the floor. ``balance``: in double support, the share of frames with the centre of mass over the
+    support polygon, and its least distance inside the edge (negative outside). ``shapes``: depth of overlaps between
+    the profile's capsules. ``tracking``: keypoint errors per limb, at the scale that fits each limb best, and the angle
+    between the person's segments and the robot's. ``touches``: distance of joints from their place on what they hold.
+    ``notes``: sentences on violated bounds, on clips that are too fast for the joints, and on clips whose feet stand in
+    less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, in_model(result.robot, result.q))
     figures = {
