@@ -55,10 +55,10 @@ def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
         out = function(jax.tree.map(lambda a: a[number], goals), np.arange(size) < here)
         return jax.tree.map(lambda a: a[:here], jax.device_get(out))
 
-    return _side_by_side(run, starts)
+    return _in_threads(run, starts)
 
 
-def _side_by_side(run: Callable[[int], Any], starts: range) -> Any:
+def _in_threads(run: Callable[[int], Any], starts: range) -> Any:
     """Return the results of all chunks one after another; on a CPU they are computed in a thread on each core."""
     if len(starts) == 1 or jax.default_backend() != "cpu":
         parts = [run(start) for start in starts]
@@ -86,7 +86,7 @@ def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
         out = jax.device_get(function(*jax.tree.map(lambda a: a[here], args)))
         return jax.tree.map(lambda a: a[: len(some)], out)
 
-    out = _side_by_side(run, range(0, len(number), size))
+    out = _in_threads(run, range(0, len(number), size))
     place = np.zeros(len(chosen), int)
     place[number] = np.arange(len(number))
     return jax.tree.map(lambda a: a[place], out)

@@ -47,7 +47,7 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
     return quaternion
 
 
-# one program each: on a GPU, a program for each of their operations takes milliseconds
+# compiled as one program, like _nearest_rotation: on a GPU, operations run one by one take milliseconds
 @jax.jit
 def _unit_quaternion(given: Float[Array, "*B 4"]) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
     squared = jnp.sum(given**2, -1, keepdims=True)
