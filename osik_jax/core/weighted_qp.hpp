@@ -200,7 +200,7 @@ template <class Team> struct WeightedQP {
       c.store(GRADIENT, total);
     });
   }
-  // Whether a correction is the last: the next one would be roundoff, for they shrink alike, or it shrinks no more.
+  // Whether a correction is the last: the next one would be far below roundoff if they shrink alike, or it shrinks no more.
   // `before`: the size of the one before it.
   OSIK_FN bool is_last(Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);

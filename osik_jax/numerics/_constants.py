@@ -196,9 +196,10 @@ GRADIENT_STEPS = 100
 
 KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
 """Largest number of corrections."""
-KERNEL_CORRECTION = 1e-16
+KERNEL_CORRECTION = 1e-20
 """Predicted next correction of a kernel, relative to the answer, below which none follows; in single precision it is
-``LAST_CORRECTION``.
+``LAST_CORRECTION``. With weak dampings the correction itself is up to 10^4 times larger: the prediction assumes that
+corrections shrink alike, and the first one is small by chance in a few problems of 10,000.
 """
 MIN_DECREASE = 0.25
 """Ratio of two corrections above which the second one was roundoff."""

@@ -67,6 +67,14 @@ def test_lane_by_lane_as_the_plain_method(m):
     assert found.factorizations.max() > 3 and found.iterations.max() > 5
 
 
+def test_no_candidate_is_left_to_the_search_where_dampings_are_weak():
+    """Dampings from 1e-6, fewer rows than variables: the rows' system has a condition of 1e9."""
+    p = problems(10_000, seed=1)
+    taken = candidates(p)
+    assert (taken.converged == 1).all()
+    np.testing.assert_array_equal(solved(p).factorizations, taken.factorizations)
+
+
 @pytest.mark.variants(release=["float64"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_recorded_problems(precision):
