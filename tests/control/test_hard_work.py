@@ -176,7 +176,11 @@ def test_a_hand_follows_a_curve_within_reach_while_the_feet_are_hard(nao, scheme
     "method", [name if name in QUICK_METHODS else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
 )
 def test_derivatives_at_the_start_are_central_differences(arm, rng, method):
-    """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives."""
+    """Every robot starts with errors of exactly 0, where clipping between equal bounds would split derivatives.
+
+    The reverse order takes all of a damping that is proportional to the error: its velocity has a term in t |t|, and
+    differences are off by 0.4 h.
+    """
     tasks = {
         "hand": osik.FrameTask(arm, "hand", rows="position"),
         "posture": osik.PostureTask(arm, priority=2, weight=1.0),
@@ -187,11 +191,11 @@ def test_derivatives_at_the_start_are_central_differences(arm, rng, method):
     def cost(t):
         return osik.solve(arm, arm.q0 + t * along, tasks, scheme=scheme, dt=0.01).velocity @ mix
 
-    both, h = jax.jit(jax.value_and_grad(cost)), 1e-5
+    both, h = jax.jit(jax.value_and_grad(cost)), 1e-7
     expected = float(both(h)[0] - both(-h)[0]) / (2.0 * h)
     assert abs(expected) > 1.0
-    assert float(both(0.0)[1]) == pytest.approx(expected, rel=1e-6)
-    assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-6)
+    assert float(both(0.0)[1]) == pytest.approx(expected, rel=1e-7)
+    assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-7)
 
 
 @pytest.mark.variants(slow=["hierarchy"])
