@@ -22,6 +22,8 @@ from . import _build, _library
 SHARED_BYTES = 227 * 1024
 """Largest shared memory of a block [bytes], on compute capability 9.0. Devices with less use the search in plain JAX.
 """
+DEFAULT_SHARED_BYTES = 48 * 1024
+"""Shared memory [bytes] that every CUDA device offers a block by default."""
 _MOST_SPACES = 1 << 14
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
 # a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
@@ -57,6 +59,11 @@ def text_of(header: str) -> str:
         return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1]), text.replace("#pragma once\n", ""))
 
     return rolled(inlined(header))
+
+
+def text_of_parts(folder: str, parts: Sequence[str]) -> str:
+    """Return the CUDA files of a kernel whose text is in several."""
+    return "\n".join((_build.FOLDER / folder / f"{part}.cu").read_text() for part in parts)
 
 
 def rolled(text: str) -> str:

@@ -20,6 +20,8 @@ from . import _build
 _REMEDY = "install a C++ compiler (Debian: g++, macOS: xcode-select --install) and install osik_jax again"
 _REBUILD = "python -m osik_jax.core._build builds it again"
 _registered: set[str] = set()
+Shapes = list[tuple[tuple[int, ...], Any]]
+"""Shape and type of each result of a kernel."""
 _lock = threading.Lock()
 
 
@@ -104,6 +106,13 @@ def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: A
         shapes = [jax.ShapeDtypeStruct(shape, _kind(jnp.dtype(kind))) for shape, kind in outputs]
         results = jax.ffi.ffi_call(name, shapes)(*wide)
         return [a.astype(given) if a.dtype == jnp.float64 else a for a in results]
+
+
+def shapes_of(
+    lanes: int, numbers: Sequence[tuple[int, ...]], integers: Sequence[tuple[int, ...]], real: Any = jnp.float64
+) -> Shapes:
+    """Return shape and type of results: arrays of numbers, then of integers, with a leading axis of lanes."""
+    return [((lanes, *shape), kind) for kind, shapes in ((real, numbers), (jnp.int32, integers)) for shape in shapes]
 
 
 def register(method: str) -> str:

@@ -19,9 +19,6 @@ from ..execution._backends import on_platforms, takes
 from ..execution._lanes import in_lanes
 from ..numerics._dense import apply, product
 
-_SHARED_BYTES = 48 * 1024
-"""Shared memory [bytes] that every CUDA device offers a block by default."""
-
 
 class BandedSystem(NamedTuple):
     """A symmetric positive definite matrix of F x F blocks, with a band of two blocks below the diagonal.
@@ -67,7 +64,7 @@ def _anywhere() -> Callable[[BandedSystem, Array], Array]:
 def has_kernel(system: BandedSystem) -> bool:
     """Return whether there is a GPU kernel for systems of this shape and precision."""
     m, n = system.rows.shape[-2:]
-    is_small = 4 * (4 * n * (n | 1) + 2 * m * n + 6 * n) <= _SHARED_BYTES
+    is_small = 4 * (4 * n * (n | 1) + 2 * m * n + 6 * n) <= _cuda.DEFAULT_SHARED_BYTES
     return system.rows.dtype == jnp.float32 and is_small and _cuda.installed()
 
 

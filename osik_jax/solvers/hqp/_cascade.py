@@ -42,50 +42,6 @@ class CascadeResult(NamedTuple):
     done: Bool[Array, ""]
 
 
-def first_working_sets(hierarchy: PaddedHierarchy, warm_start: WorkingSet | None) -> WorkingSet:
-    """Return the working sets of a batch that a kernel tries first: warm starts, or zeros without any."""
-    batch, count, m, _ = hierarchy.levels.matrix.shape
-    h = hierarchy.hard.shape[1]
-    zeros = WorkingSet(jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
-    return zeros if warm_start is None else warm_start
-
-
-class KernelAnswers(NamedTuple):
-    """Output of a kernel for a batch of hierarchies, of L levels with m rows each and h hard rows."""
-
-    x: Float[Array, "B n"]
-    multipliers: Float[Array, "B L h"]
-    slack_norms: Float[Array, "B L"]
-    dampings: Float[Array, "B L"]
-    residual: Float[Array, " B"]
-    active_bounds: Int[Array, "B n"]
-    active: Int[Array, "B L h"]
-    frozen: Int[Array, "B L h"]
-    in_cost: Int[Array, "B L m"]
-    own: Int[Array, "B L m"]
-    ranks: Int[Array, "B L"]
-    report: Int[Array, "B 3"]  # whether it ended, iterations, factorisations
-
-
-def result_of_kernel(answers: KernelAnswers) -> CascadeResult:
-    """Return a kernel's uncertified answers in the form of the search's."""
-    is_damped = answers.dampings[:, :, None] > 0.0
-    # the derivative keeps rows that a damped level has at their bounds, frozen or not
-    kept = jnp.where(is_damped, answers.active, answers.frozen)
-    return CascadeResult(
-        x=answers.x,
-        active_bounds=answers.active_bounds,
-        active_sets=ActiveSets(kept, answers.frozen, answers.in_cost, answers.ranks),
-        working_sets=WorkingSet(answers.active, answers.own),
-        multipliers=answers.multipliers,
-        slack_norms=answers.slack_norms,
-        residual=answers.residual,
-        iterations=answers.report[:, 1],
-        factorizations=answers.report[:, 2],
-        done=answers.report[:, 0] != 0,
-    )
-
-
 def solve_cascade(
     layout: Layout,
     max_iterations: int,

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ...core import _library
-from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
+from ._cascade import CascadeResult
+from ._implicit_diff import ActiveSets
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -27,20 +31,42 @@ def solve(
         warm_start: working sets to try first; all zeros in a problem for none.
         max_iterations: limit on the active-set iterations of one level (static).
     """
+
+    def call(shapes: _library.Shapes, numbers: list[Array], integers: list[Array]) -> list[Array]:
+        sizes = layout.row_counts, layout.level_of_hard, layout.row_of_hard, [max_iterations]
+        return _library.call("hierarchy", shapes, *numbers, *integers, *(np.array(a, np.int32) for a in sizes))
+
+    return answers(call, hierarchy, tolerances, warm_start)
+
+
+def answers(
+    call: Callable[[_library.Shapes, list[Array], list[Array]], list[Array]],
+    hierarchy: PaddedHierarchy,
+    tolerances: Tolerances,
+    warm_start: WorkingSet | None,
+) -> CascadeResult:
+    """Return a kernel's uncertified answers in the form of the search's.
+
+    Args:
+        call: calls the kernel. It is given the shapes of the results, in the order of ``Answer`` in
+            ``core/hierarchy.hpp``, and the numbers and the integers of ``Problem``.
+        hierarchy: as for ``solve``, and so the following.
+        tolerances: of each problem.
+        warm_start: working sets to try first.
+    """
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]
-    guess = first_working_sets(hierarchy, warm_start)
-    floats = dict(x=(n,), multipliers=(count, h), slack_norms=(count,), dampings=(count,), residual=())
-    ints = dict(active_bounds=(n,), active=(count, h), frozen=(count, h), in_cost=(count, m), own=(count, m))
-    ints |= dict(ranks=(count,), report=(3,))
-    results = _library.call(
-        "hierarchy",
-        [((batch, *shape), kind) for kind, shapes in ((float, floats), (int, ints)) for shape in shapes.values()],
-        *(hierarchy.levels.matrix, hierarchy.levels.lower, hierarchy.levels.upper, hierarchy.hard[:, n:]),
-        *(hierarchy.hard_lower, hierarchy.hard_upper),
-        *(jnp.stack(hierarchy.damping[:3], -1), hierarchy.damping.bends),
-        *(jnp.stack(tolerances, -1), hierarchy.is_equality, hierarchy.hard_is_equality, *guess),
-        *(np.array(a, np.int32) for a in (layout.row_counts, layout.level_of_hard, layout.row_of_hard)),
-        np.array([max_iterations], np.int32),
-    )
-    return result_of_kernel(KernelAnswers(**dict(zip((*floats, *ints), results, strict=True))))
+    levels, damping = hierarchy.levels, hierarchy.damping
+    numbers = [levels.matrix, levels.lower, levels.upper, hierarchy.hard[:, n:], hierarchy.hard_lower]
+    numbers += [hierarchy.hard_upper, jnp.stack(damping[:3], -1), damping.bends, jnp.stack(tolerances, -1)]
+    guess = warm_start or (jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
+    labels = (n,), (count, h), (count, h), (count, m), (count, m), (count,), (3,)
+    shapes = _library.shapes_of(batch, ((n,), (count, h), (count,), (count,), ()), labels)
+    integers = [hierarchy.is_equality, hierarchy.hard_is_equality, *guess]
+    x, multipliers, slack_norms, dampings, residual, *others = call(shapes, numbers, integers)
+    active_bounds, active, frozen, in_cost, own, ranks, report = others
+    # the derivative keeps rows that a damped level has at their bounds, frozen or not
+    kept = jnp.where(dampings[:, :, None] > 0.0, active, frozen)
+    sets = active_bounds, ActiveSets(kept, frozen, in_cost, ranks), WorkingSet(active, own)
+    ended, iterations, factorizations = (report[:, k] for k in range(3))
+    return CascadeResult(x, *sets, multipliers, slack_norms, residual, iterations, factorizations, ended != 0)

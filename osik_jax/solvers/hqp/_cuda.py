@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ...core import _cuda, _library
-from ._cascade import CascadeResult, KernelAnswers, first_working_sets, result_of_kernel
+from ._cascade import CascadeResult
+from ._core import answers
 from ._padding import Layout, PaddedHierarchy
 from ._problem import Tolerances, WorkingSet
 
@@ -39,8 +40,7 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
 def _bytes(layout: Layout) -> int:
     """Return the shared memory of one problem, a multiple of 16."""
     library = _library.core().library
-    if library is None:
-        return _cuda.SHARED_BYTES + 1
+    assert library is not None
     return library.osik_hierarchy_bytes(layout.levels, layout.rows, layout.variables, len(layout.level_of_hard))
 
 
@@ -65,37 +65,18 @@ def solve(
     warm_start: WorkingSet | None,
     max_iterations: int,
 ) -> CascadeResult:
-    """Return candidates for a batch of hierarchies, computed on the default GPU.
+    """Return candidates for a batch of hierarchies, computed on the default GPU; arguments as for ``_core.solve``."""
 
-    Args:
-        layout: sizes and row indices (static).
-        hierarchy: the numbers, with a leading axis of problems.
-        tolerances: what counts as zero, one of each a problem.
-        warm_start: working sets to try first; all zeros in a problem for none.
-        max_iterations: limit on the active-set iterations of one level (static).
-    """
-    batch, count, m, n = hierarchy.levels.matrix.shape
-    h = hierarchy.hard.shape[1]
-    levels = hierarchy.levels
-    # rows without padding, and column by column, so that the threads of a warp read neighbours
-    rows = jnp.concatenate([levels.matrix[:, k, :size] for k, size in enumerate(layout.row_counts)], 1)
-    numbers = (jnp.swapaxes(rows, 1, 2), levels.lower, levels.upper, hierarchy.hard[:, n:], hierarchy.hard_lower)
-    numbers += (hierarchy.hard_upper, jnp.stack(hierarchy.damping[:3], -1), hierarchy.damping.bends)
-    numbers += (jnp.stack(tolerances, -1),)
-    flags = (hierarchy.is_equality, hierarchy.hard_is_equality, *first_working_sets(hierarchy, warm_start))
-    double, whole = jnp.float64, jnp.int32
-    shapes: dict[str, tuple[tuple[int, ...], Any]] = dict(x=((n,), double), multipliers=((count, h), double))
-    shapes |= dict(slack_norms=((count,), double), dampings=((count,), double), residual=((), double))
-    shapes |= dict(active_bounds=((n,), whole), active=((count, h), whole), frozen=((count, h), whole))
-    shapes |= dict(in_cost=((count, m), whole), own=((count, m), whole), ranks=((count,), whole), report=((3,), whole))
-    results = _cuda.call(
-        _source(layout, max_iterations),
-        [((batch, *shape), dtype) for shape, dtype in shapes.values()],
-        *map(_cuda.as_double, numbers),
-        *(jnp.asarray(a, jnp.int32) for a in flags),
-        problems=batch,
-        shared=_bytes(layout),
-    )
-    dtype = hierarchy.levels.matrix.dtype
-    results = [a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a for a in results]
-    return result_of_kernel(KernelAnswers(**dict(zip(shapes, results, strict=True))))
+    def call(shapes: _library.Shapes, numbers: list[Array], integers: list[Array]) -> list[Array]:
+        # rows without padding, and column by column, so that the threads of a warp read neighbours
+        rows = jnp.concatenate([numbers[0][:, k, :size] for k, size in enumerate(layout.row_counts)], 1)
+        return _cuda.call(
+            _source(layout, max_iterations),
+            shapes,
+            *map(_cuda.as_double, (jnp.swapaxes(rows, 1, 2), *numbers[1:])),
+            *(jnp.asarray(a, jnp.int32) for a in integers),
+            problems=len(rows),
+            shared=_bytes(layout),
+        )
+
+    return answers(call, hierarchy, tolerances, warm_start)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from ...core import _build, _cuda
+from ...core import _cuda, _library
 from ...numerics import _constants
 from ._implicit_diff import ActiveJoints, SaturatedResult
 from ._padding import Problem
@@ -21,8 +21,6 @@ PARTS = (
     *("saturated", "stop", "choices", "search", "attempt", "after", "levels"),
 )
 """Files of the kernel in order; each uses the definitions of earlier ones."""
-_SHARED_BYTES = 48 * 1024
-"""Shared memory [bytes] that every CUDA device offers a block by default."""
 _MAX_ROWS, _MAX_WARPS = 64, 2
 _WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "SIGN_CHECKS", "STRAIGHT", "WHOLE")
 _NUMBERS = (
@@ -68,7 +66,7 @@ class Shape(NamedTuple):
         wide = max(n, m)
         room = n * (wide | 1) + (0 if m * (m | 1) <= n * n else m * (m | 1))
         doubles = n * (n | 1) + room + 14 * n + 6 * m + wide
-        return min(_MAX_WARPS, _SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
+        return min(_MAX_WARPS, _cuda.DEFAULT_SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
 
 
 def fits(problem: Problem) -> bool:
@@ -83,9 +81,8 @@ def _source(shape: Shape, max_iterations: int) -> str:
     numbers = dict(N=n, LEVELS=levels, M=m, WARPS=shape.warps, max_iterations=max_iterations)
     numbers |= {name: getattr(_constants, name) for name in _WHOLE}
     floats = [f"constexpr double {name} = {getattr(_constants, name)!r};" for name in _NUMBERS]
-    parts = [(_build.FOLDER / "saturation_cuda" / f"{part}.cu").read_text() for part in PARTS]
     head = _cuda.constants(**numbers) + "\n".join(floats)
-    return head + _KERNEL + _cuda.rolled("\n".join(parts)) + "}\n"
+    return head + _KERNEL + _cuda.rolled(_cuda.text_of_parts("saturation_cuda", PARTS)) + "}\n"
 
 
 def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
@@ -96,18 +93,14 @@ def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
         max_iterations: limit on the changes of the active set, for each level (static).
     """
     shape, levels, damping = Shape.of(problem), problem.levels, problem.damping
-    batch, (n, count, _) = len(problem.lower), shape
     given = (jnp.swapaxes(levels.matrix, 2, 3), levels.lower, levels.upper, jnp.stack(damping[:3], 1), damping.bends)
     given += (problem.targets, problem.lower, problem.upper, problem.rank_tol)
-    double, whole = jnp.float64, jnp.int32
-    shapes: list[tuple[tuple[int, ...], Any]] = [((n,), double), ((n, n), double), ((count,), double)]
-    shapes += [((count,), whole), ((count, n), whole), ((count, n), whole), ((count,), whole), ((n,), whole)]
     results = _cuda.call(
         _source(shape, max_iterations),
-        [((batch, *size), kind) for size, kind in [*shapes, ((2,), whole)]],
+        answer_shapes(problem),
         *map(_cuda.as_double, given),
-        levels.equal.astype(whole),
-        problems=batch,
+        levels.equal.astype(jnp.int32),
+        problems=len(problem.lower),
         shared=0,
         per_block=shape.warps,
         warps=shape.warps,
@@ -115,8 +108,15 @@ def solve(problem: Problem, max_iterations: int) -> SaturatedResult:
     return of_core(results)
 
 
+def answer_shapes(problem: Problem) -> _library.Shapes:
+    """Return shape and type of a kernel's outputs in the order of ``SaturationAnswer`` in ``core/saturation.hpp``."""
+    batch, count, _, n = problem.levels.matrix.shape
+    joints = (count,), (count, n), (count, n), (count,), (n,), (2,)
+    return _library.shapes_of(batch, ((n,), (n, n), (count,)), joints)
+
+
 def of_core(results: list[Any]) -> SaturatedResult:
-    """Return a kernel's outputs in the order of ``SaturationAnswer`` in ``core/saturation.hpp``."""
+    """Return a kernel's outputs, in the order of ``answer_shapes``, as a result."""
     x, projector, scales, done, at_bound, blocking, blocker, active, report = results
     joints = ActiveJoints(done != 0, at_bound, blocking, blocker, done)
     return SaturatedResult(x, projector, scales, joints, active, report[:, 1], report[:, 0] != 0)

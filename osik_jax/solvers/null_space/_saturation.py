@@ -168,12 +168,9 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
 
 def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
     """Return the core's answers, and in ``done`` whether each problem has one."""
-    batch, count, _, n = problem.levels.matrix.shape
-    floats = (batch, n), (batch, n, n), (batch, count)
-    ints = (batch, count), (batch, count, n), (batch, count, n), (batch, count), (batch, n), (batch, 2)
     results = _library.call(
         "saturation",
-        [*((s, float) for s in floats), *((s, int) for s in ints)],
+        _cuda.answer_shapes(problem),
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )

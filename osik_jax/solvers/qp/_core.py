@@ -29,7 +29,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     packed = side_by_side(*others) if qp.packed is None else qp.packed
     x, y, active, report = _library.call(
         "weighted_qp",
-        [((batch, n), float), ((batch, p), float), ((batch, n + p), int), ((batch, 3), int)],
+        _library.shapes_of(batch, ((n,), (p,)), ((n + p,), (3,))),
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
     return of_core(x, y, active, report)

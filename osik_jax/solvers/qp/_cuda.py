@@ -71,7 +71,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     outside = -(-batch // per_block), (2 * most + 6) * (most | 1)  # of the dual method, which few problems need
     x, y, active, report, _ = _cuda.call(
         _source(*sizes, max_iterations, per_block),
-        [((batch, n), kind), ((batch, p), kind), ((batch, most), jnp.int32), ((batch, 3), jnp.int32), (outside, kind)],
+        [*_library.shapes_of(batch, ((n,), (p,)), ((most,), (3,)), kind), (outside, kind)],
         *(a.astype(kind) for a in (*numbers, qp.lower, qp.upper)),
         guess.astype(jnp.int32),
         tolerance.astype(kind),

@@ -42,8 +42,6 @@ from ._search import SearchResult, initial_result, search, usable_guess, violate
 _BLOCKS, _MIN_BLOCK = 16, 1024
 """Block size of the search on a GPU: a 16th of the batch, at least 1,024 problems."""
 
-Solve = Callable[[QP, Array, Array, int], Candidate]
-
 
 @cache
 def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, Array, Array], SearchResult]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...core import _build, _cuda
+from ...core import _cuda, _library
 from ...numerics._constants import (
     KERNEL_REFINEMENTS,
     KKT_RIDGE,
@@ -29,8 +29,6 @@ from ._problem import QP
 PARTS = ("workspace", "vectors", "problem", "factor", "refine", "labels", "dual_step", "active_set")
 """Files of the kernel in order; each uses the definitions of earlier ones."""
 _MAX_VARIABLES = 64
-_SHARED_BYTES = 48 * 1024
-"""Shared memory [bytes] that every CUDA device offers a block by default."""
 _MAX_WARPS = 4
 _KERNEL = """
 #define INFINITY __int_as_float(0x7f800000)
@@ -57,7 +55,7 @@ class Shape(NamedTuple):
             return 0
         length = 4 * ((n + 3) // 4 | 1)
         floats = (m + 1) * length + n * length + 5 * length + 3 * (m + 3) + 3
-        return min(_MAX_WARPS, _SHARED_BYTES // (4 * floats))
+        return min(_MAX_WARPS, _cuda.DEFAULT_SHARED_BYTES // (4 * floats))
 
 
 def fits(qp: QP) -> bool:
@@ -78,8 +76,7 @@ def _source(shape: Shape, max_iterations: int) -> str:
     floats = dict(RIDGE=KKT_RIDGE[single] * float(jnp.finfo(single).eps), LAST_CORRECTION=LAST_CORRECTION[single])
     floats |= dict(VIOLATION_TOL=VIOLATION_TOL, MIN_DECREASE=MIN_DECREASE)
     head = _cuda.constants(**numbers) + "\n".join(f"constexpr float {k} = {v!r}f;" for k, v in floats.items())
-    parts = [(_build.FOLDER / "weighted_qp_cuda" / f"{part}.cu").read_text() for part in PARTS]
-    return head + _KERNEL + "\n".join(parts) + "}\n"
+    return head + _KERNEL + _cuda.text_of_parts("weighted_qp_cuda", PARTS) + "}\n"
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
@@ -87,13 +84,13 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape
-    shape, single, whole = Shape(n, m), jnp.float32, jnp.int32
+    shape, single = Shape(n, m), jnp.float32
     numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.lower, qp.upper)
     x, y, active, report = _cuda.call(
         _source(shape, max_iterations),
-        [((batch, n), single), ((batch, 0), single), ((batch, n), whole), ((batch, 3), whole)],
+        _library.shapes_of(batch, ((n,), (0,)), ((n,), (3,)), single),
         *(a.astype(single) for a in (*numbers, qp.rows, qp.compliance)),
-        guess.astype(whole),
+        guess.astype(jnp.int32),
         tolerance.astype(single),
         problems=batch,
         shared=0,
