@@ -107,13 +107,16 @@ def call(
         return list(run(*inputs, source=source, key=key, **{name: np.int32(n) for name, n in numbers.items()}))
 
 
-def call_lanes(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any) -> list[Array]:
+def call_lanes(
+    method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, space: int = 0
+) -> list[Array]:
     """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane: a robot of the batch.
 
     Args:
         method: name of its CPU handler without the prefix "osik_".
         outputs: shape and type of each result, as for ``_library.call``; all are floats.
         inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers.
+        space: numbers of workspace of a lane.
 
     Returns:
         The results, in the precision of the inputs.
@@ -124,7 +127,8 @@ def call_lanes(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inp
     lanes = outputs[0][0][0]
     given = tuple((2 if len(a) > 1 else 1, *a.shape[1:]) if _is_real(a) else a.shape for a in arrays)
     integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))
-    source = _lanes_source(method, real == jnp.float32, given, integers, tuple(shape[1:] for shape, _ in outputs))
+    results = tuple(shape[1:] for shape, _ in outputs)
+    source = _lanes_source(method, real == jnp.float32, given, integers, results, space)
     shapes, last = [(shape, real) for shape, _ in outputs], [_is_real(a) and len(a) > 1 for a in arrays]
     last += [lanes > 1] * len(shapes)
     return call(source, shapes, *arrays, problems=lanes, shared=0, per_block=64, warps=2, lanes_last=last)
@@ -148,6 +152,7 @@ def _lanes_source(
     given: tuple[tuple[int, ...], ...],
     integers: tuple[int, ...],
     results: tuple[tuple[int, ...], ...],
+    space: int = 0,
 ) -> str:
     """Return CUDA text that runs a method for one lane a thread.
 
@@ -157,6 +162,7 @@ def _lanes_source(
         given: shape of each argument; the leading axis of floats is 1 if all lanes share it.
         integers: which arguments are integers.
         results: shape of each result without the axis of lanes.
+        space: as in ``call_lanes``.
     """
 
     def table(name: str, shapes: Sequence[tuple[int, ...]]) -> str:
@@ -169,12 +175,6 @@ def _lanes_source(
 
     parameters = [f"const {'int' if k in integers else 'Real'}* a{k}" for k in range(len(given))]
     parameters += [f"Real* r{k}" for k in range(len(results))]
-    widest = max(shape[-1] for shape in results if shape)
-    space = max(4 * given[0][1], 3 * widest)  # of the centre of mass: numbers of bodies, and of dofs
-    if method == "chain_steps":  # as ChainSearch::space, the joints counted by the numbers of the chain
-        n, frames = given[0][1], given[1][1]
-        joints = (given[2][1] - 12 * frames - 3 * n) // 44
-        space = 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1)
     return (
         text_of("lanes_cuda.hpp")
         + f"using namespace osik;\nusing Real = {'float' if single else 'double'};\nstruct Sizes {{\n"

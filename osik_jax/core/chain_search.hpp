@@ -30,9 +30,6 @@ template <class Call> struct ChainSearch {
   Real *pose, *turned, *point, *e, *gram;          // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
   Real *tips, *J, *x, *home;                       // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
 
-  static OSIK_FN int space(int n, int joints, int frames) {
-    return 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1);
-  }
   ChainSearch(const int* sizes, int n, int frames, Real* next) : n(n), frames(frames), m(6 * frames) {
     Reader<const int*> integers{sizes};
     joints = *integers.take(1), rows = *integers.take(1), near = *integers.take(1);
@@ -61,6 +58,7 @@ template <class Call> struct ChainSearch {
       const Real angle = (coordinate[j] < 0 ? 0 : x[coordinate[j]] * factor[j]) + offset[j], half = Real(0.5) * angle;
       const Real s = sin(half), f = hinge[j] ? 2 * s * cos(half) : angle, g = hinge[j] ? 2 * s * s : 0;
       Real local[12];
+      OSIK_UNROLL
       for (int i = 0; i < 12; ++i)
         local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
       const M before = turn_of_joint(parent[j]), turn = before * turn_of(local + 0);
@@ -93,62 +91,84 @@ template <class Call> struct ChainSearch {
     found.score = most(found.position / numbers[1], found.orientation / numbers[2]);
     return found;
   }
-  // The column of J of a coordinate: [rows], the derivative of e.
-  void differentiate(int dof, Real* column) const {
-    for (int f = 0; f < frames; ++f) {
-      V linear{0, 0, 0}, angular{0, 0, 0};
-      for (int j = 0; j < joints; ++j) {
-        if (coordinate[j] != dof || !carries[f * joints + j]) continue;
-        const V own = factor[j] * V::of(turned + 3 * j);
-        linear = linear + (hinge[j] ? cross(own, V::of(tips + 3 * f) - V::of(point + 3 * j)) : own);
-        if (hinge[j]) angular = angular + numbers[0] * own;
+  // J, the derivative of e.
+  void differentiate() {
+    for (int k = 0; k < n * rows; ++k) J[k] = 0;
+    for (int j = 0; j < joints; ++j) {
+      if (coordinate[j] < 0) continue;
+      Real* const column = J + coordinate[j] * rows;
+      const V own = factor[j] * V::of(turned + 3 * j), at = V::of(point + 3 * j);
+      for (int f = 0; f < frames; ++f) {
+        if (!carries[f * joints + j]) continue;
+        const V linear = hinge[j] ? cross(own, V::of(tips + 3 * f) - at) : own;
+        const V angular = (hinge[j] ? numbers[0] : 0) * own;
+        const Real off[] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
+        OSIK_UNROLL
+        for (int i = 0; i < 6; ++i)
+          if (row[6 * f + i] >= 0) column[row[6 * f + i]] += off[i];
       }
-      const Real off[] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
-      for (int i = 0; i < 6; ++i)
-        if (row[6 * f + i] >= 0) column[row[6 * f + i]] = off[i];
     }
   }
   // Solve gram y = e by elimination, of which the lower triangle is given; y in place of e. ROWS: 0 or known before.
-  template <int ROWS> void eliminate() {
+  template <int ROWS> void eliminate(Real* gram, Real* e) const {
     const int rows = ROWS ? ROWS : this->rows;
+    OSIK_UNROLL
     for (int k = 0; k < rows; ++k) {
-      Real* const pivot = gram + k * rows;
+      const Real inverse = 1 / gram[k * rows + k];
+      OSIK_UNROLL
       for (int i = k + 1; i < rows; ++i) {
-        Real* const own = gram + i * rows;
-        const Real ratio = own[k] / pivot[k];
-        for (int j = k + 1; j <= i; ++j) own[j] -= ratio * gram[j * rows + k];
+        const Real ratio = gram[i * rows + k] * inverse;
+        OSIK_UNROLL
+        for (int j = k + 1; j <= i; ++j) gram[i * rows + j] -= ratio * gram[j * rows + k];
         e[i] -= ratio * e[k];
       }
     }
+    OSIK_UNROLL
     for (int k = rows - 1; k >= 0; --k) {
+      OSIK_UNROLL
       for (int i = k + 1; i < rows; ++i) e[k] -= gram[i * rows + k] * e[i];
       e[k] /= gram[k * rows + k];
     }
   }
+  // Whether a search with these errors is at its end. One towards `start` goes on.
+  bool is_done(const Errors& found) const { return !near && found.score <= numbers[3]; }
   // The errors at x, and the next point in its place.
   template <int ROWS> Errors step(In goal) {
     const int rows = ROWS ? ROWS : this->rows;
+    Real registers[ROWS ? ROWS * (ROWS + 1) : 1];  // of a GPU, because every loop over them is unrolled
+    Real *const gram = ROWS ? registers : this->gram, *const e = ROWS ? registers + ROWS * ROWS : this->e;
     place();
     const Errors found = compare(goal);
+    if (is_done(found)) return found;
+    differentiate();
     const Real damping = numbers[4] * found.cost + numbers[5] * numbers[0] * numbers[0];
-    for (int a = 0; a < rows; ++a)
+    OSIK_UNROLL
+    for (int a = 0; a < rows; ++a) {
+      e[a] = this->e[a];
+      OSIK_UNROLL
       for (int b = 0; b <= a; ++b) gram[a * rows + b] = a == b ? damping : 0;
+    }
     for (int j = 0; j < n; ++j) {
       Real *column = J + j * rows, gradient = 0;
-      differentiate(j, column);
+      OSIK_UNROLL
       for (int a = 0; a < rows; ++a) gradient += column[a] * e[a];
       const bool is_stopped = (x[j] <= lower[j] && gradient > 0) || (x[j] >= upper[j] && gradient < 0);
       for (int a = 0; a < rows && is_stopped; ++a) column[a] = 0;
       home[j] = near && !is_stopped ? start[j] - x[j] : 0;
-      for (int a = 0; a < rows; ++a)
+      OSIK_UNROLL
+      for (int a = 0; a < rows; ++a) {
+        OSIK_UNROLL
         for (int b = 0; b <= a; ++b) gram[a * rows + b] += column[a] * column[b];
+      }
     }
-    for (int j = 0; j < n && near; ++j)
+    for (int j = 0; j < n && near; ++j) {
+      OSIK_UNROLL
       for (int a = 0; a < rows; ++a) e[a] += J[j * rows + a] * home[j];
-    if (!near && found.score <= numbers[3]) return found;
-    eliminate<ROWS>();
+    }
+    eliminate<ROWS>(gram, e);
     for (int j = 0; j < n; ++j) {
       Real to = x[j] + home[j];
+      OSIK_UNROLL
       for (int a = 0; a < rows; ++a) to -= J[j * rows + a] * e[a];
       x[j] = to < lower[j] ? lower[j] : to > upper[j] ? upper[j] : to;
     }
@@ -159,7 +179,7 @@ template <class Call> struct ChainSearch {
 template <class Call> void advance_chain(const Call& call) {
   using Real = typename Call::Real;
   const int n = call.size(0, 1), frames = call.size(1, 1), *integers = call.integers(3);
-  typename Call::Space space(ChainSearch<Call>::space(n, integers[1], frames));
+  auto space = call.space();
   ChainSearch<Call> search(integers + 1, n, frames, space.data());
   call.each_lane([&](int lane) {
     search.read(call.in(2, lane));
@@ -168,10 +188,11 @@ template <class Call> void advance_chain(const Call& call) {
     Real* at = search.x;
     typename ChainSearch<Call>::Errors found{};
     for (int j = 0; j < n; ++j) at[j] = x[j];
-    for (int step = 0; step < integers[0]; ++step) {
-      if (step + 1 == integers[0])
-        for (int j = 0; j < n; ++j) here[j] = at[j];
+    bool is_done = false;
+    for (int step = 0; step < integers[0] && !is_done; ++step) {
+      for (int j = 0; j < n; ++j) here[j] = at[j];
       found = search.rows == 6 ? search.template step<6>(call.in(1, lane)) : search.template step<0>(call.in(1, lane));
+      is_done = search.is_done(found);
     }
     for (int j = 0; j < n; ++j) there[j] = at[j];
     errors[0] = found.position, errors[1] = found.orientation, errors[2] = found.score, errors[3] = found.cost;

@@ -138,13 +138,6 @@ std::string_view text(const xla::Attributes& a, std::string_view name) {
   return {};
 }
 
-int32_t number(const xla::Attributes& a, std::string_view name) {
-  for (int64_t i = 0; i < a.size; ++i)
-    if (std::string_view(a.names[i]->data, a.names[i]->size) == name)
-      return *static_cast<const int32_t*>(static_cast<const xla::Scalar*>(a.values[i])->value);
-  return 0;
-}
-
 // Launch osik_kernel(arguments..., results..., problems): `threads` threads a block, `per_block` problems each.
 std::string launch(xla::CallFrame* frame) {
   const Cuda& c = cuda();
@@ -161,8 +154,8 @@ std::string launch(xla::CallFrame* frame) {
     for (int64_t i = 0; i < frame->arguments.size; ++i) data.push_back(frame->arguments.buffers[i]->data);
     for (int64_t i = 0; i < frame->results.size; ++i) data.push_back(frame->results.buffers[i]->data);
     for (auto& pointer : data) pointers.push_back(&pointer);
-    int32_t problems = number(a, "problems"), shared = number(a, "shared");
-    const int32_t per_block = number(a, "per_block"), threads = number(a, "threads");
+    int32_t problems = xla::number(a, "problems"), shared = xla::number(a, "shared");
+    const int32_t per_block = xla::number(a, "per_block"), threads = xla::number(a, "threads");
     pointers.push_back(&problems);
     if (shared > SHARED_WITHOUT_ASKING) c.set_attribute(function, DYNAMIC_SHARED, shared);
     if (problems > 0)

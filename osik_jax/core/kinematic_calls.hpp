@@ -5,7 +5,7 @@
 //   integers(k)                           argument k, integers that all lanes share
 //   in(k, lane), out(k, lane)             the numbers of one lane: pointers (In, Out), or what stands for them
 //   each_lane(f)                          f(lane) for all lanes, or for the one of a GPU's thread
-//   Space                                 numbers to work with
+//   space()                               numbers to work with, a Space: as many as the caller in Python says
 // Both calls are written for it: one of a CPU (kinematics_cpu.cpp), one of a GPU (lanes_cuda.hpp).
 #pragma once
 #include "task_rows.hpp"
@@ -80,15 +80,15 @@ template <class Call> struct Center {
   int bodies, dofs, nv;
   Reader<const int*> integers;
   const int *parents, *owner, *column;
-  typename Call::Space below;
+  typename Call::Space space;  // [bodies, 4] of what is below each body, then what the caller of `find` needs
   Center(const Call& call, int nv)
       : bodies(call.size(0, 1)), dofs(call.size(2, 1)), nv(nv), integers{call.integers(6)}, parents(integers.take(bodies)),
-        owner(integers.take(dofs)), column(integers.take(dofs)), below(4 * bodies) {}
+        owner(integers.take(dofs)), column(integers.take(dofs)), space(call.space()) {}
   template <class Out> void find(const Call& call, int lane, Out point, Out J) {
     Reader<In> numbers{call.in(5, lane)};
     const DofColumns<In> columns{dofs, nv, column, numbers.take(dofs)};
     const In mass = numbers.take(bodies), center = numbers.take(3 * bodies);
-    move_center(columns, placed(call, lane), bodies, parents, owner, mass, center, below.data(), point, J);
+    move_center(columns, placed(call, lane), bodies, parents, owner, mass, center, space.data(), point, J);
   }
 };
 template <class Call> void move_centers(const Call& call) {
@@ -108,14 +108,14 @@ template <class Call> void find_center_rows(const Call& call) {
   const int m = call.result_size(1, 1), nv = call.result_size(1, 2);
   Center<Call> center(call, nv);
   const int *axes = center.integers.take(m), *turning = center.integers.take(nv);
-  typename Call::Space J(3 * nv);
+  typename Call::Real* const J = center.space.data() + 4 * center.bodies;
   call.each_lane([&](int lane) {
     typename Call::Real point[3];
-    center.find(call, lane, point + 0, J.data());
+    center.find(call, lane, point + 0, J);
     Reader<In> numbers{call.in(7, lane)};
     CenterGoal<In> goal{m, axes, turning};
     goal.target = numbers.take(m), goal.velocity = numbers.take(m), goal.weight = numbers.take(m), goal.gain = numbers.at;
-    center_rows(goal, point + 0, J.data(), nv, rows_of(call, lane));
+    center_rows(goal, point + 0, J, nv, rows_of(call, lane));
   });
 }
 

@@ -13,6 +13,7 @@ struct Lanes {
   using Out = double*;
   using Space = std::vector<double>;
   xla::Call call;
+  Space space() const { return Space(xla::number(call.frame->attributes, "space")); }
   int size(int k, int axis) const { return call.size(k, axis); }
   int result_size(int k, int axis) const { return int(call.result(k).dimensions[axis]); }
   const int* integers(int k) const { return call.in<int>(k); }

@@ -25,12 +25,12 @@ template <class R, class Sizes> struct ThreadCall {
   using Out = Strided<R>;
   struct Space {
     R numbers[Sizes::SPACE];
-    Space(int) {}
     R* data() { return numbers; }
   };
   const void* const* arguments;
   void* const* results;
   int lanes;
+  Space space() const { return Space(); }
   int size(int k, int axis) const { return Sizes::argument(k, axis); }
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
   const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }

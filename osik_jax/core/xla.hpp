@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <string_view>
 
 namespace osik::xla {
 
@@ -115,6 +116,14 @@ inline bool is_call(CallFrame* frame, uint32_t traits = 0) {
     return false;
   }
   return frame->stage == EXECUTE;
+}
+
+// An attribute of a call that is an integer; 0 if there is none of this name.
+inline int32_t number(const Attributes& a, std::string_view name) {
+  for (int64_t i = 0; i < a.size; ++i)
+    if (std::string_view(a.names[i]->data, a.names[i]->size) == name)
+      return *static_cast<const int32_t*>(static_cast<const Scalar*>(a.values[i])->value);
+  return 0;
 }
 
 // The buffers of one call; every buffer has a leading axis of problems unless said otherwise.

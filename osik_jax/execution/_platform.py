@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import jax
@@ -23,6 +24,19 @@ def cpu_is_default() -> bool:
     Programs for a CPU minimise the number of operations and work in blocks that fit into the cache.
     """
     return jax.default_backend() == "cpu"
+
+
+def on_host() -> AbstractContextManager[Any]:
+    """Return a context in which JAX computes on the CPU, if a GPU is the default and JAX has the CPU too.
+
+    For a few numbers that Python needs: each transfer between host and GPU takes as long as a search for a pose.
+    """
+    if not cuda_is_default():
+        return nullcontext()
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX_PLATFORMS names the GPU alone
+        return nullcontext()
 
 
 def is_symbolic(count: Any) -> bool:

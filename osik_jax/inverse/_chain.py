@@ -7,6 +7,7 @@ numbers, on a CPU and on a GPU. Of the robot, only the joints that carry one of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..execution._platform import cuda_is_default
 from ..kinematics._rigid import compose, cross, rotate, rotation_matrix
 from ..robot import Robot
 from ..robot._tree import HINGE, SLIDE, KinematicTree
@@ -87,6 +89,7 @@ def _carrying(tree: KinematicTree, frame: str) -> list[int]:
     return [j for body in reversed(path) for j, owner in enumerate(tree.joint_bodies) if owner == body]
 
 
+@lru_cache
 def chain_layout(tree: KinematicTree, frames: Sequence[str]) -> Layout:
     """Return the structure of the chain to some frames, of which ``is_plain`` holds."""
     paths = [_carrying(tree, name) for name in frames]
@@ -227,7 +230,8 @@ def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"]) -> Float[Ar
             pose = _joined(pose, own)
             return pose, pose
 
-        _, poses = jax.lax.scan(along, world, local)
+        # on a GPU each operation of a loop is launched anew
+        _, poses = jax.lax.scan(along, world, local, unroll=cuda_is_default())
         return jnp.concatenate([poses, world[None]])
 
     def after(poses: Array, step: tuple[Array, Array, Array]) -> tuple[Array, None]:

@@ -43,5 +43,8 @@ def advanced(
     lanes = max(len(a) for a in (x, goals, numbers))
     shapes = [((lanes, x.shape[1]), float)] * 2 + [((lanes, 4), float)]
     integers = np.concatenate([np.ravel(part) for part in parts]).astype(np.int32)
-    here, there, errors = call("chain_steps", shapes, x, goals.reshape(len(goals), -1, 12), numbers, integers)
+    n, rows = x.shape[1], 6 * len(layout.ends)
+    space = 18 * len(layout.joints) + 3 * len(layout.ends) + 2 * n + rows * (rows + n + 1)  # as ChainSearch takes it
+    given = x, goals.reshape(len(goals), -1, 12), numbers, integers
+    here, there, errors = call("chain_steps", shapes, *given, space=space)
     return here, there, Errors(*errors.T)

@@ -10,12 +10,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..execution._lanes import first_set
 
-CHECK = 4
-"""Steps between two looks at how the lanes are doing."""
 _TRIAL = 8
 """Steps that every search may take before it has to make progress."""
 _PROGRESS = 0.7
 """A search goes on where a few steps have brought the cost below this, relative to what it was."""
+
+
+class Pace(NamedTuple):
+    """Rhythm of a pool of searches.
+
+    Attributes:
+        lanes: searches for a target that a GPU goes on with together, where there are few targets.
+        check: steps between two looks at how the lanes are doing.
+    """
+
+    lanes: int = 8
+    check: int = 4
 
 
 class Errors(NamedTuple):
@@ -84,6 +94,7 @@ def run_pool(
     open_: Bool[Array, " targets"],
     *,
     lanes: int,
+    check: int,
     seeds: Int[Array, " targets"],
     longest: Int[Array, ""],
     enough: Float[Array, ""],
@@ -97,6 +108,7 @@ def run_pool(
         goals: pytree of the targets, with the targets in front.
         open_: targets that are looked for; the others, which fill up a batch, are left alone.
         lanes: searches that go on at the same time.
+        check: steps between two looks at how they are doing.
         seeds: searches for each target at most, one number each.
         longest: steps of one search at most.
         enough: score at which a target is found and its searches end.
@@ -107,9 +119,10 @@ def run_pool(
 
     def body(state: _State) -> _State:
         state = _refill(search, goals, open_, seeds, enough, state)
-        here, there, errors = search.advance(state.lanes.x, _of(goals, state.lanes.target), CHECK)
-        found = _best(state.found, state.lanes, here, errors)
-        return state._replace(lanes=_culled(state.lanes, there, errors, found, longest, enough), found=found)
+        here, there, errors = search.advance(state.lanes.x, _of(goals, state.lanes.target), check)
+        found = _best(state.found, state.lanes, here, errors, check)
+        lanes = _culled(state.lanes, there, errors, found, check, longest, enough)
+        return state._replace(lanes=lanes, found=found)
 
     def goes_on(state: _State) -> Array:
         return (state.lanes.target < targets).any() | _wanting(state, open_, seeds, enough).any()
@@ -170,7 +183,7 @@ def _refill(search: Search, goals: Any, open_: Array, seeds: Array, enough: Arra
     )
 
 
-def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
+def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors, check: int) -> Found:
     """Update the best result of each target; ties keep the present result, then the lowest lane."""
     least = found.errors.score.at[lanes.target].min(errors.score)
     number = jnp.arange(len(lanes.target), dtype=jnp.int32)
@@ -188,13 +201,13 @@ def _best(found: Found, lanes: _Lanes, x: Array, errors: Errors) -> Found:
         put(found.x, x),
         Errors(*(put(old, new) for old, new in zip(found.errors, errors, strict=True))),
         put(found.seed, lanes.seed),
-        found.steps.at[lanes.target].add(CHECK),
+        found.steps.at[lanes.target].add(check),
     )
 
 
-def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, longest: Array, enough: Array) -> _Lanes:
+def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, check: int, longest: Array, enough: Array) -> _Lanes:
     """End searches whose target is found, that are too long, or that make no progress."""
-    age = lanes.age + CHECK
+    age = lanes.age + check
     # the negated comparison also ends a search whose cost is NaN
     stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)
     ends = stuck | (age >= longest) | (found.errors.score[lanes.target] <= enough)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from typing import Any, cast
 
 import jax
@@ -13,6 +14,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._errors import OsikValueError
+from ..execution._platform import on_host
 from ..numerics._arguments import concrete
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
@@ -36,13 +38,20 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
         TypeError, ValueError: something that is no pose, or batches of different lengths.
         KeyError: no such frame.
     """
-    dtype = robot.q0.dtype
-    parts = {}
-    for name, value in targets.items():
-        try:
-            parts[name] = _one(value, dtype)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"targets[{name!r}]: {error}") from None
+    parts, (values, structure) = {}, jax.tree.flatten(list(targets.values()))
+    traced = any(isinstance(leaf, Tracer) for leaf in values)
+    if not traced and any(isinstance(leaf, jax.Array) for leaf in values):
+        # all arrays at once, because each transfer from a GPU makes the host wait
+        fetched = iter(jax.device_get([leaf for leaf in values if isinstance(leaf, jax.Array)]))
+        values = [next(fetched) if isinstance(leaf, jax.Array) else leaf for leaf in values]
+    # an operation of JAX's costs as much as a short search; it alone refuses all that is no number
+    numbers = np if all(isinstance(leaf, np.ndarray) and leaf.dtype != object for leaf in values) else jnp
+    with nullcontext() if traced else on_host():
+        for name, value in zip(targets, jax.tree.unflatten(structure, values), strict=True):
+            try:
+                parts[name] = _one(value, robot.q0.dtype, numbers)
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"targets[{name!r}]: {error}") from None
     counts = {name: position.shape[0] for name, (position, _, _) in parts.items() if position.ndim == 2}
     if len(set(counts.values())) > 1:
         raise OsikValueError(
@@ -52,22 +61,21 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
     if count == 0:
         raise OsikValueError("there are no targets: the poses have a leading axis of length 0")
     shape = (count or 1,)
-    traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(parts))
-    numbers = jnp if traced else np  # an operation of JAX's costs as much as a short search
+    numbers = jnp if traced else np
     position = numbers.stack([numbers.broadcast_to(p, (*shape, 3)) for p, _, _ in parts.values()], 1)
     rotation = numbers.stack([numbers.broadcast_to(r, (*shape, 3, 3)) for _, r, _ in parts.values()], 1)
     return Goal(cast(Array, position), cast(Array, rotation)), tuple(rows for _, _, rows in parts.values()), count
 
 
-def _one(value: Any, dtype: Any) -> tuple[Array, Array, tuple[bool, ...]]:
+def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool, ...]]:
     """Return position, rotation and rows of one pose or of n. (3,) or (n, 3), likewise the rotation."""
-    array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED)
+    array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED, numbers)
     if array is not None and array.shape[-1:] == (3,) and array.ndim <= 2:
         _check_finite(array)
-        return array, jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
-    pose = _split(value if array is None else array, dtype)
+        return array, numbers.broadcast_to(numbers.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
+    pose = _split(value if array is None else array, dtype, numbers)
     if pose[0].ndim == 1:
-        return *as_pose(pose, dtype), _POSE
+        return *as_pose(pose, dtype, numbers=numbers), _POSE
     if pose[0].ndim != 2 or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
         raise OsikValueError(
             f"got positions of shape {pose[0].shape} and rotations of shape {pose[1].shape}; many poses are positions "
@@ -86,11 +94,11 @@ def _has_parts(value: Any) -> bool:
     return isinstance(value, jaxlie.SE3) or (isinstance(value, tuple | list) and len(value) == 2)
 
 
-def _split(value: Any, dtype: Any) -> tuple[Array, Array]:
+def _split(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array]:
     if isinstance(value, jaxlie.SE3):
-        return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
+        return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
     if isinstance(value, tuple | list):
-        return pose_array(value[0], dtype, _ACCEPTED), pose_array(value[1], dtype, _ACCEPTED)
+        return pose_array(value[0], dtype, _ACCEPTED, numbers), pose_array(value[1], dtype, _ACCEPTED, numbers)
     if value.shape[-2:] != (4, 4) or value.ndim > 3:
         raise OsikValueError(f"got an array of shape {value.shape}; a pose is a (4, 4) matrix, a position is (3,)")
     return value[..., :3, 3], value[..., :3, :3]

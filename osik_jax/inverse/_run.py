@@ -18,6 +18,7 @@ from ._chain_problem import Settings
 from ._closest import Closest, closest
 from ._fixed import LAST, Outcomes, choose, search_all
 from ._host import in_chunks, lanes_for, only
+from ._packed import Packed, packed, unpacked
 from ._pool import run_pool
 from ._solution import InverseKinematicsSolution
 
@@ -44,22 +45,28 @@ def searched(
 
     ``go_on``: to the configuration with the least error, for targets that are not met.
     """
-    run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes_for(len(jax.tree.leaves(goals)[0])))
+    lanes = lanes_for(len(jax.tree.leaves(goals)[0]), route.pace.lanes)
+    run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
     hopeless = np.int32(1 if go_on else _HOPELESS)
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
         def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
-            return run(goals, settings, left, np.int32(most), hopeless, np.int32(steps))
+            given = packed((goals, settings, left, np.int32(most), hopeless, np.int32(steps)))
+            return unpacked(jax.device_get(run(given)))
 
         found = by(1 if warm else seeds, wanted)
-        left = wanted & ~np.asarray(found.converged)
+        left = wanted & ~found.converged
         if warm and left.any():
             found = _with(found, left, by(seeds, left))
-            left &= ~np.asarray(found.converged)
+            left &= ~found.converged
         if not (go_on and left.any()):
             return found
         starts = min(seeds, _STARTS)
-        approach = partial(_approached, robot, settings=settings, route=route, warm=warm, starts=starts)
+        run_on = partial(_approached, robot, route=route, warm=warm, starts=starts)
+
+        def approach(*args: Any) -> InverseKinematicsSolution:
+            return unpacked(jax.device_get(run_on(packed((settings, *args)))))
+
         own = only(left, approach, goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
@@ -71,39 +78,19 @@ def _with(found: Any, changed: np.ndarray, new: Any) -> Any:
 
 
 @partial(jax.jit, static_argnames=("route", "warm", "lanes"))
-def _pooled(
-    robot: Robot,
-    goals: Any,
-    settings: Settings,
-    wanted: Array,
-    seeds: Array,
-    hopeless: Array,
-    longest: Array,
-    *,
-    route: Any,
-    warm: bool,
-    lanes: int,
-) -> InverseKinematicsSolution:
+def _pooled(robot: Robot, given: Packed, *, route: Any, warm: bool, lanes: int) -> Packed:
+    goals, settings, wanted, seeds, hopeless, longest = unpacked(given)
     search = route.search(robot, settings, warm=warm, near=False)
     most = jnp.where(route.beyond(search, goals) > 0.0, jnp.minimum(seeds, hopeless), seeds)
-    found = run_pool(search, goals, wanted, lanes=lanes, seeds=most, longest=longest, enough=search.enough)
-    return route.answer(robot, search, goals, found.x, found.seed, found.steps)
+    limits = dict(seeds=most, longest=longest, enough=search.enough)
+    found = run_pool(search, goals, wanted, lanes=lanes, check=route.pace.check, **limits)
+    return packed(route.answer(robot, search, goals, found.x, found.seed, found.steps))
 
 
 @partial(jax.jit, static_argnames=("route", "warm", "starts"))
-def _approached(
-    robot: Robot,
-    goals: Any,
-    q: Array,
-    seed: Array,
-    before: Array,
-    *,
-    settings: Settings,
-    route: Any,
-    warm: bool,
-    starts: int,
-) -> InverseKinematicsSolution:
+def _approached(robot: Robot, given: Packed, *, route: Any, warm: bool, starts: int) -> Packed:
     """Return the least-error configuration for unmet targets, from new searches and the best so far."""
+    settings, goals, q, seed, before = unpacked(given)
     search = route.search(robot, settings, warm=warm, near=False)
 
     def some(goals: Any, best: Array) -> Closest:
@@ -116,7 +103,7 @@ def _approached(
     new = starts if route.starts_anew else 0
     steps = before + new * _GLANCE + found.steps
     number = jnp.where(found.seed == new, seed, found.seed)
-    return route.answer(robot, search, goals, found.x, number, steps)
+    return packed(route.answer(robot, search, goals, found.x, number, steps))
 
 
 @partial(jax.jit, static_argnames=("route", "seeds", "steps", "warm", "near", "every", "go_on"))

@@ -22,7 +22,7 @@ from ..schemes import Scheme
 from ..tasks import AxisAlignTask, ComTask, ContactTask, FrameTask, LookAtTask, RelativeFrameTask, Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
-from ._pool import Errors
+from ._pool import Errors, Pace
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_search import Aims, TaskSearch, entry_limits, is_goal
@@ -63,6 +63,11 @@ class TaskRoute(NamedTuple):
     def starts_anew(self) -> bool:
         """Return False, because each copy of a scheme's step in a program takes long to compile."""
         return False
+
+    @property
+    def pace(self) -> Pace:
+        """Return the rhythm of its searches."""
+        return Pace()
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
         """Return the search for these tasks."""

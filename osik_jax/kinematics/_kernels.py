@@ -61,7 +61,7 @@ def center_of_mass(call: Call, robot: Robot, kinematics: Any) -> tuple[Array, Ar
     """Return the centre of the masses of the bodies, and its Jacobian."""
     given, integers, lanes = center_arguments(robot, kinematics)
     outputs = [((lanes, 3), float), ((lanes, 3, robot.tree.nv), float)]
-    center, jacobian = call("center_of_mass", outputs, *given, integers)
+    center, jacobian = call("center_of_mass", outputs, *given, integers, space=4 * len(robot.tree.body_parents))
     return center, jacobian
 
 

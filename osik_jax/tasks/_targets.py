@@ -23,9 +23,13 @@ if the other is not used.
 """
 
 _LAST_ROW = 1e-4
+_ACCEPTED = (
+    "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix or a "
+    "jaxlie.SE3"
+)
 
 
-def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> Pose:
+def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = jnp) -> Pose:
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
@@ -35,14 +39,15 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
         value: the pose.
         dtype: of the result.
         rest: position and rotation where the value has only the other part; None: the value has to have that part.
+        numbers: module that makes arrays of what is not computed, ``jax.numpy`` or ``numpy``.
 
     Raises:
         TypeError: no numbers.
         ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
     """
-    parts = _parts(value, dtype)
+    parts = _parts(value, dtype, numbers)
     if parts is None:
-        array = pose_array(value, dtype)
+        array = pose_array(value, dtype, numbers=numbers)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
             _check_last_row(array)
@@ -59,16 +64,16 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None)) -> 
     return position, _rotation(rotation)
 
 
-def _parts(value: Any, dtype: Any) -> tuple[Array, Array] | None:
+def _parts(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array] | None:
     """Return position and rotation of a pair."""
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
-        return jnp.asarray(value.translation(), dtype), jnp.asarray(value.rotation().wxyz, dtype)
+        return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
     if isinstance(value, (tuple, list)) and len(value) == 2:
-        return pose_array(value[0], dtype), pose_array(value[1], dtype)
+        return pose_array(value[0], dtype, numbers=numbers), pose_array(value[1], dtype, numbers=numbers)
     return None
 
 
-def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
+def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Array:
     """Return the numbers of an array, or of an object that has a matrix.
 
     Raises:
@@ -79,15 +84,9 @@ def pose_array(value: Any, dtype: Any, accepted: str | None = None) -> Array:
     elif hasattr(value, "homogeneous"):
         value = value.homogeneous
     try:
-        return jnp.asarray(value, dtype)
+        return numbers.asarray(value, dtype)
     except (TypeError, ValueError):
-        raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted or _ACCEPTED}") from None
-
-
-_ACCEPTED = (
-    "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix or a "
-    "jaxlie.SE3"
-)
+        raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted}") from None
 
 
 def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:

@@ -19,6 +19,7 @@ NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 
 PLACED = (2, 3, 3), (2, 3, 3, 3), (2, 7, 3), (2, 7, 3), (2, 7, 3)
 """Kinematics of three bodies and seven dofs."""
+CENTER = (*PLACED, (1, 50), (9,), (2, 9))
 POSE = (2, 3), (2, 3, 3), (2, 6, 7), (1, 25), (8,)
 CHAIN = (2, 7), (2, 1, 12), (1, 347), (38,)
 """Steps of a search for the pose of a frame that seven joints carry."""
@@ -44,10 +45,10 @@ TEXTS = {
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
     "bodies": lambda: _cuda._lanes_source("kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((3, 3), *[(2, 3)] * 4)),
     "frames": lambda: _cuda._lanes_source("moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((1, 3), (1, 6, 7))),
-    "centre of mass": lambda: _cuda._lanes_source("center_rows", True, (*PLACED, (1, 50), (9,), (2, 9)), (6,), ROWS),
+    "centre of mass": lambda: _cuda._lanes_source("center_rows", True, CENTER, (6,), ROWS, 33),
     "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 44), (16,)), (6,), ROWS),
     "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
-    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((7,), (7,), (4,))),
+    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((7,), (7,), (4,)), 227),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 
