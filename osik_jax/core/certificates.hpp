@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "hierarchy.hpp"
+#include "lanes.hpp"
 #include "weighted_qp.hpp"
 
 namespace osik {
@@ -16,68 +17,55 @@ struct Certificate {
 
 // Of a weighted QP in double precision.
 class QPCertificate {
-  using Team = Serial<double>;
   QPSizes s;
   std::vector<double> space;
-  double *SIZE, *GRADIENT, *SCALE, *ROOT, *INVERSE_ROOT, *ROW_TERMS, *ROW;  // [n]; the sizes of terms of the gradient
+  double *SIZE, *GRADIENT, *SCALE, *ROOT, *INVERSE_ROOT, *ROW_TERMS;  // [n]; the sizes of terms of the gradient
+  double *FORCE, *TERMS;                                              // [m] pulls of the rows, and the sizes of their terms
+  double scaled, plain, tolerance;                                    // sizes of x: per root of a curvature, and per unit
 
  public:
-  explicit QPCertificate(const QPSizes& sizes) : s(sizes), space(7 * (sizes.n + 8)) {
+  explicit QPCertificate(const QPSizes& sizes) : s(sizes), space(6 * sizes.n + 2 * sizes.m) {
     double* at = space.data();
-    for (double** v : {&SIZE, &GRADIENT, &SCALE, &ROOT, &INVERSE_ROOT, &ROW_TERMS, &ROW}) *v = at, at += s.n + 8;
+    for (double** v : {&SIZE, &GRADIENT, &SCALE, &ROOT, &INVERSE_ROOT, &ROW_TERMS}) *v = at, at += s.n;
+    FORCE = at, TERMS = at + s.m;
   }
 
   // x: [n], y: [p] multipliers of the rows, active: [n + p] labels; residuals up to kkt_tol are certified
   Certificate judge(const QPData<double>& d, const double* x, const double* y, const int* active, double kkt_tol) {
     const int n = s.n, p = s.p;
-    double scaled = 0, plain = 0, scaled_newton = 0, plain_newton = 0;
+    tolerance = d.tolerance;
     add_terms(d, x);
-    for (int j = 0; j < n; ++j) {
-      const double newton = fabs(GRADIENT[j]) / square(ROOT[j]);
-      scaled = larger(scaled, SIZE[j] * ROOT[j]), plain = larger(plain, SIZE[j]);
-      scaled_newton = larger(scaled_newton, newton * ROOT[j]), plain_newton = larger(plain_newton, newton);
-      ROW_TERMS[j] = 0;
-    }
-    if (scaled <= ZERO_TOL * EPSILON * scaled_newton) scaled = scaled_newton, plain = plain_newton;
+    measure();
     for (int q = 0; q < p; ++q)
-      for (int j = 0; j < n; ++j) GRADIENT[j] -= d.rows[q * n + j] * y[q], ROW_TERMS[j] += fabs(d.rows[q * n + j] * y[q]);
+      each_entry(n, [&](auto e) {
+        const auto force = e(d.rows + q * n) * y[q];
+        e.put(e(GRADIENT) - force, GRADIENT), e.put(e(ROW_TERMS) + fabs(force), ROW_TERMS);
+      });
     bool holds = true, exact = true;
-    double dual = 0, primal = 0, terms = 0;
-    for (int i = 0; i < n + p; ++i) {
-      const int label = active[i], q = i - n;
-      double per_curvature = 0, per_unit = 1, value = 0, compliant = 0, longest = 1;
-      if (i < n) per_curvature = INVERSE_ROOT[i], value = compliant = x[i];
-      else {
-        const double* row = d.rows + q * n;
-        per_unit = longest = 0;
-        for (int j = 0; j < n; ++j)
-          per_curvature += fabs(row[j]) * INVERSE_ROOT[j], per_unit += fabs(row[j]), longest = larger(longest, fabs(row[j]));
-        value = Team::own_dot(row, x, 0, n), compliant = value + d.compliance[q] * y[q];
-      }
-      const double low = d.lower[i], high = d.upper[i], nearest = fabs(low) < fabs(high) ? fabs(low) : fabs(high);
-      const double reach = scaled * per_curvature < plain * per_unit ? scaled * per_curvature : plain * per_unit;
-      const double scale = reach + fabs(value) + (nearest < INFINITE ? nearest : 0.0);
-      const double force = scale / square(larger(per_curvature, 2.2250738585072014e-308)) +
-                           (i < n ? ROW_MULTIPLIER * ROW_TERMS[i] : 0.0);
-      const double multiplier = i < n ? GRADIENT[i] : y[q], sign = label == AT_LOWER ? -multiplier : multiplier;
-      const bool one_side = label == AT_LOWER || label == AT_UPPER, is_active = label != INACTIVE;
-      const double off = is_active ? fabs(compliant - (label == AT_UPPER ? high : low)) : 0.0;
-      const double gap = larger(low - compliant, compliant - high);
-      holds = holds && (one_side || (label == EQUALITY ? low == high : label == INACTIVE && low != high));
-      holds = holds && off <= VALUE_TOL * d.tolerance * scale && !(gap > VALUE_TOL * d.tolerance * scale);
-      holds = holds && (!one_side || sign <= SIGN_TOL * d.tolerance * force);
-      if (i < n) {
-        const double size = SCALE[i] + ROW_TERMS[i], roundoff = GRADIENT_TOL * EPSILON * size;
-        holds = holds && (is_active || fabs(multiplier) <= VALUE_TOL * d.tolerance * force);
-        exact = exact && (label == EQUALITY || (is_active ? sign : fabs(multiplier)) <= roundoff);
-        terms = larger(terms, size), dual = larger(dual, one_side ? sign : is_active ? 0.0 : fabs(multiplier));
-      } else {
-        const double missed = larger(gap > 0 ? gap : 0.0, y[q] != 0 ? off : 0.0);
-        holds = holds && (is_active || y[q] == 0) && is_finite(y[q]);
-        dual = larger(dual, one_side ? sign * longest : 0.0), primal = larger(primal, missed / (scale > 0 ? scale : 1.0));
-      }
+    Gathered dual, primal, terms;
+    each_entry(n, [&](auto e) {
+      const auto multiplier = e(GRADIENT), at = e(x), free = fabs(multiplier);
+      const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier, ROW_MULTIPLIER * e(ROW_TERMS));
+      const auto size = e(SCALE) + e(ROW_TERMS), beyond = select(found.inactive, free, found.sign);
+      holds &= !any(!(found.holds & ((free <= VALUE_TOL * d.tolerance * found.force) | !found.inactive)));
+      exact &= !any(!(e.are(active, EQUALITY) | (beyond <= GRADIENT_TOL * EPSILON * size)));
+      terms.most(size), dual.most(select(found.one_side | found.inactive, beyond, decltype(at)(0)));
+    });
+    for (int q = 0; q < p; ++q) {
+      const double* row = d.rows + q * n;
+      Gathered curved, length, longest, product;
+      each_entry(n, [&](auto e) {
+        const auto entry = e(row), size = fabs(entry);
+        curved.add(size * e(INVERSE_ROOT)), length.add(size), longest.most(size), product.add(entry * e(x));
+      });
+      const double value = product.sum();
+      const auto found = check(Entries<double>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q], curved.sum(),
+                               length.sum(), y[q], 0.0);
+      holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
+      const double missed = larger(found.gap > 0 ? found.gap : 0.0, y[q] != 0 ? found.off : 0.0);
+      dual.most(found.one_side ? found.sign * longest.largest() : 0.0), primal.most(missed / (found.scale > 0 ? found.scale : 1.0));
     }
-    const double residual = larger(dual / (terms > 0 ? terms : 1.0), primal);
+    const double total = terms.largest(), residual = larger(dual.largest() / (total > 0 ? total : 1.0), primal.largest());
     return {holds && residual <= kkt_tol, residual, exact};
   }
 
@@ -85,21 +73,59 @@ class QPCertificate {
   // the cost's gradient at x, the sizes of its terms, and roots of its curvatures
   void add_terms(const QPData<double>& d, const double* x) {
     const int n = s.n;
-    for (int j = 0; j < n; ++j) {
-      SIZE[j] = fabs(x[j]), ROOT[j] = d.damping[j];
-      GRADIENT[j] = d.damping[j] * (x[j] - d.center[j]), SCALE[j] = d.damping[j] * (SIZE[j] + fabs(d.center[j]));
-    }
+    each_entry(n, [&](auto e) { e.put(fabs(e(x)), SIZE); });
     for (int i = 0; i < s.m; ++i) {
-      const double *row = d.matrix + i * n, weight = d.weight[i];
-      for (int j = 0; j < n; ++j) ROW[j] = fabs(row[j]);
-      const double force = weight * (Team::own_dot(row, x, 0, n) - d.target[i]);
-      const double size = weight * (Team::own_dot(ROW, SIZE, 0, n) + fabs(d.target[i]));
-      for (int j = 0; j < n; ++j) {
-        GRADIENT[j] += row[j] * force, SCALE[j] += ROW[j] * size, ROOT[j] += weight * row[j] * row[j];
-      }
+      const double* row = d.matrix + i * n;
+      Gathered value, size;
+      each_entry(n, [&](auto e) { value.add(e(row) * e(x)), size.add(fabs(e(row)) * e(SIZE)); });
+      FORCE[i] = d.weight[i] * (value.sum() - d.target[i]), TERMS[i] = d.weight[i] * (size.sum() + fabs(d.target[i]));
     }
-    for (int j = 0; j < n; ++j) ROOT[j] = sqrt(ROOT[j] > 0 ? ROOT[j] : 1.0), INVERSE_ROOT[j] = 1 / ROOT[j];
+    each_entry(n, [&](auto e) {
+      const auto damping = e(d.damping), center = e(d.center);
+      auto gradient = damping * (e(x) - center), scale = damping * (e(SIZE) + fabs(center)), curvature = damping;
+      for (int i = 0; i < s.m; ++i) {
+        const auto entry = e(d.matrix + i * n);
+        gradient += entry * FORCE[i], scale += fabs(entry) * TERMS[i], curvature += d.weight[i] * (entry * entry);
+      }
+      const auto root = sqrt(select(curvature > 0.0, curvature, decltype(damping)(1)));
+      e.put(gradient, GRADIENT), e.put(scale, SCALE), e.put(root, ROOT), e.put(1.0 / root, INVERSE_ROOT), e.put(0.0, ROW_TERMS);
+    });
   }
+  // the sizes of x, or those of its Newton step by the curvatures alone where x is roundoff beside it
+  void measure() {
+    Gathered rooted, size, rooted_newton, newton;
+    each_entry(s.n, [&](auto e) {
+      const auto step = fabs(e(GRADIENT)) * e(INVERSE_ROOT) * e(INVERSE_ROOT);
+      rooted.most(e(SIZE) * e(ROOT)), size.most(e(SIZE)), rooted_newton.most(step * e(ROOT)), newton.most(step);
+    });
+    const bool is_roundoff = rooted.largest() <= ZERO_TOL * EPSILON * rooted_newton.largest();
+    scaled = (is_roundoff ? rooted_newton : rooted).largest(), plain = (is_roundoff ? newton : size).largest();
+  }
+  template <class Real> struct Checked {
+    using Which = decltype(Real() < Real());
+    Which holds, one_side, inactive;
+    Real force, sign, off, gap, scale;  // sign: the multiplier, if positive in the wrong direction; off: from its bound
+  };
+  // What all constraints have to be, and what is asked of their multipliers.
+  template <class E, class Real>
+  Checked<Real> check(E e, const double* lower, const double* upper, const int* active, Real value, Real compliant,
+                      Real per_curvature, Real per_unit, Real multiplier, Real force_of_rows) const {
+    using Which = typename Checked<Real>::Which;
+    const Which at_lower = e.are(active, AT_LOWER), at_upper = e.are(active, AT_UPPER), inactive = e.are(active, INACTIVE);
+    const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper;
+    const Real low = e(lower), high = e(upper), from = fabs(low), to = fabs(high), nearest = select(from < to, from, to), zero = 0;
+    const Real scaled_reach = scaled * per_curvature, reach = plain * per_unit;
+    const Real scale = select(scaled_reach < reach, scaled_reach, reach) + fabs(value) + select(nearest < Real(INFINITE), nearest, zero);
+    const Real curved = select(per_curvature < Real(SMALLEST), Real(SMALLEST), per_curvature);
+    const Real force = scale / (curved * curved) + force_of_rows, sign = select(at_lower, zero - multiplier, multiplier);
+    const Real off = select(inactive, zero, fabs(compliant - select(at_upper, high, low)));
+    const Real below = low - compliant, above = compliant - high, gap = select(above > below, above, below);
+    const Real near = VALUE_TOL * tolerance * scale;
+    const Which labelled = one_side | (equality & (low == high)) | (inactive & (low != high));
+    const Which holds = labelled & (off <= near) & !(gap > near) & ((sign <= SIGN_TOL * tolerance * force) | !one_side);
+    return {holds, one_side, inactive, force, sign, off, gap, scale};
+  }
+  static constexpr double SMALLEST = 2.2250738585072014e-308;
 };
 
 // Of a hierarchy, whose x is clipped into its box first.

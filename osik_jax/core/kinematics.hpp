@@ -70,8 +70,9 @@ void place_bodies(const Tree<In>& tree, Q q, const Placed<Out>& to) {
         position = position + displacement * axis;
         add_dof(frame * axis, zero, at);
       } else {
-        const Real half = Real(0.5) * displacement, sine = sin(half);
-        turn = turn * Turn{Real(cos(half)), sine * given.x, sine * given.y, sine * given.z};
+        Real sine, cosine;
+        sine_and_cosine(Real(Real(0.5) * displacement), sine, cosine);
+        turn = turn * Turn{cosine, sine * given.x, sine * given.y, sine * given.z};
         position = own - turn.carry(fixed);
         add_dof(zero, frame * axis, at);
       }

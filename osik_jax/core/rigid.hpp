@@ -7,6 +7,11 @@
 
 namespace osik {
 
+// Decisions by a number, in words that packs of robots have too (lanes.hpp).
+template <class Real> OSIK_FN Real select(bool which, Real a, Real b) { return which ? a : b; }
+OSIK_FN bool any(bool which) { return which; }
+template <class Real> OSIK_FN void sine_and_cosine(Real angle, Real& sine, Real& cosine) { sine = sin(angle), cosine = cos(angle); }
+
 template <class Real> struct Vec3 {
   Real x, y, z;
   template <class At> OSIK_FN static Vec3 of(At a) { return {a[0], a[1], a[2]}; }
@@ -56,10 +61,10 @@ template <class Real> struct Quaternion {
   }
   // the quaternion over its length; one of zeros becomes finite and useless, as in MJX
   OSIK_FN Quaternion normalized() const {
-    if (fabs(w) <= Real(1e-8) && fabs(x) <= Real(1e-8) && fabs(y) <= Real(1e-8) && fabs(z) <= Real(1e-8))
-      return {1e6, 1e6, 1e6, 1e6};
-    const Real length = sqrt(w * w + x * x + y * y + z * z);
-    return {w / length, x / length, y / length, z / length};
+    const Real least = 1e-8, length = sqrt(w * w + x * x + y * y + z * z);
+    const auto none = (fabs(w) <= least) & (fabs(x) <= least) & (fabs(y) <= least) & (fabs(z) <= least);
+    auto part = [&](Real a) { return select(none, Real(1e6), a / length); };
+    return {part(w), part(x), part(y), part(z)};
   }
 };
 
@@ -89,12 +94,16 @@ template <class Real> OSIK_FN Vec3<Real> rotation_log(const Mat3<Real>& m) {
   return Real(2) * atan2(sine, q.w) / sine * q.vector();
 }
 
-// I - [e]/2 + c [e]^2 with c = (1 - (angle/2) cot(angle/2)) / angle^2: the inverse left Jacobian of SO(3) at e.
+// c = (1 - (angle/2) cot(angle/2)) / angle^2 of the squared angle of a rotation
+template <class Real> OSIK_FN Real turn_factor(Real s) {
+  const Real half = Real(0.5) * sqrt(s);
+  return s < Real(SMALL_ANGLE_SQUARED) ? 1. / 12 + s * (1. / 720 + s * (1. / 30240 + s * (1. / 1209600 + s / 47900160)))
+                                       : (1 - half * cos(half) / sin(half)) / s;
+}
+
+// I - [e]/2 + c [e]^2: the inverse left Jacobian of SO(3) at e.
 template <class Real> OSIK_FN Mat3<Real> inverse_left_jacobian(Vec3<Real> e) {
-  const Real s = inner(e, e), half = Real(0.5) * sqrt(s);
-  const Real c = s < Real(SMALL_ANGLE_SQUARED)
-                     ? 1. / 12 + s * (1. / 720 + s * (1. / 30240 + s * (1. / 1209600 + s / 47900160)))
-                     : (1 - half * cos(half) / sin(half)) / s;
+  const Real s = inner(e, e), c = turn_factor(s);
   const Vec3<Real> h = Real(0.5) * e;
   return {{1 + c * (e.x * e.x - s), c * e.x * e.y + h.z, c * e.x * e.z - h.y},
           {c * e.x * e.y - h.z, 1 + c * (e.y * e.y - s), c * e.y * e.z + h.x},

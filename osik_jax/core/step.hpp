@@ -13,12 +13,12 @@ namespace osik {
 class Step : StepRows {
  public:
   Step(const int* given, int count) : StepRows(given, count) { begin_solvers(); }
-  using StepRows::has;
+  using StepRows::find_pack, StepRows::has;
 
-  // clean: whether no number of the arrays is NaN
-  void take(const StepData& d, const StepResult& to, bool clean) {
+  // clean: whether no number of the arrays is NaN; robot: as in find_rows
+  void take(const StepData& d, const StepResult& to, bool clean, int robot = -1) {
     const int n = s.nv;
-    const bool valid = find_rows(d, clean);
+    const bool valid = find_rows(d, clean, robot);
     std::fill(to.integers, to.integers + 3 + s.labels(), 0);
     if (s.scheme == CLASSICAL || s.scheme == SATURATED) to.integers[2] = s.L - 1;
     if (s.scheme == CLASSICAL) to.integers[1] = s.L - 1;
@@ -71,7 +71,7 @@ class Step : StepRows {
     for (int j = 0; j < n; ++j) farthest[j] = 0;
     for (int k = 0; k < s.tasks; ++k)
       if (chosen(tasks[k]))
-        for (int j = 0; j < n; ++j) farthest[j] = turning[j] ? larger(farthest[j], levers[k * n + j]) : 0.0;
+        for (int j = 0; j < n; ++j) farthest[j] = layout.turning[j] ? larger(farthest[j], levers[k * n + j]) : 0.0;
     for (int j = 0; j < n; ++j) largest = larger(largest, farthest[j]);
     for (int j = 0; j < n; ++j) {  // the lever of the one farther from the root
       const bool moves = farthest[j] > LEVER_ROUNDOFF * largest;
@@ -79,7 +79,7 @@ class Step : StepRows {
     }
     for (int j = n - 1; j >= 0; --j) {
       sum += farthest[j], own[j] += farthest[j] > 0 ? sum : 0.0;
-      own[j] = scalar[j] >= 0 ? dt * own[j] : 0.0, most = larger(most, own[j]);
+      own[j] = layout.scalar[j] >= 0 ? dt * own[j] : 0.0, most = larger(most, own[j]);
     }
     return most;
   }
@@ -102,7 +102,7 @@ class Step : StepRows {
   }
 
   // ---- the weighted scheme (schemes/_weighted.py)
-  Numbers solver_space, qp_bounds, diagonal, center, compliance, multipliers, above;
+  Numbers solver_space, qp_bounds, diagonal, compliance, multipliers, above;
   std::vector<WeightedQP<Team>> qp;
   std::vector<QPCertificate> certificate;
 
@@ -128,8 +128,8 @@ class Step : StepRows {
       qp_bounds[n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], -1) : -INFINITE;
       qp_bounds[N + n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], 1) : INFINITE;
     }
-    const QPData<double> data{J.data(),          low.data(),         weight.data(),    diagonal.data(),
-                              center.data(),     J.data() + s.m * n, compliance.data(), qp_bounds.data(),
+    const QPData<double> data{J,          low,         weight,    diagonal.data(),
+                              center.data(),     J + s.m * n, compliance.data(), qp_bounds.data(),
                               qp_bounds.data() + N, d.guess ? d.guess : no_labels.data(), tolerances[0]};
     int report[3], *active = to.integers + 3;
     qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
@@ -189,7 +189,7 @@ class Step : StepRows {
         else level_lower[row] = task.bounded ? -INFINITE : 0, level_upper[row] = task.bounded ? INFINITE : 0;
       }
     for (int i = n; i < s.h; ++i) {
-      const int row = level_of_hard[i] * s.m + row_of_hard[i - n];
+      const int row = layout.level_of_hard[i] * s.m + layout.row_of_hard[i - n];
       for (int j = 0; j < n; ++j) hard[(i - n) * n + j] = level_rows[row * n + j];
       hard_lower[i] = level_lower[row], hard_upper[i] = level_upper[row], pinned[i] = equality[row];
     }
@@ -215,7 +215,7 @@ class Step : StepRows {
   std::vector<char> hierarchy_space;
   std::vector<Hierarchy<Team>> hierarchy;
 
-  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, row_counts, level_of_hard, row_of_hard}; }
+  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, layout.row_counts, layout.level_of_hard, layout.row_of_hard}; }
   Certificate solve_hierarchy(const StepData& d, const StepResult& to) {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     add_levels();
@@ -245,7 +245,7 @@ class Step : StepRows {
   std::vector<ClassicalProjection<Team>> projection;
   std::vector<Saturation<Team>> saturation;
 
-  double of_scheme(int k) const { return *leaf(of_step[k]).at; }
+  double of_scheme(int k) const { return *leaf(layout.of_step[k]).at; }
   // descent of the joint-limit potential (limit_potential_gradient); returns whether it is finite
   bool find_descent(double* out) {
     const double potential_gain = of_scheme(6), margin = of_scheme(7);
@@ -253,14 +253,14 @@ class Step : StepRows {
     int count = 0;
     for (int j = 0; j < s.nv; ++j) {
       from[j] = -INFINITE, to[j] = INFINITE;
-      for (const int* limit = limits; limit < limits + 5 * s.limits && scalar[j] >= 0; limit += 5)
+      for (const int* limit = layout.limits; limit < layout.limits + 5 * s.limits && layout.scalar[j] >= 0; limit += 5)
         if (limit[0] == RANGE) from[j] = larger(from[j], leaf(limit[1])[j]), to[j] = least(to[j], leaf(limit[2])[j]);
       count += from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j];
     }
     for (int j = 0; j < s.nv; ++j) {
       double gradient = 0;
       if (from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j]) {
-        const double span = to[j] - from[j], at = nearest(leaf(of_step[0]).at[scalar[j]], from[j] + margin * span, to[j] - margin * span);
+        const double span = to[j] - from[j], at = nearest(leaf(layout.of_step[0]).at[layout.scalar[j]], from[j] + margin * span, to[j] - margin * span);
         gradient = span * (2 * at - to[j] - from[j]) / (2 * count * square(to[j] - at) * square(at - from[j]));
       }
       out[j] = -potential_gain * gradient;
@@ -278,7 +278,7 @@ class Step : StepRows {
       projection[0].begin();
       for (int k = 0; k < own; ++k)
         projection[0].solve_level({&level_rows[k * m * n], &level_lower[k * m], &level_upper[k * m], &bends[k * n], &equality[k * m],
-                                   dampings[3 * k], dampings[3 * k + 1], dampings[3 * k + 2], row_counts[k], n, 1});
+                                   dampings[3 * k], dampings[3 * k + 1], dampings[3 * k + 2], layout.row_counts[k], n, 1});
       projection[0].end(secondary, x, nullptr);
       return {true, first_residual(x, x, 1)};
     }
@@ -323,7 +323,7 @@ class Step : StepRows {
 
   void begin_solvers() {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
-    center.resize(3 * n + 8), above.resize(n);
+    above.resize(n);
     if (s.scheme == WEIGHTED) {
       const QPSizes of{m, n, s.p, s.max_iterations};
       solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));

@@ -8,12 +8,6 @@
 using namespace osik;
 
 namespace {
-bool has_no_nan(const double* at, size_t count) {
-  bool valid = true;
-  for (size_t i = 0; i < count; ++i) valid &= at[i] == at[i];
-  return valid;
-}
-
 void take_steps(const xla::Call& call) {
   constexpr int GUESS = 1, FIRST = 3;
   thread_local std::unique_ptr<Step> step;  // of the last call: its workspace is ready
@@ -27,20 +21,31 @@ void take_steps(const xla::Call& call) {
   for (int k = 0; k < given; ++k) {
     arrays[k] = call.in<double>(FIRST + k), sizes[k] = xla::numbers_of_lane(call.argument(FIRST + k));
     strides[k] = call.size(FIRST + k, 0) > 1 ? sizes[k] : 0;
-    if (!strides[k]) shared_clean = shared_clean && has_no_nan(arrays[k], sizes[k]);
+    if (!strides[k]) shared_clean = shared_clean && !has_nan(arrays[k], sizes[k]);
   }
   auto guess = [&](int k, int lane) -> const int* {
     const xla::Buffer& buffer = call.argument(k);
     const size_t labels = xla::numbers_of_lane(buffer);
     return labels ? call.in<int>(k) + (buffer.dimensions[0] > 1 ? labels * lane : 0) : nullptr;
   };
+  auto begin_at = [&](int lane) {
+    for (int k = 0; k < given; ++k) arrays[k] = call.in<double>(FIRST + k) + strides[k] * lane;
+    return StepData{call.in<double>(FIRST + given), arrays.data(), strides.data(), given, guess(GUESS, lane), guess(GUESS + 1, lane)};
+  };
+  // The last pack of a batch has robots of the one before it. A robot alone, and batches of fewer robots, need no pack.
+  constexpr int PACK = Lanes<double>::COUNT;
+  int pack = -1;
   for (int lane = 0; lane < lanes; ++lane) {
+    if (lanes >= PACK && (pack < 0 || lane == pack + PACK)) {
+      pack = lane + PACK <= lanes ? lane : lanes - PACK;
+      step->find_pack(begin_at(pack));
+    }
+    const StepData data = begin_at(lane);
     bool clean = shared_clean;
     for (int k = 0; k < given; ++k)
-      if (strides[k]) clean = clean && has_no_nan(arrays[k], sizes[k]);
-    step->take({call.in<double>(FIRST + given), arrays.data(), given, guess(GUESS, lane), guess(GUESS + 1, lane)},
-               {call.out<double>(0) + size_t(numbers) * lane, call.out<int>(1) + size_t(integers) * lane}, clean);
-    for (int k = 0; k < given; ++k) arrays[k] += strides[k];
+      if (strides[k]) clean = clean && !has_nan(arrays[k], sizes[k]);
+    step->take(data, {call.out<double>(0) + size_t(numbers) * lane, call.out<int>(1) + size_t(integers) * lane}, clean,
+               pack < 0 ? -1 : lane - pack);
   }
 }
 }  // namespace

@@ -24,15 +24,15 @@ OSIK_FN void ask(const Rows<Out>& to, const Bounds<In>& bounds, int i, Real erro
     return;
   }
   const Real low = bounds.lower[i], high = bounds.upper[i];
-  auto approach = [&](Real bound) { return fabs(bound) < Real(INFINITE) ? gain * (bound - error) + forward : bound; };
-  to.pull[i] = gain * (error > high ? error - high : error < low ? error - low : Real(0));
+  auto approach = [&](Real bound) { return select(fabs(bound) < Real(INFINITE), gain * (bound - error) + forward, bound); };
+  to.pull[i] = gain * select(error > high, error - high, select(error < low, error - low, Real(0)));
   to.lower[i] = approach(low), to.upper[i] = approach(high);
 }
 
 // The pose that a task asks for, and how.
-template <class In> struct PoseGoal {
+template <class In, class Own = In> struct PoseGoal {
   In position, rotation, velocity;  // [3], [9], [6] of the target, [linear; angular]
-  In weight, gain;                  // [m] of the rows that are kept, [1]
+  Own weight, gain;                 // [m] of the rows that are kept, [1]
   const int* kept;                  // [6] flags
   bool in_frame, geometric;         // rows along the frame's axes; without the inverse left Jacobian
   Bounds<In> bounds;
@@ -42,8 +42,9 @@ template <class In> struct PoseGoal {
 // xx, xy, xz, yy, yz, zz.
 template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real* arms) {
   Real size = fabs(pull.x);
-  size = fabs(pull.y) > size ? fabs(pull.y) : size, size = fabs(pull.z) > size ? fabs(pull.z) : size;
-  if (!(size > 0)) return 0;
+  size = select(fabs(pull.y) > size, fabs(pull.y), size), size = select(fabs(pull.z) > size, fabs(pull.z), size);
+  const auto pulls = size > Real(0);
+  if (!any(pulls)) return 0;
   const Vec3<Real> unit = Real(1) / size * pull;
   const Real x = unit.x, y = unit.y, z = unit.z;
   const Real xx = axes[0], xy = axes[1], xz = axes[2], yy = axes[3], yz = axes[4], zz = axes[5];
@@ -53,7 +54,7 @@ template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real*
   const Real txz = x * y * yz - y * y * xz - x * z * yy + y * z * xy;
   const Real tyz = x * z * xy - y * z * xx - x * x * yz + x * y * xz;
   const Real squared = txx * arms[0] + tyy * arms[3] + tzz * arms[5] + 2 * (txy * arms[1] + txz * arms[2] + tyz * arms[4]);
-  return squared > 0 ? size * sqrt(squared) : 0;
+  return select(pulls & (squared > Real(0)), size * sqrt(squared), Real(0));
 }
 
 // The columns of a frame's Jacobian J [6, nv], which are there.
@@ -84,8 +85,10 @@ template <class Real, class Columns> Real pose_curvature(Vec3<Real> force, Vec3<
   };
   for (int j = 0; j < nv; ++j) {
     const auto [moves, axis] = J[j];
-    if (axis.x == 0 && axis.y == 0 && axis.z == 0) continue;
-    add(axes, axis.x, axis.y, axis.z), add(arms, moves.x, moves.y, moves.z);
+    const auto turns = (axis.x != Real(0)) | (axis.y != Real(0)) | (axis.z != Real(0));
+    if (!any(turns)) continue;
+    auto arm = [&](Real a) { return select(turns, a, Real(0)); };
+    add(axes, axis.x, axis.y, axis.z), add(arms, arm(moves.x), arm(moves.y), arm(moves.z));
   }
   return (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
 }
@@ -94,8 +97,8 @@ template <class Real, class Columns> Real pose_curvature(Vec3<Real> force, Vec3<
 //
 // The error of the position is p - p*; that of the rotation R is the logarithm e of R R*', or of R*'R in the frame's
 // axes. Its rate is E w: E the inverse left Jacobian of SO(3) at e, w the angular velocity; in the frame's axes E'R' w.
-template <class In, class From, class Columns, class Out>
-void pose_rows(const PoseGoal<In>& goal, From position, From rotation, const Columns& J, int nv, const Rows<Out>& to) {
+template <class In, class Own, class From, class Columns, class Out>
+void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, const Columns& J, int nv, const Rows<Out>& to) {
   using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   using M = Mat3<Real>;
@@ -136,17 +139,18 @@ void pose_rows(const PoseGoal<In>& goal, From position, From rotation, const Col
 }
 
 // Where a task asks the centre of mass to be, along `m` of the world's axes or normals of edges on the ground.
-template <class In> struct CenterGoal {
+template <class In, class Own = In> struct CenterGoal {
   int m;
   const int *axes, *turning;            // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
-  In target, velocity, weight, gain;    // [m] or null for 0, [m] or null for 0, [m], [1]
+  In target, velocity;                  // [m] each, or null for 0
+  Own weight, gain;                     // [m], [1]
   In normals{};                         // [m, 2] in place of axes
   Bounds<In> bounds = {};
 };
 
 // Rows of a task on the centre of mass `point` [3] with Jacobian J [3, nv].
-template <class In, class From, class Out>
-void center_rows(const CenterGoal<In>& goal, From point, From J, int nv, const Rows<Out>& to) {
+template <class In, class Own, class From, class Out>
+void center_rows(const CenterGoal<In, Own>& goal, From point, From J, int nv, const Rows<Out>& to) {
   using Real = NumberAt<Out>;
   auto along = [&](int i, Real x, Real y, Real z) {
     if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
@@ -167,13 +171,16 @@ void center_rows(const CenterGoal<In>& goal, From point, From J, int nv, const R
     ask(to, goal.bounds, i, goal.target ? value - goal.target[i] : value, goal.velocity ? goal.velocity[i] : Real(0),
         goal.gain[0]);
     const Real pull = fabs(goal.weight[i] * to.pull[i]);
-    largest = pull > largest || pull != pull ? pull : largest;
+    largest = select((pull > largest) | (pull != pull), pull, largest);
     Real length = 0;
-    for (int j = 0; j < nv && to.squares; ++j) length += to.jacobian[i * nv + j] * to.jacobian[i * nv + j];
+    for (int j = 0; j < nv && to.squares; ++j) {
+      const Real entry = to.jacobian[i * nv + j];
+      length += entry * entry;
+    }
     if (to.squares) to.squares[i] = length;
   }
   // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
-  const Real unit = largest > 0 ? Real(1) / largest : Real(0);
+  const Real unit = select(largest > Real(0), Real(1) / largest, Real(0));
   for (int i = 0; i < goal.m; ++i) {
     const Real part = goal.weight[i] * to.pull[i] * unit;
     square += part * part;
