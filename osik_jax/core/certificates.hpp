@@ -117,7 +117,7 @@ class QPCertificate {
     const Real scaled_reach = scaled * per_curvature, reach = plain * per_unit;
     const Real scale = select(scaled_reach < reach, scaled_reach, reach) + fabs(value) + select(nearest < Real(INFINITE), nearest, zero);
     const Real curved = select(per_curvature < Real(SMALLEST), Real(SMALLEST), per_curvature);
-    const Real force = scale / (curved * curved) + force_of_rows, sign = select(at_lower, zero - multiplier, multiplier);
+    const Real force = scale / (curved * curved) + force_of_rows, sign = select(at_lower, -multiplier, multiplier);
     const Real off = select(inactive, zero, fabs(compliant - select(at_upper, high, low)));
     const Real below = low - compliant, above = compliant - high, gap = select(above > below, above, below);
     const Real near = VALUE_TOL * tolerance * scale;

@@ -43,6 +43,7 @@ template <class R> struct Lanes {
   }
   OSIK_FN Lanes& operator+=(Lanes b) { return v += b.v, *this; }
   OSIK_FN Lanes& operator-=(Lanes b) { return v -= b.v, *this; }
+  friend OSIK_FN Lanes operator-(Lanes a) { return of(-a.v); }
   friend OSIK_FN Lanes operator+(Lanes a, Lanes b) { return of(a.v + b.v); }
   friend OSIK_FN Lanes operator-(Lanes a, Lanes b) { return of(a.v - b.v); }
   friend OSIK_FN Lanes operator*(Lanes a, Lanes b) { return of(a.v * b.v); }
@@ -78,7 +79,7 @@ template <class R> void sine_and_cosine(Lanes<R> angle, Lanes<R>& sine, Lanes<R>
       const typename L::Flags turn = __builtin_bit_cast(typename L::Flags, shifted.v);
       const typename L::Which odd{(turn & 1) != 0}, down{(turn & 2) != 0}, left{((turn + 1) & 2) != 0};
       const L high = select(odd, c, s), across = select(odd, s, c);
-      sine = select(down, 0 - high, high), cosine = select(left, 0 - across, across);
+      sine = select(down, -high, high), cosine = select(left, -across, across);
       return;
     }
   }
@@ -94,6 +95,8 @@ template <class Real> struct Entries {
     __builtin_memcpy(&some, from + first, sizeof some);
     return some;
   }
+  // of a leaf, a scalar of which is each entry (moving_rows.hpp)
+  template <class Leaf> OSIK_FN Real of(const Leaf& leaf) const { return leaf.size > 1 ? (*this)(leaf.at) : Real(*leaf.at); }
   OSIK_FN void put(Real a, double* to) const { __builtin_memcpy(to + first, &a, sizeof a); }
   OSIK_FN auto are(const int* labels, int label) const {  // whether they are this label
     if constexpr (ALONE) return labels[first] == label;

@@ -74,10 +74,10 @@ template <class In> struct Leaf {
 
 // The rows of all tasks, and what the solvers need beside them, one robot's after another's.
 struct RowPlaces {
-  size_t error, J, low, high, weight, pull, levers, curvature, end;
+  size_t error, J, low, high, weight, pull, square, levers, curvature, end;
   explicit RowPlaces(const StepSizes& s) {
     const size_t rows = s.rows + 8;
-    error = 0, low = rows, high = 2 * rows, weight = 3 * rows, pull = 4 * rows, J = 5 * rows;
+    error = 0, low = rows, high = 2 * rows, weight = 3 * rows, pull = 4 * rows, square = 5 * rows, J = 6 * rows;
     levers = J + size_t(s.rows) * s.nv + 8, curvature = levers + size_t(s.tasks) * s.nv, end = curvature + s.tasks;
   }
 };
@@ -140,7 +140,8 @@ template <class Real> class MovingRows {
     }
     auto out = [&](size_t first, size_t i) { return numbers<Out>(rows + first + i, at.end); };
     const Rows<Out> to{out(at.error, task.first), out(at.J, task.first * s.nv), out(at.low, task.first), out(at.curvature, k),
-                       out(at.pull, task.first), out(at.levers, k * s.nv), task.bounded ? out(at.high, task.first) : Out{}};
+                       out(at.pull, task.first), out(at.levers, k * s.nv), task.bounded ? out(at.high, task.first) : Out{},
+                       out(at.square, task.first)};
     if (task.kind == POSE) add_pose(task, interval, &gain, to);
     else add_center(task, interval, &gain, to);
     for (int i = 0; i < task.m; ++i) out(at.weight, task.first)[i] = weights[i];

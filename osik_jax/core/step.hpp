@@ -46,11 +46,10 @@ class Step : StepRows {
     for (int k = 0; k < s.tasks; ++k) {
       const Task& task = tasks[k];
       if (!chosen(task) || (task.kind == POSTURE && !task.bounded)) continue;
-      double distance = 0, held = 0;
+      double distance = 0, held = 0, divisor = curvature[k] > 0 ? curvature[k] : 1;
       for (int i = 0; i < task.m && !task.bounded; ++i) {
-        const double *row = task.rows.jacobian + i * s.nv, divisor = curvature[k] > 0 ? curvature[k] : 1;
         distance += task.rows.error[i] * (task.weight[i] * (task.rows.pull[i] / divisor));
-        held += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
+        held += task.weight[i] * task.rows.squares[i];
       }
       const double ratio = square(clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR));
       bounds[count] = dt * curvature[k], stiffness[count] = held, far[count] = task.bounded ? -1 : ratio / (1 + ratio);
@@ -93,10 +92,7 @@ class Step : StepRows {
     if (!level || !count) return 0;
     double squares = 0;
     for (const Task& task : tasks)
-      for (int i = 0; i < task.m && task.level < level; ++i) {
-        const double* row = task.rows.jacobian + i * s.nv;
-        squares += task.weight[i] * Team::own_dot(row, row, 0, s.nv);
-      }
+      for (int i = 0; i < task.m && task.level < level; ++i) squares += task.weight[i] * task.rows.squares[i];
     const double most = find_bends([&](const Task& task) { return task.level < level; }, above.data());
     return safe_norm(force, count) * (most / (squares > 0 ? sqrt(squares) : 1.0));
   }
@@ -110,18 +106,19 @@ class Step : StepRows {
     const int n = s.nv, N = n + s.p;
     const Bending bending = curvature_of([](const Task&) { return true; });
     const double bound = kappa * bending.bound, rest = kappa * bending.damping;
-    for (int j = 0; j < n; ++j) diagonal[j] = damping, center[j] = 0, qp_bounds[j] = low_speed[j], qp_bounds[N + j] = high_speed[j];
+    std::fill_n(diagonal.data(), n, damping), std::fill_n(center.data(), n, 0.0);
+    std::copy_n(low_speed.data(), n, qp_bounds.data()), std::copy_n(high_speed.data(), n, &qp_bounds[N]);
     for (const Task& task : tasks)
       for (int i = 0; i < task.m && task.diagonal; ++i) {
         const int dof = task.options[task.m + i];
         diagonal[dof] += task.weight[i], center[dof] += task.weight[i] * task.rows.lower[i];
       }
-    for (int j = 0; j < n; ++j) {
-      const double total = bound + DIAGONAL_RATIO * diagonal[j];
-      diagonal[j] += rest * (bound / (total > 0 ? total : 1));
-      diagonal[j] = diagonal[j] < 0 ? 0 : diagonal[j], center[j] /= diagonal[j] > 0 ? diagonal[j] : 1;
-      if (!(diagonal[j] <= LARGEST_DOUBLE)) return {false, INFINITE};
-    }
+    each_entry(n, [&](auto e) {
+      const auto given = e(diagonal.data()), total = bound + DIAGONAL_RATIO * given, one = decltype(given + given)(1);
+      const auto sum = given + rest * (bound / select(total > 0.0, total, one)), held = select(sum < 0.0, 0.0 * one, sum);
+      e.put(held, diagonal.data()), e.put(e(center.data()) / select(held > 0.0, held, one), center.data());
+    });
+    if (!all_finite(diagonal.data(), n)) return {false, INFINITE};
     for (int i = 0; i < s.p; ++i) {  // a row of weight 0 has no bounds
       const double own = weight[s.m + i];
       compliance[i] = 1 / (own > 0 ? own : 1);

@@ -34,7 +34,7 @@ inline double nearest(double a, double low, double high) {
 
 inline double positive_root(double a) { return a > 0 ? sqrt(a) : 0; }
 // The smaller one; NaN if one is.
-inline double least(double a, double b) { return a != a || a < b ? a : b; }
+template <class Real> Real least(Real a, Real b) { return select((a != a) | (a < b), a, b); }
 
 // The Euclidean norm, whose squares neither overflow nor underflow.
 inline double safe_norm(const double* v, int count) {
@@ -75,7 +75,7 @@ class StepRows {
   StepRows(const int* given, int count)
       : layout(given, count), s(layout.s), place(s), own(layout), packed(layout), numbers(Pack::COUNT * place.end) {
     center.resize(3 * s.nv + 8), zeros.resize(s.rows + s.nq + 1), no_labels.resize(s.labels()), bounds.resize(s.tasks);
-    parts.resize(s.rows + 3 * s.tasks + 8);
+    parts.resize(s.rows + s.nv + 3 * s.tasks + 8);
     for (Numbers* v : {&lower, &upper, &low_speed, &high_speed}) v->resize(s.nv);
     for (const StepLayout::Task& task : layout.tasks) tasks.push_back({task, true, {}, nullptr});
   }
@@ -131,48 +131,58 @@ class StepRows {
       Task& task = tasks[k];
       const size_t i = task.first;
       task.rows = {at + place.error + i, J + i * s.nv, low + i, curvature + k, at + place.pull + i, levers + k * s.nv,
-                   task.bounded ? high + i : nullptr};
+                   task.bounded ? high + i : nullptr, at + place.square + i};
       task.weight = weight + i;
     }
   }
   // A bound of the solver's: where they are the wrong way round, both are in the middle (solvers/_box.py).
-  static double order(double low, double high, int side) { return low > high ? 0.5 * (low + high) : side < 0 ? low : high; }
+  template <class Real> static Real order(Real low, Real high, int side) {
+    return select(low > high, 0.5 * (low + high), side < 0 ? low : high);
+  }
   // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given. What depends on NaN is NaN. The classical
   // projection has no box, whatever its bounds are.
   bool find_box(const double* given) {
-    const int nv = s.nv;
-    for (int j = 0; j < nv; ++j) lower[j] = layout.of_step[4] < 0 ? -INFINITE : leaf(layout.of_step[4]).at[j];
-    for (int j = 0; j < nv; ++j) upper[j] = layout.of_step[4] < 0 ? INFINITE : leaf(layout.of_step[5]).at[j];
-    bool valid = true;
-    for (int k = 0; k < s.limits; ++k) {
-      const int* limit = layout.limits + 5 * k;
-      const bool of_speed = limit[0] == SPEED;
-      const Leaf<const double*> low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
-      valid &= of_speed || all_finite(gain.at, gain.size);
-      if (layout.of_step[4] >= 0) continue;
-      auto reach = [&](double bound, double at, double inward, int j) {  // rounded inward
-        const double way = bound - at;
-        return fabs(bound) < INFINITE ? gain[j] * (way + inward * RANGE_ROUNDOFF * EPSILON * fabs(way)) / dt : bound;
-      };
-      for (int j = 0; j < nv; ++j) {
-        double a = -high[j], b = high[j];
-        if (!of_speed) {
-          const bool is_scalar = layout.scalar[j] >= 0;
-          double at = is_scalar ? given[layout.scalar[j]] : 0.0;
-          at = fabs(at) < INFINITE || at != at ? at : 1;
-          a = reach(is_scalar ? low[j] : -INFINITE, at, 1, j), b = reach(is_scalar ? high[j] : INFINITE, at, -1, j);
-          b = -least(-b, speed[j]), a = least(least(a, speed[j]), b);
-        }
-        const double first = lower[j], last = upper[j];
-        auto narrowed = [&](double bound) { return first == first && bound == bound ? nearest(bound, first, last) : NAN; };
-        lower[j] = narrowed(a), upper[j] = narrowed(b);
-      }
-    }
+    const int nv = s.nv, *box = layout.of_step + 4;
+    double *angle = parts.data(), *a = lower.data(), *b = upper.data();
     for (int j = 0; j < nv; ++j) {
-      if (s.scheme != CLASSICAL) valid &= lower[j] < INFINITE && upper[j] > -INFINITE, ordered &= lower[j] <= upper[j];
-      low_speed[j] = order(lower[j], upper[j], -1), high_speed[j] = order(lower[j], upper[j], 1);
+      const double at = layout.scalar[j] < 0 ? 0.0 : given[layout.scalar[j]];
+      angle[j] = fabs(at) < INFINITE || at != at ? at : 1;
+      a[j] = *box < 0 ? -INFINITE : leaf(box[0]).at[j], b[j] = *box < 0 ? INFINITE : leaf(box[1]).at[j];
     }
+    bool valid = true;
+    for (const int* limit = layout.limits; limit < layout.limits + 5 * s.limits; limit += 5) {
+      const Leaf<const double*> low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
+      const bool of_speed = limit[0] == SPEED;
+      valid &= of_speed || all_finite(gain.at, gain.size);
+      if (*box < 0) each_entry(nv, [&](auto e) { narrow(e, of_speed, e.of(low), e.of(high), e.of(gain), e.of(speed)); });
+    }
+    each_entry(nv, [&](auto e) {
+      const auto from = e(a), to = e(b);
+      if (s.scheme != CLASSICAL)
+        valid &= !any(!((from < INFINITE) & (to > -INFINITE))), ordered &= !any(!(from <= to));
+      e.put(order(from, to, -1), low_speed.data()), e.put(order(from, to, 1), high_speed.data());
+    });
     return valid;
+  }
+  // Narrow the box at some dofs by a limit on the speed, or by a range that is to be kept.
+  template <class E, class Real> void narrow(E e, bool of_speed, Real low, Real high, Real gain, Real speed) {
+    Real from = -high, to = high;
+    if (!of_speed) {
+      const Real at = e(parts.data()), none = INFINITE;
+      const auto alone = e.are(layout.scalar, -1);  // no range
+      auto reach = [&](Real bound, double inward) {  // rounded inward
+        const Real way = bound - at, found = gain * (way + inward * RANGE_ROUNDOFF * EPSILON * fabs(way)) / Real(dt);
+        return select(fabs(bound) < none, found, bound);
+      };
+      from = reach(select(alone, -none, low), 1), to = reach(select(alone, none, high), -1);
+      to = -least(-to, speed), from = least(least(from, speed), to);
+    }
+    const Real first = e(lower.data()), last = e(upper.data());
+    auto narrowed = [&](Real bound) {
+      const Real raised = select(bound < first, first, bound), within = select(raised > last, last, raised);
+      return select((first != first) | (bound != bound), Real(NAN), within);
+    };
+    e.put(narrowed(from), lower.data()), e.put(narrowed(to), upper.data());
   }
   // The rows of a task, and whether a solver takes them. Leaves of a task: gain, weight, target velocity (or none), bounds
   // (or none), then those of its kind.
@@ -210,11 +220,12 @@ class StepRows {
     const int m = task.m, *options = task.options, *leaves = task.leaves;
     const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
     const Bounds<const double*> interval = task.bounded ? Bounds<const double*>{leaf(leaves[3]).at, leaf(leaves[4]).at} : Bounds<const double*>{};
+    const Leaf<const double*> weights = leaf(leaves[1]);
     *task.rows.curvature = 0;
-    for (int j = 0; j < s.nv; ++j) task.rows.levers[j] = 0;
+    std::fill_n(task.rows.levers, s.nv, 0.0);
     for (int i = 0; i < m; ++i) {
       const double value = given[options[i]] - (target ? target[options[i]] : 0.0);
-      task.weight[i] = leaf(leaves[1])[i];
+      task.weight[i] = weights[i], task.rows.squares[i] = 1;
       ask(task.rows, interval, i, value, velocity[i], gain);
       for (int j = 0; j < s.nv && !task.diagonal; ++j) task.rows.jacobian[i * s.nv + j] = j == options[m + i];
     }

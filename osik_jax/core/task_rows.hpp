@@ -174,7 +174,7 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, From J, int nv, co
     largest = select((pull > largest) | (pull != pull), pull, largest);
     Real length = 0;
     for (int j = 0; j < nv && to.squares; ++j) {
-      const Real entry = to.jacobian[i * nv + j];
+      const Real entry = along(i, J[j], J[nv + j], J[2 * nv + j]);
       length += entry * entry;
     }
     if (to.squares) to.squares[i] = length;
