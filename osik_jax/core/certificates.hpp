@@ -45,7 +45,8 @@ class QPCertificate {
     Gathered dual, primal, terms;
     each_entry(n, [&](auto e) {
       const auto multiplier = e(GRADIENT), at = e(x), free = fabs(multiplier);
-      const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier, ROW_MULTIPLIER * e(ROW_TERMS));
+      const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier,
+                               ROW_MULTIPLIER * e(ROW_TERMS));
       const auto size = e(SCALE) + e(ROW_TERMS), beyond = select(found.inactive, free, found.sign);
       holds &= !any(!(found.holds & ((free <= VALUE_TOL * d.tolerance * found.force) | !found.inactive)));
       exact &= !any(!(e.are(active, EQUALITY) | (beyond <= GRADIENT_TOL * EPSILON * size)));
@@ -59,7 +60,8 @@ class QPCertificate {
         curved.add(size * e(INVERSE_ROOT)), length.add(size), longest.most(size), product.add(entry * e(x));
       });
       const double value = product.sum();
-      const auto found = check(Entries<double>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q], curved.sum(),
+      const double compliant = value + d.compliance[q] * y[q];
+      const auto found = check(Entries<double>{size_t(n + q)}, d.lower, d.upper, active, value, compliant, curved.sum(),
                                length.sum(), y[q], 0.0);
       holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
       const double missed = larger(found.gap > 0 ? found.gap : 0.0, y[q] != 0 ? found.off : 0.0);

@@ -26,10 +26,12 @@ class Step : StepRows {
     Certificate found{false, d.constants[s.nq + s.dofs]};
     if (valid) {
       found = s.scheme == WEIGHTED ? solve_weighted(d, to) : s.scheme == HIERARCHICAL ? solve_hierarchy(d, to) : solve_null_space(to);
-      status = !(found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n)) ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
+      const bool finite = found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n);
+      status = !finite ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
     }
     for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
-      to.numbers[j] = s.scheme == CLASSICAL ? 0 : nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE, upper[j] > -INFINITE ? upper[j] : INFINITE);
+      to.numbers[j] = s.scheme == CLASSICAL ? 0 : nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE,
+                                                          upper[j] > -INFINITE ? upper[j] : INFINITE);
     to.integers[0] = status;
     report(to, status == NUMERICAL_ERROR ? d.constants[s.nq + s.dofs] : found.residual);
   }
@@ -178,7 +180,8 @@ class Step : StepRows {
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {
         const int row = task.level * s.m + end[task.level]++;
-        const double own = task.weight[i], root = positive_root(own), low = task.rows.lower[i], high = task.bounded ? task.rows.upper[i] : low;
+        const double own = task.weight[i], root = positive_root(own);
+        const double low = task.rows.lower[i], high = task.bounded ? task.rows.upper[i] : low;
         const double a = order(low, high, -1), b = order(low, high, 1);
         for (int j = 0; j < n; ++j) level_rows[row * n + j] = root * task.rows.jacobian[i * n + j];
         equality[row] = !task.bounded || (a >= b && own > 0);
@@ -257,7 +260,8 @@ class Step : StepRows {
     for (int j = 0; j < s.nv; ++j) {
       double gradient = 0;
       if (from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j]) {
-        const double span = to[j] - from[j], at = nearest(leaf(layout.of_step[0]).at[layout.scalar[j]], from[j] + margin * span, to[j] - margin * span);
+        const double span = to[j] - from[j], angle = leaf(layout.of_step[0]).at[layout.scalar[j]];
+        const double at = nearest(angle, from[j] + margin * span, to[j] - margin * span);
         gradient = span * (2 * at - to[j] - from[j]) / (2 * count * square(to[j] - at) * square(at - from[j]));
       }
       out[j] = -potential_gain * gradient;

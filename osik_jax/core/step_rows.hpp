@@ -219,7 +219,8 @@ class StepRows {
   void add_posture(const Task& task, const double* given, const double* velocity, double gain) {
     const int m = task.m, *options = task.options, *leaves = task.leaves;
     const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
-    const Bounds<const double*> interval = task.bounded ? Bounds<const double*>{leaf(leaves[3]).at, leaf(leaves[4]).at} : Bounds<const double*>{};
+    Bounds<const double*> interval;
+    if (task.bounded) interval = {leaf(leaves[3]).at, leaf(leaves[4]).at};
     const Leaf<const double*> weights = leaf(leaves[1]);
     *task.rows.curvature = 0;
     std::fill_n(task.rows.levers, s.nv, 0.0);

@@ -235,6 +235,20 @@ def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
 
 
+def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
+    """Rows of a batch are computed for several robots at once, with sines and cosines of its own."""
+    robot = osik.load_robot("arm7")
+    q = jnp.zeros((9, robot.nq)).at[:, 1:5].set(jnp.asarray([1e-9, 0.3, -2.0, 40.0, -1e3, 9e4, 3e5, -1e9, 7.0])[:, None])
+    frame = robot.frame_names[-1]
+    tasks = {"tip": osik.FrameTask(robot, frame, target=(jnp.zeros(3), jnp.eye(3)))}
+    given = tasks, osik.WeightedQP(), (), jnp.asarray(DT), None
+    found, _ = by_core(robot, q, *given)
+    for lane in range(len(q)):
+        data = mujoco_at(robot, np.asarray(q[lane]))
+        place = data.body(frame) if frame in robot.body_names else data.site(frame)
+        np.testing.assert_allclose(found.error["tip"][lane, :3], place.xpos, rtol=0.0, atol=1e-12)
+
+
 @pytest.mark.variants(
     slow=["mixed-hierarchy", "bounded-null-space", "bounded-saturated"],
     release=["bounded-weighted", "bounded-hierarchy", "mixed-null-space", "mixed-saturated"],
