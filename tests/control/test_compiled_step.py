@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
+from mujoco_states import mujoco_at
 
 import osik_jax as osik
 from osik_jax.control import _compiled_step, _step
