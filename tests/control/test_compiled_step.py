@@ -239,7 +239,8 @@ def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
 def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
     """Rows of a batch are computed for several robots at once, with sines and cosines of its own."""
     robot = osik.load_robot("arm7")
-    q = jnp.zeros((9, robot.nq)).at[:, 1:5].set(jnp.asarray([1e-9, 0.3, -2.0, 40.0, -1e3, 9e4, 3e5, -1e9, 7.0])[:, None])
+    angles = jnp.asarray([1e-9, 0.3, -2.0, 40.0, -1e3, 9e4, 3e5, -1e9, 7.0])
+    q = jnp.zeros((len(angles), robot.nq)).at[:, 1:5].set(angles[:, None])
     frame = robot.frame_names[-1]
     tasks = {"tip": osik.FrameTask(robot, frame, target=(jnp.zeros(3), jnp.eye(3)))}
     given = tasks, osik.WeightedQP(), (), jnp.asarray(DT), None
