@@ -34,6 +34,7 @@ if sys.dont_write_bytecode:
     sys.pycache_prefix = os.environ["PYTHONPYCACHEPREFIX"] = str(
         Path(os.environ["JAX_COMPILATION_CACHE_DIR"]) / "python"
     )
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # also beside a GPU, whose kernels have tests of their own
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # programs without the lines that they come from

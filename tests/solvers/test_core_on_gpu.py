@@ -26,7 +26,7 @@ from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 
 usable = _backends.cuda_is_default() and core_cuda.installed()
-pytestmark = pytest.mark.skipif(not usable, reason="needs a CUDA device, JAX for it and the compiled core")
+pytestmark = pytest.mark.skipif(not usable, reason="needs JAX_PLATFORMS=cuda,cpu, a CUDA device and the compiled core")
 
 
 @pytest.fixture(params=["core", "jax"])
