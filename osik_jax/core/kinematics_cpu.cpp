@@ -7,7 +7,7 @@
 using namespace osik;
 
 namespace {
-struct Lanes {
+struct Robots {
   using Real = double;
   using In = const double*;
   using Out = double*;
@@ -23,15 +23,15 @@ struct Lanes {
     for (int lane = 0; lane < result_size(0, 0); ++lane) f(lane);
   }
 };
-template <void (*method)(const Lanes&)> void of_lanes(const xla::Call& call) { method(Lanes{call}); }
+template <void (*method)(const Robots&)> void of_lanes(const xla::Call& call) { method(Robots{call}); }
 }  // namespace
 
 extern "C" {
-void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Lanes>>>(frame); }
-void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Lanes>>>(frame); }
-void* osik_moving_frames(xla::CallFrame* frame) { return xla::handle<of_lanes<move_frames<Lanes>>>(frame); }
-void* osik_center_of_mass(xla::CallFrame* frame) { return xla::handle<of_lanes<move_centers<Lanes>>>(frame); }
-void* osik_center_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_center_rows<Lanes>>>(frame); }
-void* osik_frame_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_frame_rows<Lanes>>>(frame); }
-void* osik_pose_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_pose_rows<Lanes>>>(frame); }
+void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Robots>>>(frame); }
+void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Robots>>>(frame); }
+void* osik_moving_frames(xla::CallFrame* frame) { return xla::handle<of_lanes<move_frames<Robots>>>(frame); }
+void* osik_center_of_mass(xla::CallFrame* frame) { return xla::handle<of_lanes<move_centers<Robots>>>(frame); }
+void* osik_center_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_center_rows<Robots>>>(frame); }
+void* osik_frame_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_frame_rows<Robots>>>(frame); }
+void* osik_pose_rows(xla::CallFrame* frame) { return xla::handle<of_lanes<find_pose_rows<Robots>>>(frame); }
 }

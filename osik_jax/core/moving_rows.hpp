@@ -32,15 +32,15 @@ struct StepLayout {
   struct Place {  // of a leaf
     int array, offset, size;
   };
-  // the robot's leaves, in the order of the layout
+  // the leaves of the step and those of the robot, in the order of the layout; the last three are NullSpace's
+  enum { Q, DT, DAMPING, CURVATURE_DAMPING, BOX, BOX_END, POTENTIAL_GAIN, MARGIN, RANK_TOLERANCE, STEP_LEAVES };
   enum { OFFSET, REFERENCE, POSITION, QUATERNION, ANCHOR, AXIS, MASS, CENTER_OF_MASS, FRAME_POSITION, FRAME_ROTATION,
          ROBOT_LEAVES };
   StepSizes s;
   std::vector<int> numbers;
   std::vector<Task> tasks;
   const Place* places;
-  const int *of_step, *of_robot;                 // leaves: q, dt, damping, curvature damping, box, those of NullSpace:
-                                                 // potential gain, margin, rank tolerance; the robot's
+  const int *of_step, *of_robot;                 // leaves, those of the box -1 for none
   const int *source, *owner, *turning, *scalar;  // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
   const int *limits;                             // [limits, 5] kind and leaves of each
   const int *parents, *types, *owners, *column;  // those of Tree and DofColumns
@@ -51,7 +51,7 @@ struct StepLayout {
     auto take = [&](int n) { return (at += n) - n; };
     s = *reinterpret_cast<const StepSizes*>(take(sizeof(StepSizes) / sizeof(int)));
     places = reinterpret_cast<const Place*>(take(3 * s.leaves));
-    of_step = take(9), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
+    of_step = take(STEP_LEAVES), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
     parents = take(s.bodies), types = take(s.joints), owners = take(s.joints), source = take(s.nq), column = take(s.dofs);
     owner = take(s.dofs), turning = take(s.nv), scalar = take(s.nv);
     row_counts = take(s.L), level_of_hard = take(s.h), row_of_hard = take(s.h > s.nv ? s.h - s.nv : 0);
@@ -119,9 +119,9 @@ template <class Real> class MovingRows {
   // in StepData; rows: of the robots, RowPlaces::end apart
   void place(const double* constants, const double* const* given, const size_t* between, double* to) {
     arrays = given, apart = between, rows = to;
-    const Real dt = leaf(layout.of_step[1]).at[0];
+    const Real dt = leaf(layout.of_step[StepLayout::DT]).at[0];
     most_gain = Real(1) / select((dt > Real(0)) & (dt <= Real(LARGEST_DOUBLE)), dt, Real(1));
-    const In from = leaf(layout.of_step[0]).at, offset = robot(StepLayout::OFFSET);
+    const In from = leaf(layout.of_step[StepLayout::Q]).at, offset = robot(StepLayout::OFFSET);
     for (int i = 0; i < s.nq; ++i) q[i] = Real(constants[i]) * from[layout.source[i]] + offset[i];
     place_bodies(Tree<In>{s.bodies, s.joints, s.dofs, layout.parents, layout.types, layout.owners,
                           robot(StepLayout::REFERENCE), robot(StepLayout::POSITION), robot(StepLayout::QUATERNION),

@@ -245,10 +245,9 @@ class Step : StepRows {
   std::vector<ClassicalProjection<Team>> projection;
   std::vector<Saturation<Team>> saturation;
 
-  double of_scheme(int k) const { return *leaf(layout.of_step[k]).at; }
   // descent of the joint-limit potential (limit_potential_gradient); returns whether it is finite
   bool find_descent(double* out) {
-    const double potential_gain = of_scheme(6), margin = of_scheme(7);
+    const double potential_gain = *of_step(StepLayout::POTENTIAL_GAIN), margin = *of_step(StepLayout::MARGIN);
     double *from = center.data(), *to = from + s.nv;
     int count = 0;
     for (int j = 0; j < s.nv; ++j) {
@@ -260,7 +259,7 @@ class Step : StepRows {
     for (int j = 0; j < s.nv; ++j) {
       double gradient = 0;
       if (from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j]) {
-        const double span = to[j] - from[j], angle = leaf(layout.of_step[0]).at[layout.scalar[j]];
+        const double span = to[j] - from[j], angle = of_step(StepLayout::Q)[layout.scalar[j]];
         const double at = nearest(angle, from[j] + margin * span, to[j] - margin * span);
         gradient = span * (2 * at - to[j] - from[j]) / (2 * count * square(to[j] - at) * square(at - from[j]));
       }
@@ -275,7 +274,7 @@ class Step : StepRows {
     add_dampings();
     if (!find_descent(secondary) || !all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n)) return {false, INFINITE};
     if (s.scheme == CLASSICAL) {
-      projection[0].rank_tol = of_scheme(8);
+      projection[0].rank_tol = *of_step(StepLayout::RANK_TOLERANCE);
       projection[0].begin();
       for (int k = 0; k < own; ++k)
         projection[0].solve_level({&level_rows[k * m * n], &level_lower[k * m], &level_upper[k * m], &bends[k * n], &equality[k * m],
@@ -288,7 +287,8 @@ class Step : StepRows {
     const double* each = separate.data();
     int *sides = found_labels.data(), report[2];
     const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
-                              targets.data(), low_speed.data(), high_speed.data(), equality.data(), of_scheme(8), s.max_iterations, L, m};
+                              targets.data(), low_speed.data(), high_speed.data(), equality.data(),
+                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m};
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];

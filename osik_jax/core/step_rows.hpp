@@ -89,7 +89,11 @@ class StepRows {
   }
 
  protected:
-  Leaf<const double*> leaf(int k) const { return {arrays[layout.places[k].array] + layout.places[k].offset, layout.places[k].size}; }
+  Leaf<const double*> leaf(int k) const {
+    const StepLayout::Place& place = layout.places[k];
+    return {arrays[place.array] + place.offset, place.size};
+  }
+  const double* of_step(int k) const { return leaf(layout.of_step[k]).at; }
   // Whether a number of these leaves is NaN.
   bool spoiled(int from, int to, int count) const {
     for (int k = from; k < to; ++k)
@@ -102,15 +106,15 @@ class StepRows {
   bool find_rows(const StepData& d, bool clean, int robot) {
     arrays = d.arrays, ordered = true;
     use(robot < 0 ? 0 : robot);
-    const int* of_step = layout.of_step;
-    const double* given = leaf(of_step[0]).at;
-    dt = *leaf(of_step[1]).at, damping = *leaf(of_step[2]).at, kappa = *leaf(of_step[3]).at;
+    const double* given = of_step(StepLayout::Q);
+    dt = *of_step(StepLayout::DT), damping = *of_step(StepLayout::DAMPING), kappa = *of_step(StepLayout::CURVATURE_DAMPING);
     tolerances = d.constants + s.nq + s.dofs + 1;
     if (!(dt > 0)) dt = NAN;
-    const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(of_step[2], of_step[1], d.count));
+    const int first = layout.of_step[StepLayout::DAMPING], end = layout.of_step[StepLayout::DT];
+    const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(first, end, d.count));
     bool valid = has_box && set_up && all_finite(given, s.given);
     if (!(dt <= LARGEST_DOUBLE)) dt = 1;
-    const bool is_placed = all_finite(given, s.given) && (clean || !spoiled(0, of_step[0], d.count));
+    const bool is_placed = all_finite(given, s.given) && (clean || !spoiled(0, layout.of_step[StepLayout::Q], d.count));
     if (is_placed && robot < 0) own.place(d.constants, arrays, d.apart, numbers.data());
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];
@@ -142,7 +146,7 @@ class StepRows {
   // limits/_box.py: of ConfigurationLimit and VelocityLimit, or as it is given. What depends on NaN is NaN. The classical
   // projection has no box, whatever its bounds are.
   bool find_box(const double* given) {
-    const int nv = s.nv, *box = layout.of_step + 4;
+    const int nv = s.nv, *box = layout.of_step + StepLayout::BOX;
     double *angle = parts.data(), *a = lower.data(), *b = upper.data();
     for (int j = 0; j < nv; ++j) {
       const double at = layout.scalar[j] < 0 ? 0.0 : given[layout.scalar[j]];
