@@ -112,9 +112,10 @@ class StepRows {
     if (!(dt > 0)) dt = NAN;
     const int first = layout.of_step[StepLayout::DAMPING], end = layout.of_step[StepLayout::DT];
     const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(first, end, d.count));
-    bool valid = has_box && set_up && all_finite(given, s.given);
+    const bool finite = all_finite(given, s.given);
+    bool valid = has_box && set_up && finite;
     if (!(dt <= LARGEST_DOUBLE)) dt = 1;
-    const bool is_placed = all_finite(given, s.given) && (clean || !spoiled(0, layout.of_step[StepLayout::Q], d.count));
+    const bool is_placed = finite && (clean || !spoiled(0, layout.of_step[StepLayout::Q], d.count));
     if (is_placed && robot < 0) own.place(d.constants, arrays, d.apart, numbers.data());
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];

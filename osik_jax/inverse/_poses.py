@@ -18,7 +18,7 @@ from ..execution._platform import on_host
 from ..numerics._arguments import concrete
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
-from ..tasks._targets import as_pose, pose_array
+from ..tasks._targets import as_pose, pose_array, pose_parts
 from ._chain_search import Goal
 
 _POSITION = (True,) * 3 + (False,) * 3
@@ -69,11 +69,15 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
 
 def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool, ...]]:
     """Return position, rotation and rows of one pose or of n. (3,) or (n, 3), likewise the rotation."""
-    array = None if _has_parts(value) else pose_array(value, dtype, _ACCEPTED, numbers)
-    if array is not None and array.shape[-1:] == (3,) and array.ndim <= 2:
-        _check_finite(array)
-        return array, numbers.broadcast_to(numbers.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
-    pose = _split(value if array is None else array, dtype, numbers)
+    pose = pose_parts(value, dtype, _ACCEPTED, numbers)
+    if pose is None:
+        array = pose_array(value, dtype, _ACCEPTED, numbers)
+        if array.shape[-1:] == (3,) and array.ndim <= 2:
+            _check_finite(array)
+            return array, numbers.broadcast_to(numbers.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
+        if array.shape[-2:] != (4, 4) or array.ndim > 3:
+            raise OsikValueError(f"got an array of shape {array.shape}; a pose is a (4, 4) matrix, a position is (3,)")
+        pose = array[..., :3, 3], array[..., :3, :3]
     if pose[0].ndim == 1:
         return *as_pose(pose, dtype, numbers=numbers), _POSE
     if pose[0].ndim != 2 or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
@@ -88,20 +92,6 @@ def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool
     if rotation.ndim == 2:
         return position, jaxlie.SO3(exact_quaternion(rotation, "rotation")).as_matrix(), _POSE
     return position, exact_rotation(rotation, "rotation"), _POSE
-
-
-def _has_parts(value: Any) -> bool:
-    return isinstance(value, jaxlie.SE3) or (isinstance(value, tuple | list) and len(value) == 2)
-
-
-def _split(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array]:
-    if isinstance(value, jaxlie.SE3):
-        return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
-    if isinstance(value, tuple | list):
-        return pose_array(value[0], dtype, _ACCEPTED, numbers), pose_array(value[1], dtype, _ACCEPTED, numbers)
-    if value.shape[-2:] != (4, 4) or value.ndim > 3:
-        raise OsikValueError(f"got an array of shape {value.shape}; a pose is a (4, 4) matrix, a position is (3,)")
-    return value[..., :3, 3], value[..., :3, :3]
 
 
 def _check_finite(array: Array) -> None:

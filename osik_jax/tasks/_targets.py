@@ -45,7 +45,7 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
         TypeError: no numbers.
         ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
     """
-    parts = _parts(value, dtype, numbers)
+    parts = pose_parts(value, dtype, numbers=numbers)
     if parts is None:
         array = pose_array(value, dtype, numbers=numbers)
         if array.shape == (4, 4):
@@ -64,12 +64,16 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
     return position, _rotation(rotation)
 
 
-def _parts(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array] | None:
-    """Return position and rotation of a pair."""
+def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Array, Array] | None:
+    """Return position and rotation of a pair or of an SE3, None of anything else.
+
+    Raises:
+        TypeError: as ``pose_array``.
+    """
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
         return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
     if isinstance(value, (tuple, list)) and len(value) == 2:
-        return pose_array(value[0], dtype, numbers=numbers), pose_array(value[1], dtype, numbers=numbers)
+        return pose_array(value[0], dtype, accepted, numbers), pose_array(value[1], dtype, accepted, numbers)
     return None
 
 
