@@ -27,7 +27,7 @@ DEFAULT_SHARED_BYTES = 48 * 1024
 _MOST_SPACES = 1 << 14
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
 # a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
-_LOOP = re.compile(r"(?<!unroll\n)(?<!unroll \d\n)(?<!OSIK_UNROLL\n)^ *(?:for|while) \(", re.MULTILINE)
+_LOOP = re.compile(r"(?<!unroll\n)(?<!unroll \d\n)(?<!UNROLL\n)(?<!UNROLL_4\n)^ *(?:for|while) \(", re.MULTILINE)
 _SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
 
 
@@ -52,7 +52,7 @@ def text_of(header: str) -> str:
     seen: set[str] = set()
 
     def inlined(name: str) -> str:
-        if name in seen or name == "serial.hpp":  # the team of a CPU
+        if name in seen or name in ("serial.hpp", "lanes.hpp"):  # the team of a CPU, and its packs
             return ""
         seen.add(name)
         text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())

@@ -129,6 +129,18 @@ struct Gathered {
   }
   OSIK_FN double sum() const { return one + (some.v[0] + some.v[1]) + (some.v[2] + some.v[3]); }
 };
+// The words of a team for these (warp.hpp has them for a GPU)
+template <class Team> using GatheredBy = Gathered;
+template <class Team> using EntryOf = Entries<double>;
+template <class R, class F> OSIK_FN void each_entry(const Serial<R>&, size_t count, F f) { each_entry(count, f); }
+OSIK_FN RowSums<double> row_sums(const Serial<double>&, const double* row, const double* x, int n) {
+  Gathered value, size;
+  each_entry(n, [&](auto e) {
+    const auto term = e(row) * e(x);
+    value.add(term), size.add(fabs(term));
+  });
+  return {value.sum(), size.sum()};
+}
 template <class F> OSIK_FN bool any_of(const double* at, size_t count, F f) {
   bool found = false;
   typename Lanes<double>::Which some{};

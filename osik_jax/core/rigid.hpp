@@ -7,9 +7,6 @@
 
 namespace osik {
 
-// Decisions by a number, in words that packs of robots have too (lanes.hpp).
-template <class Real> OSIK_FN Real select(bool which, Real a, Real b) { return which ? a : b; }
-OSIK_FN bool any(bool which) { return which; }
 template <class Real> OSIK_FN void sine_and_cosine(Real angle, Real& sine, Real& cosine) { sine = sin(angle), cosine = cos(angle); }
 
 template <class Real> struct Vec3 {

@@ -55,6 +55,11 @@ template <class Real, int B> struct Pack {
     for (int b = 0; b < B; ++b) v[b] += o.v[b] * o.v[b];
     return *this;
   }
+  OSIK_FN Pack size() const {
+    Pack p;
+    for (int b = 0; b < B; ++b) p.v[b] = v[b] < 0 ? -v[b] : v[b];
+    return p;
+  }
 };
 
 template <class Real, int B> struct Columns {
@@ -78,8 +83,16 @@ template <class T, class At, class Sizes> struct PointerArray {
   OSIK_FN operator T*() const { return data; }
 };
 
+// A number that depends on a problem's sizes, as At::of says.
+template <class At, class Sizes> struct SizeValue {
+  int value;
+  OSIK_FN SizeValue(const Sizes& s) : value(At::of(s)) {}
+  OSIK_FN operator int() const { return value; }
+};
+
 template <class R> struct Serial {
   using Real = R;
+  template <class At, class Sizes> using Fixed = SizeValue<At, Sizes>;
   template <class T, class At, class Sizes> using Array = PointerArray<T, At, Sizes>;
   using Int = int;
   using Loaded = typename Vector<R>::Loaded;
@@ -88,7 +101,7 @@ template <class R> struct Serial {
   using Bits = typename Vector<R>::Bits;
   static constexpr int LANES = Vector<R>::LANES;
   static constexpr bool COPIES = true;  // a method copies the rows that it is given, so that they are padded
-  static constexpr bool SPARES_SPACE = false;
+  static constexpr bool SPARES_SPACE = false, HOLDS_COLUMNS = false;
   static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
   static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
@@ -144,6 +157,7 @@ template <class R> struct Serial {
     for (int i = a; i < b; ++i) t += f(i);
     return t;
   }
+  OSIK_FN static bool all(bool flag) { return flag; }
   // the largest of `t` and the values f(i, largest so far); NaN stays
   template <class F> OSIK_FN Real most(Real t, int a, int b, F f) const {
     for (int i = a; i < b; ++i) {
@@ -224,6 +238,15 @@ template <class R> struct Serial {
     if (j < n) t += *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
     return total(t + u);
   }
+  // the sum of |a_j b_j|
+  OSIK_FN static Real own_size_on(const Real* a, const Real* b, int n) {
+    Value t{};
+    for (int j = 0; j < n; j += LANES) {
+      const Value v = *(const Loaded*)(a + j) * *(const Loaded*)(b + j);
+      t += v < 0 ? -v : v;
+    }
+    return total(t);
+  }
   // a += by b for rows of n numbers, from the pack of column `start` on
   OSIK_FN static void own_axpy_on(Real* a, Real by, const Real* b, int start, int n) {
     for (int j = start / LANES * LANES; j < n; j += LANES) *(Loaded*)(a + j) += by * *(const Loaded*)(b + j);
@@ -256,9 +279,12 @@ template <class R> struct Serial {
     else
       for (; j < n; ++j) to[j] = by * from[j];
   }
-  // row a of `to` [rows, ld] = factor[a] times row a of `from` [rows, n]
+  OSIK_FN void fetch(Real* to, const Real* from, int count) const { scaled_copy(to, 1, from, count); }
+  OSIK_FN void fetch_rows(Real*, int, const Real*, int) const {}
+  OSIK_FN void arrive() const {}
+  // row a of `to` [rows, ld] = factor[a] times row a of `from` [rows, n]; no factor: 1
   OSIK_FN void scaled_rows(Real* to, int ld, const Real* factor, const Real* from, int rows, int n) const {
-    for (int a = 0; a < rows; ++a) scaled_copy(to + a * ld, factor[a], from + a * n, n);
+    for (int a = 0; a < rows; ++a) scaled_copy(to + a * ld, factor ? factor[a] : Real(1), from + a * n, n);
   }
   // products of A rows with LANES other rows, over the columns [start, n)
   template <int A> OSIK_FN static void products(const Real* const* a, const Real* const* b, int start, int n, Value* out) {

@@ -102,7 +102,7 @@ class Step : StepRows {
   // ---- the weighted scheme (schemes/_weighted.py)
   Numbers solver_space, qp_bounds, diagonal, compliance, multipliers, above;
   std::vector<WeightedQP<Team>> qp;
-  std::vector<QPCertificate> certificate;
+  std::vector<QPCertificate<Team>> certificate;
 
   Certificate solve_weighted(const StepData& d, const StepResult& to) {
     const int n = s.nv, N = n + s.p;
@@ -330,7 +330,7 @@ class Step : StepRows {
       solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));
       qp_bounds.resize(2 * (n + s.p)), diagonal.resize(n + 8), compliance.resize(s.p), multipliers.resize(s.p);
       qp.emplace_back(of, reinterpret_cast<char*>(solver_space.data()));
-      certificate.emplace_back(of);
+      certificate.emplace_back(of, reinterpret_cast<char*>(solver_space.data()));
       return;
     }
     level_rows.resize(L * m * n + 8), level_lower.assign(L * m, -INFINITE), level_upper.assign(L * m, INFINITE);

@@ -6,21 +6,24 @@
 //   pairs(n, f)          f(a, b) for all a <= b < n
 //   columns(a, b, f)     f(c) for packs of columns: c.load(row), c.store(row, pack)
 //   narrow_columns(a, b, f)  the same with smaller packs, for an f that works on several at once
-//   sum, count           of f(i); every thread gets the result, as of the next two
+//   sum, count, all      of f(i), or of each thread's flag; every thread gets the result, as of the next two
 //   most, best           the largest f(i); the largest f(i) with its index i
 //   dot, axpy, forward, backward, reflect   vector operations of the whole team
-//   scaled_copy, scaled_rows   copies of a row, or of rows, times factors, with zeros in the padding
+//   fetch, fetch_rows    copies of numbers, which may take until arrive(), and then
+//   scaled_rows          of rows times factors, with zeros in the padding
 //   rows_times, weighted_gram, largest   products of all rows with a vector, and with each other; the largest product
 // The functions own_... are those of one thread, for use inside f.
 //
-// Rows are padded: a row of n numbers has Team::stride(n) places, and the places after the n-th hold zeros.
-// own_dot_on, own_axpy_on, rows_times and largest may read these zeros, up to Team::padded(n). Real is the type of the numbers: double, or float on a GPU.
+// Rows are padded: a row of n numbers has Team::stride(n) places, and the places after the n-th hold zeros. own_dot_on,
+// own_size_on, own_axpy_on, rows_times and largest may read these zeros, up to Team::padded(n). Real is the type of the
+// numbers: double, or float on a GPU.
 #pragma once
 
 #ifdef __CUDACC__
 #define OSIK_FN __device__ __forceinline__
 #define OSIK_HOST __host__ __device__
 #define OSIK_UNROLL _Pragma("unroll")
+#define OSIK_UNROLL_4 _Pragma("unroll 4")
 // Calls keep the text short: it has to fit into the instruction cache.
 #define OSIK_CALL __device__ __noinline__
 #define OSIK_METHOD __device__ __noinline__
@@ -30,6 +33,7 @@
 #define OSIK_METHOD OSIK_CALL
 #define OSIK_HOST
 #define OSIK_UNROLL _Pragma("GCC unroll 8")
+#define OSIK_UNROLL_4
 #endif
 
 namespace osik {
@@ -51,23 +55,36 @@ template <class Real> struct Best {
   int which;  // -1 where no value is larger than the start
 };
 
+// The product of a row with a vector, and the sum of the sizes of its terms.
+template <class Real> struct RowSums {
+  Real value, size;
+};
+
 // How a warp lays out its workspace. The host uses it to compute the size of one.
 template <class T, class At, class Sizes> struct NoArray {};
+template <class At, class Sizes> struct NoSize {};
 
 template <class R = double> struct WarpSizes {
   using Int = short;
   using Real = R;
   template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
+  template <class At, class Sizes> using Fixed = NoSize<At, Sizes>;
   static constexpr bool COPIES = false;        // rows are read from global memory
   static constexpr bool SPARES_SPACE = true;   // inverse_factor is in place; what is seldom used is in global memory
-  static constexpr OSIK_HOST int stride(int n) { return n | 1; }  // odd: threads read different banks of memory
-  static constexpr OSIK_HOST int padded(int n) { return n; }
+  static constexpr int WIDE = sizeof(R) == 4 ? 4 : 1;  // numbers that a thread reads at once
+  static constexpr OSIK_HOST int padded(int n) { return (n + WIDE - 1) / WIDE * WIDE; }
+  // an odd number of wide ones, so that threads read different banks of memory
+  static constexpr OSIK_HOST int stride(int n) { return WIDE * ((n + WIDE - 1) / WIDE | 1); }
   static constexpr OSIK_HOST int variables(int n) { return n; }
   static constexpr OSIK_HOST int level_rows(int m) { return m; }
   static constexpr OSIK_HOST int hard_rows(int h) { return h; }
 };
 
 constexpr double LARGEST_DOUBLE = 1.7976931348623157e308, INFINITE = __builtin_bit_cast(double, 0x7ff0000000000000ull);
+
+// Decisions by a number, in words that packs of robots have too (lanes.hpp).
+template <class Real> OSIK_FN Real select(bool which, Real a, Real b) { return which ? a : b; }
+OSIK_FN bool any(bool which) { return which; }
 
 OSIK_FN bool is_finite(double a) { return a >= -LARGEST_DOUBLE && a <= LARGEST_DOUBLE; }  // false for NaN
 

@@ -4,28 +4,49 @@
 
 namespace osik {
 
-struct Column {
-  int at;
-  template <class Real> struct Number {
-    Real v;
-    OSIK_FN Number() {}
-    OSIK_FN Number(Real a) : v(a) {}
-    OSIK_FN Number& operator+=(const Number& o) { return v += o.v, *this; }
-    OSIK_FN Number& operator-=(const Number& o) { return v -= o.v, *this; }
-    OSIK_FN Number& operator*=(const Number& o) { return v *= o.v, *this; }
-    OSIK_FN Number inverse() const { return Real(1) / v; }
-    OSIK_FN Number& fma(Real a, const Number& o) { return v += a * o.v, *this; }
-    OSIK_FN Number& square(const Number& o) { return v += o.v * o.v, *this; }
+// One column of a thread, or two that are 32 apart: of the second one only numbers before `end` count.
+template <class Real, int SLOTS> struct ColumnsOf {
+  int at, end;
+  struct P {
+    Real v[SLOTS];
+    OSIK_FN P() {}
+    OSIK_FN P(Real a) {
+      each([&](int s) { v[s] = a; });
+    }
+    template <class F> OSIK_FN static void each(F f) {
+OSIK_UNROLL
+      for (int s = 0; s < SLOTS; ++s) f(s);
+    }
+    OSIK_FN P& operator+=(const P& o) { return each([&](int s) { v[s] += o.v[s]; }), *this; }
+    OSIK_FN P& operator-=(const P& o) { return each([&](int s) { v[s] -= o.v[s]; }), *this; }
+    OSIK_FN P& operator*=(const P& o) { return each([&](int s) { v[s] *= o.v[s]; }), *this; }
+    OSIK_FN P& fma(Real a, const P& o) { return each([&](int s) { v[s] += a * o.v[s]; }), *this; }
+    OSIK_FN P& square(const P& o) { return each([&](int s) { v[s] += o.v[s] * o.v[s]; }), *this; }
+    OSIK_FN P inverse() const {
+      P p;
+      return each([&](int s) { p.v[s] = Real(1) / v[s]; }), p;
+    }
+    OSIK_FN P size() const {
+      P p;
+      return each([&](int s) { p.v[s] = fabs(v[s]); }), p;
+    }
   };
+  OSIK_FN P load(const Real* row) const {
+    P p;
+    return P::each([&](int s) { p.v[s] = row[s && at + 32 * s >= end ? at : at + 32 * s]; }), p;
+  }
+  OSIK_FN void store(Real* row, const P& p) const {
+    P::each([&](int s) {
+      if (!s || at + 32 * s < end) row[at + 32 * s] = p.v[s];
+    });
+  }
 };
 
-template <class Real> struct ColumnOf : Column {
-  using P = Number<Real>;
-  OSIK_FN P load(const Real* row) const { return row[at]; }
-  OSIK_FN void store(Real* row, const P& p) const { row[at] = p.v; }
+template <int K> struct Constant {
+  static constexpr int value = K;
 };
 
-extern __shared__ double shared_space[];  // of one problem: a block is one warp
+extern __shared__ __align__(16) double shared_space[];  // of one problem: a block is one warp
 
 // An array of a workspace in shared memory. Its address is a constant, so that no register and no member holds it.
 template <class T, class At, class Sizes> struct SharedArray {
@@ -36,14 +57,25 @@ template <class T, class At, class Sizes> struct SharedArray {
   }
 };
 
+// A number that depends on a problem's sizes: a constant too, so that loops have constant ends.
+template <class At, class Sizes> struct SizeConstant {
+  OSIK_FN SizeConstant(const Sizes&) {}
+  OSIK_FN operator int() const {
+    constexpr int value = At::of(Sizes{});
+    return value;
+  }
+};
+
 // Space is laid out for N variables, M rows of a level and H hard rows, which are constants of a compilation.
 template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   using Real = R;
   using typename WarpSizes<R>::Int;
   template <class T, class At, class Sizes> using Array = SharedArray<T, At, Sizes>;
+  template <class At, class Sizes> using Fixed = SizeConstant<At, Sizes>;
   static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
   static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   static constexpr unsigned ALL = 0xffffffffu;
+  static constexpr int SLOTS = sizeof(R) == 4 && N > 32 ? 2 : 1;  // columns of a thread at once
   static constexpr OSIK_HOST int variables(int) { return N; }
   static constexpr OSIK_HOST int level_rows(int) { return M; }
   static constexpr OSIK_HOST int hard_rows(int) { return H; }
@@ -73,6 +105,7 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   OSIK_FN static Real inverse_root(Real a) { return rsqrt(a); }
   // tells the compiler that these arrays are in shared memory, whose instructions are shorter
   template <class... P> OSIK_FN static void are_shared(P... p) { (__builtin_assume(__isShared(p)), ...); }
+  template <class... P> OSIK_FN static void are_global(P... p) { (__builtin_assume(__isGlobal(p)), ...); }
   OSIK_FN void nonzero(const Real* A, int row, int column, int rows, int n, Int* from, Int* to) const {
     __syncwarp();
 #pragma unroll 4
@@ -89,7 +122,7 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   template <class F> OSIK_FN void columns(int a, int b, F f) const {
     __syncwarp();
 #pragma unroll 1
-    for (int i = a + me(); i < b; i += 32) f(ColumnOf<R>{{i}});
+    for (int i = a + me(); i < b; i += 32 * SLOTS) f(ColumnsOf<R, SLOTS>{i, b});
     __syncwarp();
   }
   template <class F> OSIK_FN void narrow_columns(int a, int b, F f) const { columns(a, b, f); }
@@ -131,6 +164,7 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     __syncwarp();  // f may write what its thread owns
     return __reduce_add_sync(ALL, t);
   }
+  OSIK_FN static bool all(bool flag) { return __all_sync(ALL, flag); }
   template <class F> OSIK_FN Real most(Real t, int a, int b, F f) const {
 #pragma unroll 1
     for (int i = a + me(); i < b; i += 32) {
@@ -154,7 +188,14 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
 
   // the largest |a_j b_j|; NaN counts as none
   OSIK_FN Real largest(const Real* a, const Real* b, int n) const {
-    return best(Real(0), 0, n, [&](int j) { return fabs(a[j] * b[j]); }).value;
+    Real most = 0;
+#pragma unroll 1
+    for (int j = me(); j < n; j += 32) {
+      const Real v = fabs(a[j] * b[j]);
+      most = v > most ? v : most;
+    }
+    if constexpr (sizeof(R) == 4) return __uint_as_float(__reduce_max_sync(ALL, __float_as_uint(most)));  // as they are not negative
+    return all_most(most);
   }
 
   // ---- vectors
@@ -166,8 +207,30 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     if (j < stop) even += a[j * step] * b[j];
     return even + odd;
   }
+  // f of four numbers of each of two padded rows at a time
+  template <class F> OSIK_FN static void own_fours(const Real* a, const Real* b, int n, F f) {
+#pragma unroll 3
+    for (int j = 0; j < n; j += 4) {
+      const float4 u = *reinterpret_cast<const float4*>(a + j), v = *reinterpret_cast<const float4*>(b + j);
+      f(u.x * v.x, u.y * v.y, u.z * v.z, u.w * v.w);
+    }
+  }
+  // in single precision from the first number on
   OSIK_FN static Real own_dot_on(const Real* a, const Real* b, int start, int n, int step = 1) {
-    return own_dot(a, b, start, n, step);
+    if constexpr (sizeof(R) == 8) return own_dot(a, b, start, n, step);
+    Real even = 0, odd = 0;
+    own_fours(a, b, n, [&](Real x, Real y, Real z, Real w) { even += x, odd += y, even += z, odd += w; });
+    return even + odd;
+  }
+  OSIK_FN static Real own_size_on(const Real* a, const Real* b, int n) {
+    Real even = 0, odd = 0;
+    if constexpr (sizeof(R) == 4)
+      own_fours(a, b, n, [&](Real x, Real y, Real z, Real w) {
+        even += fabs(x), odd += fabs(y), even += fabs(z), odd += fabs(w);
+      });
+    else
+      for (int j = 0; j < n; ++j) even += fabs(a[j] * b[j]);
+    return even + odd;
   }
   OSIK_FN static Real own_row(const Real* a, const Real* b, int from, int to, int, int step) {
     return own_dot(a, b, from, to, step);
@@ -185,26 +248,39 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   }
   OSIK_FN static void own_axpy_on(Real* a, Real by, const Real* b, int start, int n) { own_axpy(a, by, b, start, n); }
   OSIK_FN static int own_end(const Real*, int n) { return n; }
-  OSIK_FN void scaled_copy(Real* to, Real by, const Real* from, int n) const {
-    each(0, n, [&](int j) { to[j] = by * from[j]; });
+  // Numbers that begin to arrive in shared memory while the threads go on; zeros where there are none.
+  OSIK_FN static void fetch_one(Real* to, const Real* from, bool there) {
+    are_global(from);
+    asm volatile("cp.async.ca.shared.global [%0], [%1], %2, %3;"
+                 ::"r"(unsigned(__cvta_generic_to_shared(to))), "l"(from), "n"(sizeof(R)), "r"(there ? int(sizeof(R)) : 0));
   }
-  OSIK_FN void scaled_rows(Real* to, int ld, const Real* factor, const Real* from, int rows, int n) const {
-    constexpr int AHEAD = 8;  // loads from global memory that wait together
-    __syncwarp();
-    for (int first = me(); first < rows * N; first += 32 * AHEAD) {
-      Real entry[AHEAD];
-OSIK_UNROLL
-      for (int u = 0; u < AHEAD; ++u) entry[u] = first + 32 * u < rows * N ? from[first + 32 * u] : Real(0);
-OSIK_UNROLL
-      for (int u = 0; u < AHEAD; ++u) {
-        const int e = first + 32 * u, a = e / N;
-        if (e < rows * N) to[a * ld + e - a * N] = factor[a] * entry[u];
-      }
+  OSIK_FN void fetch(Real* to, const Real* from, int count) const {
+    for (int i = me(); i < count; i += 32) fetch_one(to + i, from + i, true);
+  }
+  OSIK_FN void fetch_rows(Real* to, int ld, const Real* from, int rows) const {
+    constexpr int PADDED = Warp::padded(N);
+#pragma unroll 2
+    for (int e = me(); e < rows * PADDED; e += 32) {
+      const int a = e / PADDED, j = e - a * PADDED;
+      fetch_one(to + a * ld + j, from + (j < N ? a * N + j : 0), j < N);
     }
+  }
+  OSIK_FN void arrive() const {
+    asm volatile("cp.async.wait_all;" ::: "memory");
     __syncwarp();
+  }
+  OSIK_FN void scaled_rows(Real* to, int ld, const Real* factor, const Real*, int rows, int) const {
+    if (factor)
+      columns(0, N, [&](auto c) {
+#pragma unroll 4
+        for (int a = 0; a < rows; ++a) {
+          auto row = c.load(to + a * ld);
+          c.store(to + a * ld, row *= factor[a]);
+        }
+      });
   }
   template <class Row, class End> OSIK_FN void rows_times(Row row, End end, const Real* v, Real* out, int count) const {
-    each(0, count, [&](int a) { out[a] = own_dot(row(a), v, 0, end(a)); });
+    each(0, count, [&](int a) { out[a] = own_dot_on(row(a), v, 0, end(a)); });
   }
   // S[a, b] = sum_j row(a)_j weight_j row(b)_j for a <= b < count
   template <class Row, class End>
@@ -259,11 +335,99 @@ OSIK_UNROLL
           column[i * ld] = (is_pivot ? Real(0) : column[i * ld]) - row[i] * factor;
       });
     }
-    each(0, count, [&](int j) {
-      for (int i = 0; i < j; ++i) S[i * ld + j] = 0;
-      S[j * ld + j] = 1;
+    each(0, Warp::padded(count), [&](int j) {
+      for (int i = 0; i < j && i < count; ++i) S[i * ld + j] = 0;
+      if (j < count) S[j * ld + j] = 1;
     });
     return regular;
+  }
+  // The inverse of the Cholesky factor of A = B'B + D, whose diagonal is made 1 + ridge times as large. Variables that are
+  // not free have a row and a column of the identity. A stays in registers: thread i has column i, and of column i + 32 the
+  // rows from 32 on; its other rows are in other threads, by symmetry.
+  // B: [M, ld] the rows; free: [ld] ones and zeros; inverse: [N, ld_inverse] with zeros in the padding; work: [2, ld].
+  // Returns whether every pivot is above `smallest` of the diagonal.
+  static constexpr bool HOLDS_COLUMNS = sizeof(R) == 4 && N <= 64;
+  OSIK_FN bool inverse_factor_of_gram(const R* B, const R* damping, const R* free, R ridge, R smallest, R* inverse, R* work,
+                                      int ld, int ld_inverse) const {
+    constexpr int FIRST = N < 32 ? N : 32, REST = N - FIRST, SOME = 8, END = Warp::padded(N);
+    R A[FIRST], low[REST + 1], other[REST + 1];  // the rows of the first column before 32 and from 32 on; of the second one
+    const int own = me() < N ? me() : N - 1, second = me() < REST ? me() + 32 : N - 1;
+    R diagonal = damping[own], second_diagonal = damping[second];
+    are_shared(B, damping, free, inverse, work);
+    auto fours = [&](const R* row, int first, int end, auto f) {  // f(k, row[k]) for first <= k < end; first: a multiple of 4
+#pragma unroll
+      for (int g = first / 4; g < (end + 3) / 4; ++g) {
+        const float4 v = reinterpret_cast<const float4*>(row)[g];
+        const R part[4] = {v.x, v.y, v.z, v.w};
+#pragma unroll
+        for (int e = 0; e < 4; ++e)
+          if (4 * g + e < end) f(4 * g + e, part[e]);
+      }
+    };
+    __syncwarp();
+#pragma unroll
+    for (int k = 0; k < FIRST; ++k) A[k] = 0;
+#pragma unroll
+    for (int k = 0; k < REST; ++k) low[k] = other[k] = 0;
+#pragma unroll 2
+    for (int r = 0; r < M; ++r) {
+      const R *row = B + r * ld, a = row[own], b = row[second];
+      diagonal += a * a, second_diagonal += b * b;
+      fours(row, 0, FIRST, [&](int k, R entry) { A[k] += a * entry; });
+      fours(row, 32, N, [&](int k, R entry) { low[k - 32] += a * entry, other[k - 32] += b * entry; });
+    }
+    const R is_free = free[own], second_is_free = free[second];
+    fours(free, 0, FIRST, [&](int k, R factor) { A[k] *= is_free * factor; });
+    fours(free, 32, N, [&](int k, R factor) { low[k - 32] *= is_free * factor, other[k - 32] *= second_is_free * factor; });
+    // what a pivot gets when its turn comes: nothing before depends on it
+    const R added = is_free > 0 ? damping[own] + ridge * diagonal : R(1);
+    const R second_added = second_is_free > 0 ? damping[second] + ridge * second_diagonal : R(1);
+    // Before step j thread i >= j has column i of the Schur complement that is left of A, thread i < j column i of the
+    // identity as far as the factor has been solved for. A[0] is row j: after each step the rows move up.
+    bool regular = true;
+    auto is_regular = [&](R pivot, R is_free, R diagonal) { return pivot > smallest * (is_free > 0 ? diagonal : R(1)); };
+    auto steps = [&](auto first) {  // from a row of the first columns on, SOME steps; the number of the rows left is a constant
+      constexpr int FROM = decltype(first)::value, TO = FROM + SOME < FIRST ? FROM + SOME : FIRST;
+      for (int j = FROM; j < TO; ++j) {
+        const bool is_pivot = me() == j;
+        A[0] += is_pivot ? added : R(0);
+        const R pivot = __shfl_sync(ALL, A[0], j), by = rsqrt(pivot), c = A[0] * by;
+        R* column = work + j % 2 * ld;
+        regular = regular && (!is_pivot || is_regular(pivot, is_free, diagonal));
+        if (me() > j && me() < FIRST) column[me() - j - 1] = c;
+        if (is_pivot)
+#pragma unroll
+          for (int k = 0; k < REST; ++k) column[32 + k] = low[k] * by;
+        if (me() < END) inverse[j * ld_inverse + me()] = is_pivot ? by : me() < j ? c : R(0);
+        if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = 0;
+        __syncwarp();
+        // thread j: its column of the factor, and the first step of its column of the identity
+        const R times = is_pivot ? c + by : c, second_times = REST ? column[second] : R(0);
+        fours(column, 0, FIRST - FROM - 1, [&](int k, R entry) { A[k] = A[k + 1] - entry * times; });
+        fours(column, 32, N, [&](int k, R entry) { low[k - 32] -= entry * times, other[k - 32] -= entry * second_times; });
+      }
+    };
+    steps(Constant<0>());
+    if constexpr (FIRST > SOME) steps(Constant<SOME>());
+    if constexpr (FIRST > 2 * SOME) steps(Constant<2 * SOME>());
+    if constexpr (FIRST > 3 * SOME) steps(Constant<3 * SOME>());
+    for (int j = 32; j < N; ++j) {
+      const bool is_pivot = me() + 32 == j;
+      other[0] += is_pivot ? second_added : R(0);
+      const R pivot = __shfl_sync(ALL, other[0], j - 32), by = rsqrt(pivot), b = low[0] * by, c = other[0] * by;
+      R* column = work + j % 2 * ld;
+      regular = regular && (!is_pivot || is_regular(pivot, second_is_free, second_diagonal));
+      if (me() + 32 > j && me() < REST) column[me() + 31 - j] = c;
+      inverse[j * ld_inverse + me()] = b;
+      if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = is_pivot ? by : me() + 32 < j ? c : R(0);
+      __syncwarp();
+      const R times = is_pivot ? c + by : c;
+      fours(column, 0, REST - 1, [&](int k, R entry) {
+        low[k] = low[k + 1] - entry * b, other[k] = other[k + 1] - entry * times;
+      });
+    }
+    __syncwarp();
+    return all(regular);
   }
 
   // ---- triangular systems of at most 64 equations; entry k of y stays in a register of thread k % 32
@@ -291,5 +455,26 @@ OSIK_UNROLL
     __syncwarp();
   }
 };
+
+// The words of lanes.hpp: an entry of arrays, and the largest of what all threads have.
+template <class Real> struct Entry {
+  size_t first;
+  OSIK_FN Real operator()(const Real* from) const { return from[first]; }
+  OSIK_FN void put(Real a, Real* to) const { to[first] = a; }
+  template <class Int> OSIK_FN bool are(const Int* labels, int label) const { return labels[first] == label; }
+};
+template <class Team> using EntryOf = Entry<typename Team::Real>;
+template <class Team> struct GatheredBy {
+  typename Team::Real own = 0;
+  OSIK_FN void most(typename Team::Real a) { own = a > own ? a : own; }
+  OSIK_FN typename Team::Real largest() const { return Team::all_most(own); }
+};
+template <class R, int N, int M, int H, class F> OSIK_FN void each_entry(const Warp<R, N, M, H>& t, int count, F f) {
+  t.each(0, count, [&](int i) { f(Entry<R>{size_t(i)}); });
+}
+template <class R, int N, int M, int H>
+OSIK_FN RowSums<R> row_sums(const Warp<R, N, M, H>& t, const R* row, const R* x, int n) {
+  return {t.own_dot_on(row, x, 0, n), t.own_size_on(row, x, n)};
+}
 
 }  // namespace osik

@@ -50,10 +50,9 @@ template <class Team> struct WeightedQP {
   static constexpr Real EPS = sizeof(Real) == 8 ? EPSILON : 1.1920929e-07;
   static constexpr bool IS_SINGLE = sizeof(Real) == 4;
   static constexpr Real VIOLATION = sizeof(Real) == 8 ? 1 : VIOLATION_TOL;
-  static constexpr int VECTORS = 24, INTEGERS = 4;
+  static constexpr int VECTORS = Team::SPARES_SPACE ? 19 : 21, INTEGERS = 4;
   Team t;
-  int m, n, p, k, N, ld, lk, lq, max_changes;  // k = m + p rows; strides of rows of n, of k and of order(k, n) numbers
-  int used, changes, factorizations;           // rows in the system of the active set
+  int max_changes, used, changes, factorizations;  // used: rows in the system of the active set
   Real tolerance;
   const Real *lower, *upper;
 
@@ -65,14 +64,30 @@ template <class Team> struct WeightedQP {
   // the order of the system of the active set. In single precision it is the Hessian's: the rows' needs a damping that is
   // far above roundoff.
   static constexpr OSIK_HOST int order(int k, int n) { return k < n && !IS_SINGLE ? k : n; }
+  template <int K> struct SizeAt {
+    static constexpr OSIK_HOST int of(const QPSizes& s) {
+      const int m = Team::level_rows(s.m), n = Team::variables(s.n), p = Team::hard_rows(s.p), k = m + p;
+      const int size[] = {m, n, p, k, n + p, Team::stride(n), Team::stride(p), Team::stride(order(k, n))};
+      return size[K];
+    }
+  };
+  template <int K> using Size = typename Team::template Fixed<SizeAt<K>, QPSizes>;
+  Size<0> m;
+  Size<1> n;
+  Size<2> p;
+  Size<3> k;   // all rows
+  Size<4> N;   // all constraints
+  Size<5> ld;  // strides of rows of n, of p and of order(k, n) numbers
+  Size<6> lp;
+  Size<7> lq;
   // the numbers before matrix `which`, in the order of the matrices below; the last two are the dual method and an end
   static constexpr OSIK_HOST int numbers_before(int which, const QPSizes& s) {
     const int n = Team::variables(s.n), p = Team::hard_rows(s.p), k = Team::level_rows(s.m) + p, q = order(k, n);
     const int kept = q < k || IS_SINGLE ? p : 0;  // rows that are kept where the system is the Hessian's
     const int dual = Team::SPARES_SPACE ? 0 : DualActiveSet<Team>::doubles(n, p);
     const int size[] = {k * Team::stride(n), kept * Team::stride(n), q * Team::stride(q),
-                        Team::SPARES_SPACE ? 0 : q * Team::stride(q), kept * Team::stride(k),
-                        Team::SPARES_SPACE ? 0 : kept * Team::stride(k), dual, Team::stride(0)};
+                        Team::SPARES_SPACE ? 0 : q * Team::stride(q), kept * Team::stride(p),
+                        Team::SPARES_SPACE ? 0 : kept * Team::stride(p), dual, Team::stride(0)};
     int count = VECTORS * width(s);
     for (int i = 0; i < which; ++i) count += size[i];
     return count;
@@ -98,8 +113,8 @@ template <class Team> struct WeightedQP {
   Matrix<1> V;   // [p, ld] where the system is the Hessian's: M times the active rows of C
   Matrix<2> S;   // [q, lq] the system of the active set, q = order(k, n)
   Matrix<(Team::SPARES_SPACE ? 2 : 3)> M;  // [q, lq] the inverse of its factor, perhaps in the place of S
-  Matrix<4> T;   // [p, lk] with V: the Schur complement of the active rows of C
-  Matrix<(Team::SPARES_SPACE ? 4 : 5)> TM;  // [p, lk] the inverse of its factor
+  Matrix<4> T;   // [p, lp] with V: the Schur complement of the active rows of C
+  Matrix<(Team::SPARES_SPACE ? 4 : 5)> TM;  // [p, lp] the inverse of its factor
   Matrix<6> DUAL;
   // vectors, as long as the longest of k and N
   Numbers<0> TARGET;
@@ -108,24 +123,23 @@ template <class Team> struct WeightedQP {
   Numbers<3> CENTER;
   Numbers<4> ROOT;
   Numbers<5> INVERSE_ROOT;
-  Numbers<6> INVERSE;
-  Numbers<7> X;
-  Numbers<8> Z;
-  Numbers<9> STEP;
-  Numbers<10> GRADIENT;
-  Numbers<11> GAP;
-  Numbers<12> RIGHT;
-  Numbers<13> SOLVED;
-  Numbers<14> PIVOT;
-  Numbers<15> TERMS;
-  Numbers<16> VALUE;
-  Numbers<17> VALUE_ROUNDOFF;
-  Numbers<18> MULTIPLIER_ROUNDOFF;
-  Numbers<19> DIAGONAL;
-  Numbers<20> SMALL;
-  Numbers<21> SMALL_PIVOT;
-  Numbers<22> SCALED;
-  Numbers<23> ALSO_SCALED;  // after SCALED, with which it is [2, ld]
+  Numbers<6> X;
+  Numbers<7> Z;
+  Numbers<8> STEP;
+  Numbers<9> GRADIENT;
+  Numbers<10> GAP;
+  Numbers<11> RIGHT;
+  Numbers<12> SOLVED;
+  Numbers<13> PIVOT;
+  Numbers<14> TERMS;
+  Numbers<15> VALUE;
+  Numbers<16> VALUE_ROUNDOFF;
+  Numbers<17> MULTIPLIER_ROUNDOFF;
+  Numbers<18> SMALL_PIVOT;
+  Numbers<15> INVERSE;  // these three while a point is solved for, whose roundoff is found afterwards
+  Numbers<16> DIAGONAL;
+  Numbers<17> SMALL;
+  Numbers<19> SCALED;  // of a CPU, with the next one [2, ld]
   Labels<0> LABEL;
   Labels<1> NEXT;
   Labels<2> USED;
@@ -138,31 +152,34 @@ template <class Team> struct WeightedQP {
   }
   // outside: space of the dual method, if the team spares space
   OSIK_FN WeightedQP(const QPSizes& s, char* space, Real* outside = nullptr)
-      : m(s.m), n(s.n), p(s.p), k(s.m + s.p), N(s.n + s.p), ld(Team::stride(s.n)), lk(Team::stride(s.m + s.p)),
-        lq(Team::stride(order(s.m + s.p, s.n))), max_changes(s.max_changes) {
+      : max_changes(s.max_changes), m(s), n(s), p(s), k(s), N(s), ld(s), lp(s), lq(s) {
     place(space, s, B, V, S, M, T, TM, DUAL, TARGET, COMPLIANCE, DAMPING, CENTER, ROOT, INVERSE_ROOT, INVERSE, X, Z, STEP,
           GRADIENT, GAP, RIGHT, SOLVED, PIVOT, TERMS, VALUE, VALUE_ROUNDOFF, MULTIPLIER_ROUNDOFF, DIAGONAL, SMALL,
-          SMALL_PIVOT, SCALED, ALSO_SCALED, LABEL, NEXT, USED, END, ORDER);
+          SMALL_PIVOT, SCALED, LABEL, NEXT, USED, END, ORDER);
     dual.begin(n, p, Team::SPARES_SPACE ? outside : DUAL, ORDER);
     t.each(n, width(s), [&](int j) { DAMPING[j] = 1; });  // which has an inverse
   }
 
   // ---- one problem
   OSIK_METHOD void begin(const Data& d) {
+    t.fetch_rows(B, ld, d.matrix, m), t.fetch_rows(B + m * ld, ld, d.rows, p);
+    t.fetch(GAP, d.weight, m), t.fetch(TARGET, d.target, m), t.fetch(COMPLIANCE + m, d.compliance, p);
+    t.fetch(DAMPING, d.damping, n), t.fetch(CENTER, d.center, n);
     lower = d.lower, upper = d.upper, tolerance = d.tolerance, changes = factorizations = 0;
-    t.each(n, ld, [&](int j) { X[j] = STEP[j] = GRADIENT[j] = SOLVED[j] = TERMS[j] = RIGHT[j] = 0; });
+    t.each(0, ld, [&](int j) { X[j] = STEP[j] = GRADIENT[j] = SOLVED[j] = TERMS[j] = RIGHT[j] = 0; });
+    t.arrive();
     t.each(0, k, [&](int i) {
-      const Real root = i < m ? sqrt(d.weight[i]) : Real(1);
-      GAP[i] = root, TARGET[i] = i < m ? root * d.target[i] : 0, COMPLIANCE[i] = i < m ? Real(1) : d.compliance[i - m];
-      Z[i] = 0;
+      const Real root = i < m ? sqrt(GAP[i]) : Real(1);
+      GAP[i] = root, TARGET[i] = i < m ? root * TARGET[i] : 0, Z[i] = 0;
+      if (i < m) COMPLIANCE[i] = 1;
     });
     t.scaled_rows(B, ld, GAP, d.matrix, m, n);
-    t.scaled_rows(B + m * ld, ld, GAP + m, d.rows, p, n);
+    t.scaled_rows(B + m * ld, ld, nullptr, d.rows, p, n);
     t.each(0, k, [&](int i) { END[i] = t.own_end(B + i * ld, n); });
-    t.scaled_copy(DAMPING, 1, d.damping, n);
-    t.scaled_copy(CENTER, 1, d.center, n);
+    t.each(n, Team::padded(n), [&](int j) { ROOT[j] = 1; });
     t.columns(0, n, [&](auto c) {
       auto total = c.load(DAMPING);
+OSIK_UNROLL_4
       for (int i = 0; i < m; ++i) total.square(c.load(B + i * ld));
       c.store(ROOT, total);
     });
@@ -196,6 +213,7 @@ template <class Team> struct WeightedQP {
       auto total = c.load(X);
       total -= c.load(CENTER);
       total *= c.load(DAMPING);
+OSIK_UNROLL_4
       for (int i = 0; i < k; ++i) total.fma(-Z[i], c.load(B + i * ld));
       c.store(GRADIENT, total);
     });
@@ -215,9 +233,10 @@ template <class Team> struct WeightedQP {
   // ---- the minimiser on the active set; returns whether the factors are regular
   OSIK_METHOD bool solve_on_active_set() {
     ++factorizations;
-    used = 0;
-    for (int i = 0; i < k; ++i) {
-      const bool in = i < m || LABEL[n + i - m] != INACTIVE;
+    t.each(0, m, [&](int i) { USED[i] = i; });
+    used = m;
+    for (int i = m; i < k; ++i) {
+      const bool in = LABEL[n + i - m] != INACTIVE;
       t.once([&] { in ? void(USED[used] = i) : void(Z[i] = 0); });
       used += in;
     }
@@ -260,7 +279,12 @@ template <class Team> struct WeightedQP {
     return true;
   }
   // H_F = B_F' B_F + D_F, with a row and a column of the identity for active variables; V = M C_F' and V D^-1 V' + E
-  OSIK_METHOD bool factor_hessian() {
+  OSIK_METHOD bool factor_hessian() { return invert_hessian() && invert_complement(); }
+  OSIK_FN bool invert_hessian() {
+    if constexpr (Team::HOLDS_COLUMNS) {
+      t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? 1 : 0, PIVOT[j] = 1; });
+      return t.inverse_factor_of_gram(B, DAMPING, STEP, RIDGE, EPS, M, TERMS, ld, lq);
+    }
     if constexpr (Team::SPARES_SPACE)
       t.pairs(n, [&](int a, int b) {
         Real even = 0, odd = 0;
@@ -276,22 +300,25 @@ template <class Team> struct WeightedQP {
         if (!free || LABEL[a] != INACTIVE) S[a * lq + b] = 0;
       S[b * lq + b] = free ? (S[b * lq + b] + DAMPING[b]) * (1 + RIDGE) : Real(1);
     });
-    if (!Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, n, EPS)) return false;
+    return Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, n, EPS);
+  }
+  OSIK_FN bool invert_complement() {
     for (int a = 0; a < used - m; ++a) {
       t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? row(m + a)[j] : Real(0); });
-      t.each(0, n, [&](int i) { V[a * ld + i] = t.own_dot_on(M + i * lq, STEP, 0, n); });
+      t.each(0, Team::padded(n), [&](int i) { V[a * ld + i] = i < n ? t.own_dot_on(M + i * lq, STEP, 0, n) : Real(0); });
       t.each(0, n, [&](int j) { STEP[j] = V[a * ld + j] * PIVOT[j]; });
       t.each(0, a + 1, [&](int b) {
-        T[b * lk + a] = t.own_dot_on(V + b * ld, STEP, 0, n) + (a == b ? COMPLIANCE[USED[m + a]] : Real(0));
+        T[b * lp + a] = t.own_dot_on(V + b * ld, STEP, 0, n) + (a == b ? COMPLIANCE[USED[m + a]] : Real(0));
       });
     }
-    return Algebra::inverse_factor(t, T, TM, SMALL_PIVOT, DIAGONAL, lk, used - m, Real(KERNEL_PIVOT) * EPS);
+    return Algebra::inverse_factor(t, T, TM, SMALL_PIVOT, DIAGONAL, lp, used - m, Real(KERNEL_PIVOT) * EPS);
   }
   // H_F dx - C_F' dy = -gradient, C_F dx + E dy = gap: (V' D^-1 V + E) dy = gap + V' D^-1 M gradient
   OSIK_METHOD bool solve_by_hessian() {
     if (!factor_hessian()) return false;
     const int rows = used - m;
-    t.each(0, n, [&](int j) { X[j] = LABEL[j] == INACTIVE ? Real(0) : bound(j); });
+    // in single precision from the point before, towards which corrections may be slow
+    t.each(0, n, [&](int j) { X[j] = LABEL[j] != INACTIVE ? bound(j) : IS_SINGLE ? X[j] : Real(0); });
     t.each(m, k, [&](int i) { Z[i] = 0; });
     Real before = INFINITE;
     find_gradient();
@@ -299,10 +326,15 @@ template <class Team> struct WeightedQP {
       t.each(0, n, [&](int j) { RIGHT[j] = LABEL[j] == INACTIVE ? -GRADIENT[j] : Real(0); });
       t.each(0, n, [&](int i) { SOLVED[i] = PIVOT[i] * t.own_dot_on(M + i * lq, RIGHT, 0, i + 1); });
       t.each(0, rows, [&](int a) { SMALL[a] = GAP[USED[m + a]] - t.own_dot_on(V + a * ld, SOLVED, 0, n); });
-      Algebra::apply_inverse(t, TM, SMALL_PIVOT, SMALL, TERMS, lk, rows);
+      Algebra::apply_inverse(t, TM, SMALL_PIVOT, SMALL, TERMS, lp, rows);
       t.each(0, rows, [&](int a) { Z[USED[m + a]] += SMALL[a]; });
       for (int a = 0; a < rows; ++a) t.each(0, n, [&](int i) { SOLVED[i] += PIVOT[i] * SMALL[a] * V[a * ld + i]; });
-      Algebra::transposed_times(t, M, SOLVED, STEP, lq, 0, n);
+      t.columns(0, n, [&](auto c) {
+        auto total = typename decltype(c)::P(0);
+OSIK_UNROLL_4
+        for (int i = 0; i < n; ++i) total.fma(SOLVED[i], c.load(M + i * lq));
+        c.store(STEP, total);
+      });
       t.each(0, n, [&](int j) { X[j] += STEP[j]; });
       find_gradient();
       if (is_last(before)) break;
@@ -327,8 +359,7 @@ template <class Team> struct WeightedQP {
       if (i < n) per_root = INVERSE_ROOT[i], value = X[i];
       else {
         const Real* r = B + (m + i - n) * ld;
-        value = t.own_dot_on(r, X, 0, n), unit = 0;
-        for (int j = 0; j < n; ++j) unit += fabs(r[j]), per_root += fabs(r[j]) * INVERSE_ROOT[j];
+        value = t.own_dot_on(r, X, 0, n), unit = t.own_size_on(r, TERMS, n), per_root = t.own_size_on(r, INVERSE_ROOT, n);
       }
       reach = most * per_root < longest * unit ? most * per_root : longest * unit;
       const Real low = fabs(lower[i]), high = fabs(upper[i]), nearest = low < high ? low : high;
@@ -339,20 +370,16 @@ template <class Team> struct WeightedQP {
     if (t.count(0, n, [&](int j) { return LABEL[j] != INACTIVE; })) find_bound_roundoff();
   }
   OSIK_METHOD void find_bound_roundoff() {  // of the multiplier of a variable on its bound: that of its gradient's terms
-    t.each(0, k, [&](int i) {
-      Real size = fabs(i < m ? TARGET[i] : Z[i]);
-      if (i < m)
-        for (int j = 0; j < n; ++j) size += fabs(B[i * ld + j] * X[j]);
-      TERMS[i] = size;
+    t.each(0, k, [&](int i) { TERMS[i] = i < m ? fabs(TARGET[i]) + t.own_size_on(B + i * ld, X, n) : fabs(Z[i]); });
+    t.columns(0, n, [&](auto c) {
+      auto size = c.load(X).size();
+      size += c.load(CENTER).size();
+      size *= c.load(DAMPING);
+OSIK_UNROLL_4
+      for (int i = 0; i < k; ++i) size.fma(TERMS[i], c.load(B + i * ld).size());
+      c.store(SOLVED, size);
     });
-    t.each(0, n, [&](int j) {
-      Real size = 0;
-      if (LABEL[j] != INACTIVE) {
-        size = DAMPING[j] * (fabs(X[j]) + fabs(CENTER[j]));
-        for (int i = 0; i < k; ++i) size += TERMS[i] * fabs(B[i * ld + j]);
-      }
-      MULTIPLIER_ROUNDOFF[j] = Real(BOUND_MULTIPLIER) * EPS * size;
-    });
+    t.each(0, n, [&](int j) { MULTIPLIER_ROUNDOFF[j] = Real(BOUND_MULTIPLIER) * EPS * SOLVED[j]; });
   }
 
   // ---- labels
@@ -408,10 +435,21 @@ template <class Team> struct WeightedQP {
     t.each(0, N, [&](int i) { LABEL[i] = NEXT[i] ? Int(REDUNDANT) : LABEL[i]; });
     return true;
   }
+  // the problem as begin() copied it, whose rows have their weights multiplied in and the stride ld
+  struct Copied {
+    Matrix<0> matrix;
+    Numbers<0> target;
+    Numbers<1> weight;  // the first compliances, which are ones
+    Numbers<2> damping;
+    Numbers<3> center;
+    const Real *rows, *compliance, *lower, *upper;
+    Real tolerance;
+  };
+  OSIK_FN Copied copied() const { return {B, TARGET, COMPLIANCE, DAMPING, CENTER, B + m * ld, COMPLIANCE + m, lower, upper, tolerance}; }
   OSIK_METHOD void solve(const Data& d, const Answer& to) {
     begin(d);
     first_labels(d.guess, LABEL);
-    const bool found = search();
+    const bool found = search() && changes <= max_changes;
     if (!found) first_labels(d.guess, LABEL);
     t.each(0, N, [&](int i) {
       to.active[i] = LABEL[i];

@@ -2,7 +2,7 @@
 #include <utility>
 #include <vector>
 
-#include "certificates.hpp"
+#include "qp_certificate.hpp"
 #include "xla.hpp"
 
 using namespace osik;
@@ -42,7 +42,8 @@ void solve_weighted_qps(const xla::Call& call) {
 void judge_weighted_qps(const xla::Call& call) {
   const int batch = call.size(0, 0), m = call.size(0, 1), n = call.size(0, 2), N = call.size(4, 1), p = N - n;
   const QPSizes s{m, n, p, 0};
-  QPCertificate certificate(s);
+  std::vector<double> space(WeightedQP<Serial<double>>::bytes(s) / sizeof(double));
+  QPCertificate<Serial<double>> certificate(s, reinterpret_cast<char*>(space.data()));
   const double* packed = call.in<double>(1);
   for (size_t k = 0; k < size_t(batch); ++k) {
     const double* tolerances = call.in<double>(5) + 2 * k;

@@ -216,8 +216,6 @@ MAX_EXCHANGES = 2
 """Exchanges without fewer wrong labels, before the dual active-set method starts."""
 MAX_DUAL_STARTS = 8
 """Starts and restarts of the dual active-set method: its answer, solved anew, may violate another bound slightly."""
-MAX_FACTORIZATIONS = 100
-"""Largest number of systems that the kernel in single precision factors; other problems are searched."""
 
 # ---- projected Newton
 

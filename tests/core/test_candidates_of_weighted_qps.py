@@ -1,4 +1,6 @@
-"""Candidates of the weighted QP on a GPU, without one: they are taken only where they are right."""
+"""Candidates of the weighted QP are taken only where they are right: by the certificates of plain JAX and of the core.
+
+And what is done on a GPU with those that its kernel does not certify, without a GPU."""
 
 import functools
 from typing import Any, NamedTuple
@@ -15,17 +17,17 @@ from osik_jax.execution import _backends
 from osik_jax.execution._lanes import first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _cuda, _dispatch, _search
+from osik_jax.solvers.qp import _core, _cuda, _dispatch, _search, _solve
 from osik_jax.solvers.qp._candidate import Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, pack
 
 CAP = 1000
 SOFT = 3
 
 
 class Batch(NamedTuple):
-    """Recorded QPs in single precision with soft rows on the base, and their answers by the search."""
+    """Recorded QPs with soft rows on the base, and their answers by the search."""
 
     qp: QP
     guess: jax.Array
@@ -38,16 +40,16 @@ def batch() -> Batch:
     p = recorded_qps("nao")
     at_bound = (np.minimum(p.solution - p.lower, p.upper - p.solution) < 1e-12).any(1)
     pick = np.flatnonzero(at_bound)[:40]
-    A, b, lower, upper = (jnp.asarray(a[pick], jnp.float32) for a in (p.A, p.b, p.lower, p.upper))
+    A, b, lower, upper = (jnp.asarray(a[pick]) for a in (p.A, p.b, p.lower, p.upper))
     rng = np.random.default_rng(3)
     count, _, n = A.shape
-    rows = jnp.asarray(rng.normal(size=(count, SOFT, n)), jnp.float32)
-    damping = jnp.full((count, n), QP_DAMPING, jnp.float32)
+    rows = jnp.asarray(rng.normal(size=(count, SOFT, n)))
+    damping = jnp.full((count, n), QP_DAMPING)
     cost = LeastSquares(A, b, jnp.ones_like(b), damping, jnp.zeros_like(damping))
-    side = jnp.full((count, SOFT), 0.1, jnp.float32)
+    side = jnp.full((count, SOFT), 0.1)
     low, high = jnp.concatenate([lower, -side], 1), jnp.concatenate([upper, side], 1)
-    qp = QP(cost, rows, jnp.full((count, SOFT), 0.1, jnp.float32), low, high)
-    guess, tolerance = jnp.zeros(low.shape, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
+    qp = QP(cost, rows, jnp.full((count, SOFT), 0.1), low, high)
+    guess, tolerance = jnp.zeros(low.shape, jnp.int32), jnp.full(count, 1e-12)
     answers = jax.jit(lambda *a: _search.search(*a, max_iterations=CAP))(qp, guess, tolerance)
     assert answers.optimal.all() and (answers.active[:, :n] != 0).any(1).all() and (answers.active[:, n:] != 0).any()
     return Batch(qp, guess, tolerance, answers)
@@ -55,22 +57,41 @@ def batch() -> Batch:
 
 def candidate_of(found: _search.SearchResult) -> Candidate:
     yes = jnp.ones_like(found.iterations)
-    return Candidate(found.x, found.row_multipliers, found.active, yes, yes, yes)
+    certified = jnp.full_like(yes, _cuda.CERTIFIED)
+    return Candidate(found.x, found.row_multipliers, found.active, certified, yes, yes, residual=found.residual)
 
 
-@functools.partial(jax.jit, static_argnames="smallest")
-def searched_from(candidate: Candidate, *given: Any, smallest: int) -> _search.SearchResult:
+@functools.partial(jax.jit, static_argnames=("smallest", "kernel"))
+def searched_from(candidate: Candidate, *given: Any, smallest: int, kernel: str) -> _search.SearchResult:
     """One program for all candidates, and another where the blocks are of another size."""
     assert smallest == _dispatch._MIN_BLOCK
+    qp, guess, tolerance = given
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_cuda, "solve", lambda *_: candidate)
-        return _dispatch.cuda_candidates(KKT_TOLERANCE[np.dtype("float32")], CAP).answers(*given)
+        patch.setattr(_cuda if kernel == "core-cuda" else _core, "solve", lambda *_: candidate)
+        if kernel == "core":
+            return _dispatch.core_candidates(KKT_TOLERANCE[np.dtype("float64")], CAP).answers(
+                qp, None, guess, tolerance
+            )
+        as_given = qp, jnp.ones(len(guess), bool)
+        return _dispatch.cuda_candidates(CAP).answers(qp, as_given, guess, tolerance)
 
 
-def completed(batch: Batch, candidate: Candidate) -> tuple[_search.SearchResult, np.ndarray]:
+def completed(batch: Batch, candidate: Candidate, kernel: str = "core") -> tuple[_search.SearchResult, np.ndarray]:
     """The end, and the lanes in which the candidate was taken; in NumPy."""
-    end, p = jax.device_get((searched_from(candidate, *batch[:3], smallest=_dispatch._MIN_BLOCK), candidate))
+    end = searched_from(candidate, *batch[:3], smallest=_dispatch._MIN_BLOCK, kernel=kernel)
+    end, p = jax.device_get((end, candidate))
     return end, np.all(end.x == p.x, 1) & (end.factorizations == p.factorizations)
+
+
+def judged(batch: Batch, c: Candidate) -> np.ndarray:
+    """The lanes that the core certifies."""
+    matrix, packed = jax.jit(jax.vmap(pack))(batch.qp)
+    tolerances = jnp.stack([batch.tolerance, jnp.full_like(batch.tolerance, KKT_TOLERANCE[np.dtype("float64")])], 1)
+    shapes = [((len(c.x),), int), ((len(c.x),), float)]
+    holds, _ = _library.call(
+        "weighted_qp_certificate", shapes, matrix, packed, c.x, c.row_multipliers, c.active, tolerances
+    )
+    return np.asarray(holds, bool)
 
 
 def assert_right(batch: Batch, end: _search.SearchResult) -> None:
@@ -85,6 +106,7 @@ def assert_right(batch: Batch, end: _search.SearchResult) -> None:
 def test_right_candidates_are_taken(batch):
     end, taken = completed(batch, candidate_of(batch.answers))
     assert taken.all() and (end.factorizations == 1).all()
+    assert not _library.installed() or judged(batch, candidate_of(batch.answers)).all()
     np.testing.assert_array_equal(end.x, batch.answers.x)
     np.testing.assert_array_equal(end.active, batch.answers.active)
     np.testing.assert_array_equal(end.row_multipliers, batch.answers.row_multipliers)
@@ -136,6 +158,8 @@ def test_wrong_candidates_are_not(batch, wrong):
     end, taken = completed(batch, candidate)
     assert not taken.any()
     assert_right(batch, end)
+    if wrong != "not converged" and _library.installed():  # the caller of the core's certificate looks at the former
+        assert not judged(batch, candidate).any()
 
 
 def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
@@ -144,8 +168,10 @@ def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
     lanes = jnp.arange(len(batch.guess))
     spoiled = (lanes * 7) % 8 < 5
     right = candidate_of(batch.answers)
-    candidate = right._replace(x=jnp.where(spoiled[:, None], 0.0, right.x), converged=jnp.where(spoiled, 0, 1))
-    end, taken = completed(batch, candidate)
+    candidate = right._replace(
+        x=jnp.where(spoiled[:, None], 0.0, right.x), converged=jnp.where(spoiled, 1, right.converged)
+    )
+    end, taken = completed(batch, candidate, "core-cuda")
     np.testing.assert_array_equal(taken, ~spoiled)
     assert_right(batch, end)
     assert (end.factorizations[spoiled] == 2).all()  # the kernel's, and one from the active set that it left
@@ -177,9 +203,11 @@ def beside_a_gpu(monkeypatch):
     def solve(qp, guess, tolerance, max_iterations):
         asked.append(qp.cost.matrix.shape[1:])
         nothing = jnp.zeros(len(guess), jnp.int32)
-        return Candidate(jnp.full_like(qp.cost.damping, jnp.nan), jnp.zeros_like(qp.compliance), guess, *[nothing] * 3)
+        x = jnp.full_like(qp.cost.damping, jnp.nan)
+        return Candidate(x, jnp.zeros_like(qp.compliance), guess, *[nothing] * 3, residual=x[:, 0])
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
+    monkeypatch.setattr(_solve, "cpu_is_default", lambda: False)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
     monkeypatch.setattr(_cuda, "solve", solve)
     jax.clear_caches()

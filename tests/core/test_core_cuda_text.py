@@ -12,7 +12,6 @@ from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
 from osik_jax.solvers.qp import _cuda as weighted_qp
-from osik_jax.solvers.qp import _single as single_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 """Two levels of three variables; the second has one inequality row."""
@@ -41,7 +40,8 @@ TEXTS = {
     "weighted QP, double": lambda: weighted_qp._source(5, 7, 2, False, 100, 1),
     "weighted QP, single": lambda: weighted_qp._source(5, 7, 0, True, 100, 4),
     "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
-    "weighted QP without rows, single": lambda: single_qp._source(single_qp.Shape(7, 5), 100),
+    "more than 32 variables": lambda: weighted_qp._source(5, 35, 2, True, 100, 1),
+    "more than 64 variables": lambda: weighted_qp._source(5, 70, 2, True, 100, 1),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
     "bodies": lambda: _cuda._lanes_source("kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((3, 3), *[(2, 3)] * 4)),
     "frames": lambda: _cuda._lanes_source("moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((1, 3), (1, 6, 7))),

@@ -15,6 +15,7 @@ from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 from saturation_families import FAMILIES as SATURATED
 from saturation_families import N, as_levels, drawn, family, solve_full
+from weighted_families import soft_problems
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
@@ -75,23 +76,6 @@ def test_whole_body_family(backend, rng):
     fine = np.asarray(s.status) == Status.SOLVED
     error = off(np.sqrt(p.weight)[..., None] * p.A, s.x, expected, np.sqrt(p.weight) * p.b)
     assert error[fine].max() < 5e-5
-
-
-def soft_problems(rng, count, n, m, p):
-    """Rows that give way, some of them equalities, some without bounds; a box of which a part is pinned or open.
-
-    A pull to a centre, different from variable to variable."""
-    A, C = rng.normal(size=(count, m, n)), rng.normal(size=(count, p, n))
-    b, weight = rng.normal(size=(count, m)), 10.0 ** rng.uniform(-1, 1, (count, m))
-    lower, upper = -rng.exponential(size=(count, n)), rng.exponential(size=(count, n))
-    lower[rng.random(lower.shape) < 0.3], upper[rng.random(upper.shape) < 0.3] = -np.inf, np.inf
-    upper = np.where(np.isfinite(lower) & (rng.random(lower.shape) < 0.05), lower, upper)
-    low, high = rng.normal(size=(count, p)) - 0.5, np.full((count, p), np.inf)
-    high = np.where(rng.random(low.shape) < 0.5, low + rng.exponential(size=low.shape), high)
-    high = np.where(rng.random(low.shape) < 0.1, low, high)
-    low = np.where(rng.random(low.shape) < 0.1, -np.inf, low)
-    pulls = 10.0 ** rng.uniform(-2, 0, (count, n)), rng.normal(size=(count, n))
-    return A, b, weight, lower, upper, C, low, high, 10.0 ** rng.uniform(-2, 0, (count, p)), *pulls
 
 
 @pytest.mark.parametrize("shape", [(3, 0, 2), (12, 20, 5), (31, 60, 1), (33, 40, 3), (48, 30, 32), (64, 50, 4)])

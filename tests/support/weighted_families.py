@@ -47,3 +47,20 @@ def problems(count: int = 200, m: int = M, seed: int = 0, weakest: float = 1e-6)
         *(C, below, above, np.where(soft, 10.0 ** rng.uniform(-3.0, 1.0, value.shape), 0.0)),
         10.0 ** rng.uniform(np.log10(weakest), 0.0, (count, N)),
     )
+
+
+def soft_problems(rng, count, n, m, p):
+    """Rows that give way, some of them equalities, some without bounds; a box of which a part is pinned or open.
+
+    A pull to a centre, different from variable to variable."""
+    A, C = rng.normal(size=(count, m, n)), rng.normal(size=(count, p, n))
+    b, weight = rng.normal(size=(count, m)), 10.0 ** rng.uniform(-1, 1, (count, m))
+    lower, upper = -rng.exponential(size=(count, n)), rng.exponential(size=(count, n))
+    lower[rng.random(lower.shape) < 0.3], upper[rng.random(upper.shape) < 0.3] = -np.inf, np.inf
+    upper = np.where(np.isfinite(lower) & (rng.random(lower.shape) < 0.05), lower, upper)
+    low, high = rng.normal(size=(count, p)) - 0.5, np.full((count, p), np.inf)
+    high = np.where(rng.random(low.shape) < 0.5, low + rng.exponential(size=low.shape), high)
+    high = np.where(rng.random(low.shape) < 0.1, low, high)
+    low = np.where(rng.random(low.shape) < 0.1, -np.inf, low)
+    pulls = 10.0 ** rng.uniform(-2, 0, (count, n)), rng.normal(size=(count, n))
+    return A, b, weight, lower, upper, C, low, high, 10.0 ** rng.uniform(-2, 0, (count, p)), *pulls

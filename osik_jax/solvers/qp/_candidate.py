@@ -11,15 +11,16 @@ from ...numerics._constants import INACTIVE, REDUNDANT
 
 
 class Candidate(NamedTuple):
-    """Uncertified answers of a kernel for a batch."""
+    """Answers of a kernel for a batch."""
 
     x: Float[Array, "B n"]
     row_multipliers: Float[Array, "B p"]
     active: Int[Array, "B n+p"]
-    converged: Int[Array, " B"]  # whether the kernel has nothing left to change
+    converged: Int[Array, " B"]  # whether the kernel has nothing left to change; 2 on a GPU if it is certified
     iterations: Int[Array, " B"]
     factorizations: Int[Array, " B"]
     redundant: Bool[Array, "B n+p"] | None = None  # constraints that the active ones imply; None for none
+    residual: Float[Array, " B"] | None = None  # ``kkt_residual``, of a GPU
 
 
 def of_core(

@@ -8,20 +8,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...core import _cuda, _library
-from . import _single
+from ...numerics._constants import KKT_TOLERANCE
 from ._candidate import Candidate, of_core
 from ._cost import LeastSquares
 from ._problem import QP
 
+CERTIFIED = 2
+"""``Candidate.converged`` of a candidate that solves its problem; 1: there is one."""
 _KERNEL = """
 using namespace osik;
 using Method = WeightedQP<Warp<Real, N, M, P>>;
 extern "C" __global__ void __launch_bounds__(32) osik_kernel(
     const Real* matrix, const Real* target, const Real* weight, const Real* damping, const Real* center,
     const Real* rows, const Real* compliance, const Real* lower, const Real* upper, const int* guess,
-    const Real* tolerance, Real* x, Real* multipliers, int* active, int* report, Real* outside, int problems) {
+    const Real* tolerance, Real* x, Real* multipliers, int* active, int* report, Real* residual, Real* outside,
+    int problems) {
   const QPSizes s{M, N, P, MAX_CHANGES};
   Method method(s, nullptr, outside + size_t(blockIdx.x) * DualActiveSet<Warp<Real, N, M, P>>::doubles(N, P));
+  QPCertificate<Warp<Real, N, M, P>> certificate(s, nullptr);
   for (int b = 0; b < PER_BLOCK; ++b) {
     const size_t k = size_t(blockIdx.x) * PER_BLOCK + b;
     if (k >= problems) return;
@@ -29,6 +33,9 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
                          rows + k * P * N, compliance + k * P, lower + k * (N + P), upper + k * (N + P),
                          guess + k * (N + P), tolerance[k]};
     method.solve(d, {x + k * N, multipliers + k * P, active + k * (N + P), report + k * 3});
+    const Certificate found = certificate.judge(method.copied(), method.X, method.Z + M, method.LABEL, KKT_TOLERANCE);
+    if (threadIdx.x == 0) report[k * 3] += report[k * 3] && found.holds && (sizeof(Real) == 4 || found.is_exact);
+    if (threadIdx.x == 0) residual[k] = found.residual;
   }
 }
 """
@@ -53,14 +60,13 @@ def _bytes(m: int, n: int, p: int, single: bool) -> int:
 @cache
 def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: int) -> str:
     sizes = _cuda.constants(M=m, N=n, P=p, MAX_CHANGES=max_changes, PER_BLOCK=per_block)
-    kind = f"using Real = {'float' if single else 'double'};\n"
-    return _cuda.text_of("weighted_qp.hpp") + sizes + kind + _KERNEL
+    tolerance = KKT_TOLERANCE[jnp.dtype("float32" if single else "float64")]
+    kind = f"using Real = {'float' if single else 'double'};\nconstexpr Real KKT_TOLERANCE = {tolerance};\n"
+    return _cuda.text_of("qp_certificate.hpp") + sizes + kind + _KERNEL
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
     """Return candidates for a batch from the GPU, in the precision of the data; arguments as for ``_core.solve``."""
-    if _single.fits(qp):
-        return _single.solve(qp, guess, tolerance, max_iterations)
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape
@@ -68,10 +74,10 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     sizes = m, n, p, kind == jnp.float32
     numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.rows, qp.compliance)
     per_block, most = _cuda.problems_of_a_block(batch), n + p
-    outside = -(-batch // per_block), (2 * most + 6) * (most | 1)  # of the dual method, which few problems need
-    x, y, active, report, _ = _cuda.call(
+    outside = -(-batch // per_block), (2 * most + 6) * (most + 7)  # of the dual method, which few problems need
+    x, y, active, report, residual, _ = _cuda.call(
         _source(*sizes, max_iterations, per_block),
-        [*_library.shapes_of(batch, ((n,), (p,)), ((most,), (3,)), kind), (outside, kind)],
+        [*_library.shapes_of(batch, ((n,), (p,)), ((most,), (3,)), kind), ((batch,), kind), (outside, kind)],
         *(a.astype(kind) for a in (*numbers, qp.lower, qp.upper)),
         guess.astype(jnp.int32),
         tolerance.astype(kind),
@@ -79,4 +85,4 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         shared=_bytes(*sizes),
         per_block=per_block,
     )
-    return of_core(x, y, active, report)
+    return of_core(x, y, active, report)._replace(residual=residual)

@@ -1,7 +1,8 @@
-"""Choice of backend for a QP: candidates of a kernel, certified in plain JAX, else the search.
+"""Choice of backend for a QP: candidates of a kernel, certified, else the search.
 
 The certificate is that of the search itself (``violated_conditions``, ``kkt_residual``), on the data as they were
-given, so that answers do not rest on the kernel. It costs two products with the rows. Problems whose candidate fails
+given, so that answers do not rest on the kernel. It costs two products with the rows. On a GPU the kernel checks the
+same conditions at its end (``core/qp_certificate.hpp``), where the rows are at hand. Problems whose candidate fails
 are gathered into blocks, and the search goes on from the candidate's active set.
 """
 
@@ -43,9 +44,15 @@ _BLOCKS, _MIN_BLOCK = 16, 1024
 """Block size of the search on a GPU: a 16th of the batch, at least 1,024 problems."""
 
 
+AsGiven = tuple[QP, Bool[Array, "..."]]
+"""Problems before any was replaced because its numbers are not valid, and which are valid."""
+
+
 @cache
-def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, Array, Array], SearchResult]:
+def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, AsGiven | None, Array, Array], SearchResult]:
     """Return the function that solves one problem, from its data, a guess of the active set and the tolerance.
+
+    The data may be passed as they were given too: a GPU solves these, so that no copy of them has to be made.
 
     Args:
         max_iterations: limit on the changes of the active set.
@@ -54,32 +61,46 @@ def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, Array, Arr
     return in_lanes(partial(_solve_on_platform, max_iterations, backend))
 
 
-def _solve_on_platform(max_iterations: int, backend: Backend, qp: QP, guess: Array, tolerance: Array) -> SearchResult:
-    kernels, kkt_tol = {}, KKT_TOLERANCE[tolerance.dtype]
-    if takes(backend, "core-cuda", fits=_cuda.fits(qp)):
-        kernels["core-cuda"] = cuda_candidates(kkt_tol, max_iterations)
+def _solve_on_platform(
+    max_iterations: int, backend: Backend, qp: QP, as_given: AsGiven | None, guess: Array, tolerance: Array
+) -> SearchResult:
+    kernels = {}
+    if as_given is not None and takes(backend, "core-cuda", fits=_cuda.fits(qp)):
+        kernels["core-cuda"] = cuda_candidates(max_iterations)
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
-        kernels["core"] = core_candidates(kkt_tol, max_iterations)
-    search_all = partial(search, max_iterations=max_iterations)
-    return certified_or_searched(kernels, search_all, qp, guess, tolerance, no_candidates=initial_result)
+        kernels["core"] = core_candidates(KKT_TOLERANCE[tolerance.dtype], max_iterations)
+
+    def search_all(qp: QP, _: AsGiven | None, guess: Array, tolerance: Array) -> SearchResult:
+        return search(qp, guess, tolerance, max_iterations=max_iterations)
+
+    def no_candidates(qp: QP, _: AsGiven | None, guess: Array, tolerance: Array) -> SearchResult:
+        return initial_result(qp, guess, tolerance)
+
+    return certified_or_searched(kernels, search_all, qp, as_given, guess, tolerance, no_candidates=no_candidates)
 
 
-def cuda_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
+def cuda_candidates(max_iterations: int) -> Candidates:
     """Return the function that uses the core on a GPU in the data's precision, and the search for the rest.
 
     Args:
-        kkt_tol: the largest residual that is certified.
         max_iterations: limit on the changes of the active set.
     """
 
-    def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+    def certified(_: QP, as_given: AsGiven, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+        qp, is_valid = as_given
         if tolerance.dtype == jnp.float32:
             tolerance = jnp.maximum(tolerance, SINGLE_TOL)
-        start = jax.vmap(usable_guess)(qp, guess)
-        candidate = _cuda.solve(qp, start, tolerance, max_iterations)
-        return _certified(qp, start, tolerance, candidate, kkt_tol, max_iterations)
+        candidate = _cuda.solve(qp, guess, tolerance, max_iterations)
+        assert candidate.residual is not None
+        residual = jnp.where(is_valid, candidate.residual, 0.0)
+        result = _as_result(qp, candidate, residual, candidate.converged == _cuda.CERTIFIED)
+        return result._replace(done=result.done | ~is_valid)
 
-    def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
+    def search_rest(
+        result: SearchResult, _: QP, as_given: AsGiven, guess: Array, tolerance: Float[Array, " B"]
+    ) -> SearchResult:
+        qp = as_given[0]
+
         def search_block(at: Array, result: SearchResult) -> SearchResult:
             block = jax.tree.map(lambda a: a[at], (qp, result.active, tolerance))
             end = search(*block, max_iterations=max_iterations)
@@ -91,14 +112,21 @@ def cuda_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
 
 
 def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
-    """Return the function that uses the core on a CPU in double precision; arguments as for ``cuda_candidates``."""
+    """Return the function that uses the core on a CPU in double precision, and the search for the rest.
 
-    def certified(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
+    Args:
+        kkt_tol: the largest residual that is certified.
+        max_iterations: limit on the changes of the active set.
+    """
+
+    def certified(qp: QP, _: AsGiven | None, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
         start = jax.vmap(usable_guess)(qp, guess)
         candidate = _core.solve(qp, start, tolerance, max_iterations)
         return _certified(qp, start, tolerance, candidate, kkt_tol, max_iterations)
 
-    def search_rest(result: SearchResult, qp: QP, guess: Array, tolerance: Float[Array, " B"]) -> SearchResult:
+    def search_rest(
+        result: SearchResult, qp: QP, _: AsGiven | None, guess: Array, tolerance: Float[Array, " B"]
+    ) -> SearchResult:
         def search_block(given: tuple[QP | tuple[Array, Array], Array], result: SearchResult) -> SearchResult:
             data, tolerance = given
             like = jax.tree.map(lambda a: a[0], qp)
@@ -117,12 +145,13 @@ def _certified(
     qp: QP, start: Array, tolerance: Float[Array, " B"], candidate: Candidate, kkt_tol: float, max_iterations: int
 ) -> SearchResult:
     """Return candidates with ``done`` set if certified; ``start`` has their initial labels."""
-    result, within_limit = _as_result(qp, candidate), candidate.iterations <= max_iterations
-    is_certified = (candidate.converged != 0) & within_limit & (result.residual <= kkt_tol)
+    residual = jax.vmap(kkt_residual)(qp, candidate.x, candidate.row_multipliers, candidate.active)
+    within_limit = candidate.iterations <= max_iterations
+    result = _as_result(qp, candidate, residual, (candidate.converged != 0) & within_limit & (residual <= kkt_tol))
     conditions = [jax.vmap(_is_certified)(qp, result, tolerance)]
     if tolerance.dtype == jnp.float64:  # in single precision the conditions above are as sharp as roundoff
         conditions.append(jax.vmap(_is_stationary)(qp, result))
-    is_certified &= jnp.concatenate(conditions, 1).all(1)
+    is_certified = result.done & jnp.concatenate(conditions, 1).all(1)
     # the search has the limit too: it may not begin where more changes than that have led
     active = jnp.where(within_limit[:, None], result.active, start)
     return result._replace(done=is_certified, optimal=is_certified, active=active)
@@ -132,8 +161,10 @@ def _block(batch: int) -> int:
     return min(batch, max(_MIN_BLOCK, -(-batch // _BLOCKS)))
 
 
-def _as_result(qp: QP, candidate: Candidate) -> SearchResult:
-    """Return a candidate as an uncertified search result."""
+def _as_result(
+    qp: QP, candidate: Candidate, residual: Float[Array, " B"], is_certified: Bool[Array, " B"]
+) -> SearchResult:
+    """Return candidates as search results."""
     zeros, redundant = jnp.zeros_like(candidate.iterations), candidate.redundant
     return SearchResult(
         x=candidate.x,
@@ -142,13 +173,13 @@ def _as_result(qp: QP, candidate: Candidate) -> SearchResult:
         redundant=jnp.zeros(candidate.active.shape, bool) if redundant is None else redundant,
         iterations=candidate.iterations,
         factorizations=candidate.factorizations,
-        done=zeros.astype(bool),
-        optimal=zeros.astype(bool),
+        done=is_certified,
+        optimal=is_certified,
         infeasible_ends=zeros,
         used_newton=zeros.astype(bool),
         infeasible=zeros.astype(bool),
         compliance=qp.compliance,
-        residual=jax.vmap(kkt_residual)(qp, candidate.x, candidate.row_multipliers, candidate.active),
+        residual=residual,
     )
 
 

@@ -186,15 +186,17 @@ def _solve(
     # bounds with lower > upper become equalities halfway; the status says so
     low, high, unordered = ordered_bounds(qp.lower, _upper(qp))
     # NaN and negative weights are replaced before the first operation, so that derivatives stay finite
-    safe, is_valid = _with_placeholder(replace(qp, lower=low, upper=high))
+    given = replace(qp, lower=low, upper=high)
+    safe, is_valid = _with_placeholder(given)
     start = jnp.zeros(m, jnp.int32) if guess is None else jnp.asarray(guess)
     limit = 20 * m if max_iterations is None else max_iterations
     solve = qp_solver(limit, check_backend(backend))
     # the search is not differentiated: its answer is, at the active set that was found
-    result = _rules.found(solve(*jax.lax.stop_gradient((safe, start, tolerance))))
+    as_given = None if cpu_is_default() else (given, is_valid)
+    result = _rules.found(solve(*jax.lax.stop_gradient((safe, as_given, start, tolerance))))
     x, y, is_finite = _differentiable(safe, result, is_valid, backend)
     # at the end x is inside the box that was given, to the last bit
-    box = (jnp.where(is_valid, b, given)[:n] for b, given in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
+    box = (jnp.where(is_valid, b, own)[:n] for b, own in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
     x = clip_roundoff(x, *box)
     # multipliers of the box from stationarity: grad cost - C'y at active variables, 0 at free ones
     gradient = jnp.where(is_finite, safe.cost.gradient(x), 0.0) - apply(safe.rows.T, y)

@@ -1,0 +1,148 @@
+// Checks whether a candidate solves its weighted QP: the C++ version of the certificate in solvers/qp/_dispatch.py
+// (_is_certified, _is_stationary, kkt_residual). A CPU judges by the data alone; a GPU by the rows that the search has
+// copied, with their weights multiplied in.
+#pragma once
+#include "lanes.hpp"
+#include "weighted_qp.hpp"
+
+namespace osik {
+
+struct Certificate {
+  bool holds;
+  double residual;       // of the optimality conditions, without units
+  bool is_exact = true;  // whether the gradient is roundoff where it has to be 0, which no search needs to reach
+};
+
+template <class Team> class QPCertificate {
+  using Real = typename Team::Real;
+  using Int = typename Team::Int;
+  using Method = WeightedQP<Team>;
+  using Gathered = GatheredBy<Team>;
+  template <int K> using Numbers = typename Method::template Numbers<K>;
+  static constexpr Real EPS = Method::EPS, REDUNDANT_TOL = DualActiveSet<Team>::REDUNDANT_BELOW;
+  Team t;
+  typename Method::template Size<0> m;
+  typename Method::template Size<1> n;
+  typename Method::template Size<2> p;
+  typename Method::template Size<Team::SPARES_SPACE ? 5 : 1> ld;  // of rows that a GPU has copied, or as given
+  Real scaled, plain, tolerance;  // sizes of x: per root of a curvature, and per unit
+  // in the workspace of a search that is over
+  Numbers<8> SIZE;                // [n]
+  Numbers<9> GRADIENT;            // [n], and the sizes of its terms:
+  Numbers<10> SCALE;              // [n] of the cost
+  Numbers<11> ROW_TERMS;          // [n] of the rows
+  Numbers<12> ROOT;               // [n] of the curvature of the cost
+  Numbers<13> INVERSE_ROOT;       // [n]
+  Numbers<14> ONES;               // [n]
+  Numbers<15> FORCE;              // [m] pulls of the rows
+  Numbers<16> TERMS;              // [m] the sizes of their terms
+
+ public:
+  OSIK_FN QPCertificate(const QPSizes& s, char* space) : m(s), n(s), p(s), ld(s) {
+    auto place = [&](auto&... arrays) { (arrays.place(space, s), ...); };
+    place(SIZE, GRADIENT, SCALE, ROW_TERMS, ROOT, INVERSE_ROOT, ONES, FORCE, TERMS);
+  }
+
+  // x: [n], y: [p] multipliers of the rows, active: [n + p] labels; residuals up to kkt_tol are certified
+  template <class Data>
+  OSIK_METHOD Certificate judge(const Data& d, const Real* x, const Real* y, const Int* active, Real kkt_tol) {
+    t.are_shared(x, y, active);
+    tolerance = d.tolerance;
+    add_terms(d, x);
+    measure();
+    each_entry(t, n, [&](auto e) {
+      auto gradient = e(GRADIENT), terms = decltype(gradient)(0);
+      for (int q = 0; q < p; ++q) {
+        const auto force = e(d.rows + q * ld) * y[q];
+        gradient -= force, terms += fabs(force);
+      }
+      e.put(gradient, GRADIENT), e.put(terms, ROW_TERMS);
+    });
+    bool holds = true, exact = true;
+    Gathered dual, primal, terms;
+    each_entry(t, n, [&](auto e) {
+      const auto multiplier = e(GRADIENT), at = e(x), free = fabs(multiplier);
+      const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier,
+                               Real(ROW_MULTIPLIER) * e(ROW_TERMS));
+      const auto size = e(SCALE) + e(ROW_TERMS), beyond = select(found.inactive, free, found.sign);
+      holds &= !any(!(found.holds & ((free <= Real(VALUE_TOL) * tolerance * found.force) | !found.inactive)));
+      exact &= !any(!(e.are(active, EQUALITY) | (beyond <= Real(GRADIENT_TOL) * EPS * size)));
+      terms.most(size), dual.most(select(found.one_side | found.inactive, beyond, decltype(at)(0)));
+    });
+    t.each(0, p, [&](int q) {
+      const Real* row = d.rows + q * ld;
+      const Real value = sums(row, x, n).value, curved = sums(row, INVERSE_ROOT, n).size, length = sums(row, ONES, n).size;
+      const auto found = check(EntryOf<Team>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q], curved,
+                               length, y[q], Real(0));
+      holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
+      Real longest = 0;
+      for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) longest = larger(longest, Real(fabs(row[j])));
+      dual.most(found.one_side ? found.sign * longest : Real(0));
+      primal.most(larger(larger(found.gap, Real(0)), y[q] != 0 ? found.off : Real(0)) / (found.scale > 0 ? found.scale : Real(1)));
+    });
+    const Real total = terms.largest(), residual = larger(dual.largest() / (total > 0 ? total : Real(1)), primal.largest());
+    return {t.all(holds) && residual <= kkt_tol, residual, t.all(exact)};
+  }
+
+ private:
+  OSIK_FN RowSums<Real> sums(const Real* row, const Real* x, int n) const { return row_sums(t, row, x, n); }
+  // the cost's gradient at x, the sizes of its terms, and roots of its curvatures
+  template <class Data> OSIK_METHOD void add_terms(const Data& d, const Real* x) {
+    t.are_shared(x);
+    each_entry(t, n, [&](auto e) { e.put(fabs(e(x)), SIZE); });
+    t.each(0, m, [&](int i) {
+      const RowSums<Real> found = sums(d.matrix + i * ld, x, n);
+      FORCE[i] = d.weight[i] * (found.value - d.target[i]), TERMS[i] = d.weight[i] * (found.size + fabs(d.target[i]));
+    });
+    t.each(n, Team::padded(n), [&](int j) { INVERSE_ROOT[j] = ONES[j] = 0; });
+    each_entry(t, n, [&](auto e) {
+      const auto damping = e(d.damping), center = e(d.center), one = decltype(damping)(1);
+      auto gradient = damping * (e(x) - center), scale = damping * (e(SIZE) + fabs(center)), curvature = damping;
+OSIK_UNROLL_4
+      for (int i = 0; i < m; ++i) {
+        const auto entry = e(d.matrix + i * ld);
+        gradient += entry * FORCE[i], scale += fabs(entry) * TERMS[i], curvature += d.weight[i] * (entry * entry);
+      }
+      const auto root = sqrt(select(curvature > Real(0), curvature, one));
+      e.put(gradient, GRADIENT), e.put(scale, SCALE), e.put(root, ROOT), e.put(one / root, INVERSE_ROOT), e.put(one, ONES);
+    });
+  }
+  // the sizes of x, or those of its Newton step by the curvatures alone where x is roundoff beside it
+  OSIK_METHOD void measure() {
+    Gathered rooted, size, rooted_newton, newton;
+    each_entry(t, n, [&](auto e) {
+      const auto step = fabs(e(GRADIENT)) * e(INVERSE_ROOT) * e(INVERSE_ROOT);
+      rooted.most(e(SIZE) * e(ROOT)), size.most(e(SIZE)), rooted_newton.most(step * e(ROOT)), newton.most(step);
+    });
+    const Real most = rooted.largest(), most_newton = rooted_newton.largest();
+    const bool is_roundoff = most <= Real(ZERO_TOL) * EPS * most_newton;
+    scaled = is_roundoff ? most_newton : most, plain = is_roundoff ? newton.largest() : size.largest();
+  }
+  template <class Number> struct Checked {
+    using Which = decltype(Number() < Number());
+    Which holds, one_side, inactive;
+    Number force, sign, off, gap, scale;  // sign: the multiplier, if positive in the wrong direction; off: from its bound
+  };
+  // What all constraints have to be, and what is asked of their multipliers.
+  template <class E, class Number>
+  OSIK_FN Checked<Number> check(E e, const Real* lower, const Real* upper, const Int* active, Number value, Number compliant,
+                                Number per_curvature, Number per_unit, Number multiplier, Number force_of_rows) const {
+    using Which = typename Checked<Number>::Which;
+    const Which at_lower = e.are(active, AT_LOWER), at_upper = e.are(active, AT_UPPER), redundant = e.are(active, REDUNDANT);
+    const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper, inactive = e.are(active, INACTIVE) | redundant;
+    const Number low = e(lower), high = e(upper), from = fabs(low), to = fabs(high), nearest = select(from < to, from, to), zero = 0;
+    const Number scaled_reach = scaled * per_curvature, reach = plain * per_unit;
+    const Number scale = select(scaled_reach < reach, scaled_reach, reach) + fabs(value) + select(nearest < Real(INFINITE), nearest, zero);
+    const Number curved = select(per_curvature < SMALLEST, Number(SMALLEST), per_curvature);
+    const Number force = scale / (curved * curved) + force_of_rows, sign = select(at_lower, -multiplier, multiplier);
+    const Number off = select(inactive, zero, fabs(compliant - select(at_upper, high, low)));
+    const Number below = low - compliant, above = compliant - high, gap = select(above > below, above, below);
+    const Number near = Real(VALUE_TOL) * tolerance * scale;
+    const Which labelled = one_side | (equality & (low == high)) | (inactive & ((low != high) | redundant));
+    const Which holds = labelled & (off <= near) & !(gap > select(redundant, REDUNDANT_TOL * near, near)) &
+                        ((sign <= Real(SIGN_TOL) * tolerance * force) | !one_side);
+    return {holds, one_side, inactive, force, sign, off, gap, scale};
+  }
+  static constexpr Real SMALLEST = sizeof(Real) == 8 ? 2.2250738585072014e-308 : 1.17549435e-38;
+};
+}  // namespace osik

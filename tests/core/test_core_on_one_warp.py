@@ -1,0 +1,72 @@
+"""The GPU's text of the weighted QP, on a CPU: answers, certificates, and what bad numbers in one problem do to others.
+
+Shared memory holds NaN before each problem.
+"""
+
+import jax
+import numpy as np
+import one_warp
+import pytest
+from core_checks import needs_core
+from problem_families import WHOLE_BODY_DAMPING, whole_body
+from weighted_families import soft_problems
+
+from osik_jax.solvers import solve_least_squares_qp
+from osik_jax.solvers.qp._cuda import CERTIFIED
+
+pytestmark = needs_core
+TOLERANCE = {np.float32: 1e-7, np.float64: 1e-12}
+
+
+def answers(A, b, weight, lower, upper, rows, low, high, compliance, damping, center):
+    def solve(A, b, weight, lower, upper, rows, low, high, compliance, damping, center):
+        options = dict(rows_compliance=compliance, damping=damping, center=center, backend="jax")
+        return solve_least_squares_qp(A, b, weight, lower, upper, rows, low, high, **options)
+
+    return jax.jit(jax.vmap(solve))(A, b, weight, lower, upper, rows, low, high, compliance, damping, center)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+@pytest.mark.parametrize("shape", [(3, 0, 2), (12, 20, 5), (33, 40, 3), (48, 30, 32), (64, 50, 4), (70, 9, 1)])
+def test_the_answers_are_those_of_the_search(shape, kind, tmp_path, rng):
+    data = soft_problems(rng, 4, *shape)
+    A, b, weight, lower, upper, rows, low, high, compliance, damping, center = data
+    bounds = np.concatenate([lower, low], 1), np.concatenate([upper, high], 1)
+    given = A, b, weight, damping, center, rows, compliance, *bounds
+    found = one_warp.solve(tmp_path, given, np.zeros(bounds[0].shape, int), TOLERANCE[kind], kind)
+    expected = answers(*data)
+    assert (found.report[:, 0] == CERTIFIED).all()
+    near = 3e-6 if kind == np.float32 else 1e-10
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=near)
+    np.testing.assert_allclose(found.multipliers, expected.row_multipliers, rtol=0, atol=10 * near)
+    np.testing.assert_array_equal(found.active, expected.active)
+    again = one_warp.solve(tmp_path, given, found.active, TOLERANCE[kind], kind)
+    assert (again.report[:, 1:] == (0, 1)).all() and (again.report[:, 0] == CERTIFIED).all()
+
+
+def family(rng, count):
+    p = whole_body(rng, count)
+    none = np.zeros((count, 0, p.A.shape[2]))
+    damping = np.full(p.lower.shape, WHOLE_BODY_DAMPING)
+    return p.A, p.b, p.weight, damping, 0 * damping, none, none[..., 0], p.lower, p.upper
+
+
+def test_most_of_a_hard_family_is_certified_in_single_precision(tmp_path, rng):
+    """Weights of six decades and factors that lose most digits, so that corrections are slow."""
+    given = family(rng, 100)
+    found = one_warp.solve(tmp_path, given, np.zeros(given[-1].shape, int), 1e-7, np.float32)
+    assert (found.report[:, 0] == CERTIFIED).mean() > 0.9
+
+
+def test_a_bad_problem_is_not_certified_and_disturbs_no_other(tmp_path, rng):
+    given = family(rng, 12)
+    guess = np.zeros(given[-1].shape, int)
+    good = one_warp.solve(tmp_path, given, guess, 1e-7, np.float32)
+    A, b, weight, damping, center, rows, compliance, lower, upper = (a.copy() for a in given)
+    A[0, 2, 1], b[1, 2], weight[2, 1], damping[3, 0], A[4, 0, 0] = np.nan, np.nan, -1.0, np.nan, np.inf
+    bad = one_warp.solve(
+        tmp_path, (A, b, weight, damping, center, rows, compliance, lower, upper), guess, 1e-7, np.float32
+    )
+    assert (bad.report[:5, 0] != CERTIFIED).all()
+    for one, other in zip(good, bad, strict=True):
+        np.testing.assert_array_equal(one[5:], other[5:])
