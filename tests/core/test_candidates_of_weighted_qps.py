@@ -177,6 +177,19 @@ def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
     assert (end.factorizations[spoiled] == 2).all()  # the kernel's, and one from the active set that it left
 
 
+def test_what_is_not_valid_is_not_searched(batch, monkeypatch):
+    is_valid = jnp.arange(len(batch.guess)) != 3
+    right = candidate_of(batch.answers)
+    spoiled = [jnp.where(is_valid[:, None], a, jnp.nan) for a in (right.x, right.row_multipliers)]
+    converged = jnp.where(is_valid, right.converged, 1)
+    candidate = right._replace(x=spoiled[0], row_multipliers=spoiled[1], converged=converged)
+    monkeypatch.setattr(_cuda, "solve", lambda *_: candidate)
+    end = _dispatch.cuda_candidates(CAP).certified(batch.qp, (batch.qp, is_valid), batch.guess, batch.tolerance)
+    assert end.done.all() and not end.optimal[3]
+    assert (end.x[3] == 0.0).all() and (end.row_multipliers[3] == 0.0).all()
+    np.testing.assert_array_equal(end.x[is_valid], batch.answers.x[is_valid])
+
+
 def test_too_many_changes_are_not_taken(batch):
     candidate = candidate_of(batch.answers)._replace(iterations=jnp.full_like(batch.answers.iterations, CAP + 1))
     end, taken = completed(batch, candidate)

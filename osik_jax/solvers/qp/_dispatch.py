@@ -92,8 +92,11 @@ def cuda_candidates(max_iterations: int) -> Candidates:
             tolerance = jnp.maximum(tolerance, SINGLE_TOL)
         candidate = _cuda.solve(qp, guess, tolerance, max_iterations)
         assert candidate.residual is not None
-        residual = jnp.where(is_valid, candidate.residual, 0.0)
-        result = _as_result(qp, candidate, residual, candidate.converged == _cuda.CERTIFIED)
+        # nothing to search where numbers are not valid, and finite numbers for derivatives
+        numbers = candidate.x, candidate.row_multipliers, candidate.residual[:, None]
+        x, y, residual = (jnp.where(is_valid[:, None], a, 0.0) for a in numbers)
+        candidate = candidate._replace(x=x, row_multipliers=y)
+        result = _as_result(qp, candidate, residual[:, 0], candidate.converged == _cuda.CERTIFIED)
         return result._replace(done=result.done | ~is_valid)
 
     def search_rest(
