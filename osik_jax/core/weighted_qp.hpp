@@ -49,7 +49,7 @@ template <class Team> struct WeightedQP {
   using Answer = QPAnswer<Real>;
   static constexpr Real EPS = sizeof(Real) == 8 ? EPSILON : 1.1920929e-07;
   static constexpr bool IS_SINGLE = sizeof(Real) == 4;
-  static constexpr Real VIOLATION = sizeof(Real) == 8 ? 1 : VIOLATION_TOL;
+  static constexpr Real VIOLATION = IS_SINGLE ? VIOLATION_TOL : 1, RELEASE = IS_SINGLE ? SINGLE_BOUND_MULTIPLIER : BOUND_MULTIPLIER;
   static constexpr int VECTORS = Team::SPARES_SPACE ? 19 : 21, INTEGERS = 4;
   Team t;
   int max_changes, used, changes, factorizations;  // used: rows in the system of the active set
@@ -218,12 +218,13 @@ OSIK_UNROLL_4
       c.store(GRADIENT, total);
     });
   }
-  // Whether a correction is the last: the next one would be far below roundoff if they shrink alike, or it shrinks no more.
-  // `before`: the size of the one before it.
+  // Whether a correction is the last: the next one would be far below roundoff if they shrink alike, or it is small and
+  // shrinks no more. `before`: the size of the one before it.
   OSIK_FN bool is_last(Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
     const bool is_roundoff = moved * moved <= CORRECTION * far * before;
-    const bool last = before < Real(INFINITE) && (is_roundoff || moved > Real(MIN_DECREASE) * before);
+    const bool stalls = moved > Real(MIN_DECREASE) * before && moved <= Real(SMALL_CORRECTION) * far;
+    const bool last = before < Real(INFINITE) && (is_roundoff || stalls);
     before = moved;
     return last;
   }
@@ -379,7 +380,7 @@ OSIK_UNROLL_4
       for (int i = 0; i < k; ++i) size.fma(TERMS[i], c.load(B + i * ld).size());
       c.store(SOLVED, size);
     });
-    t.each(0, n, [&](int j) { MULTIPLIER_ROUNDOFF[j] = Real(BOUND_MULTIPLIER) * EPS * SOLVED[j]; });
+    t.each(0, n, [&](int j) { MULTIPLIER_ROUNDOFF[j] = RELEASE * EPS * SOLVED[j]; });
   }
 
   // ---- labels

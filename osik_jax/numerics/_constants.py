@@ -201,14 +201,16 @@ KERNEL_CORRECTION = 1e-20
 ``LAST_CORRECTION``. With weak dampings the correction itself is up to 10^4 times larger: the prediction assumes that
 corrections shrink alike, and the first one is small by chance in a few problems of 10,000.
 """
-MIN_DECREASE = 0.25
-"""Ratio of two corrections above which the second one was roundoff."""
+MIN_DECREASE, SMALL_CORRECTION = 0.25, 1e-3
+"""Ratio of two corrections above which the second one was roundoff, if it was also below that part of the answer. A
+larger one follows where the first was small by chance, or where weak directions shrink slowly.
+"""
 KERNEL_PIVOT = 1e2
 """Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""
-BOUND_MULTIPLIER = 1.0
+BOUND_MULTIPLIER = {jnp.dtype("float64"): 1.0, jnp.dtype("float32"): 0.03}
 """Multiplier of the wrong sign in units of machine epsilon times the gradient's terms, above which a variable leaves
 its bound. A tolerance relative to the cost's curvature would be too large: a weak task such as a posture pulls with
-less.
+less. In single precision the sum of all terms would be too, as their roundoff mostly cancels.
 """
 VIOLATION_TOL = 10.0
 """Violation in units of roundoff, in single precision, below which a bound holds."""
