@@ -229,7 +229,6 @@ OSIK_UNROLL_4
     return last;
   }
   static constexpr Real CORRECTION = sizeof(Real) == 8 ? KERNEL_CORRECTION : SINGLE_CORRECTION;
-  static constexpr int REFINEMENTS = sizeof(Real) == 8 ? KERNEL_REFINEMENTS : SINGLE_REFINEMENTS;
 
   // ---- the minimiser on the active set; returns whether the factors are regular
   OSIK_METHOD bool solve_on_active_set() {
@@ -257,7 +256,7 @@ OSIK_UNROLL_4
     if (!Algebra::inverse_factor(t, S, M, PIVOT, DIAGONAL, lq, used, Real(KERNEL_PIVOT) * EPS)) return false;
     t.each(0, n, [&](int j) { GRADIENT[j] = 0; });
     Real before = INFINITE;
-    for (int round = 0; round < REFINEMENTS; ++round) {
+    for (int round = 0; round < KERNEL_REFINEMENTS; ++round) {
       Algebra::apply_inverse(t, M, PIVOT, RIGHT, SOLVED, lq, used);
       t.each(0, used, [&](int a) { Z[USED[a]] += RIGHT[a]; });
       t.columns(0, n, [&](auto c) {
@@ -323,7 +322,7 @@ OSIK_UNROLL_4
     t.each(m, k, [&](int i) { Z[i] = 0; });
     Real before = INFINITE;
     find_gradient();
-    for (int round = 0; round < REFINEMENTS; ++round) {
+    for (int round = 0; round < KERNEL_REFINEMENTS; ++round) {
       t.each(0, n, [&](int j) { RIGHT[j] = LABEL[j] == INACTIVE ? -GRADIENT[j] : Real(0); });
       t.each(0, n, [&](int i) { SOLVED[i] = PIVOT[i] * t.own_dot_on(M + i * lq, RIGHT, 0, i + 1); });
       t.each(0, rows, [&](int a) { SMALL[a] = GAP[USED[m + a]] - t.own_dot_on(V + a * ld, SOLVED, 0, n); });

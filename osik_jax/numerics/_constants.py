@@ -194,7 +194,7 @@ GRADIENT_STEPS = 100
 
 # ---- weighted QPs in kernels: double precision is the core's, single precision CUDA's
 
-KERNEL_REFINEMENTS = {jnp.dtype("float64"): 10, jnp.dtype("float32"): 6}
+KERNEL_REFINEMENTS = 10
 """Largest number of corrections."""
 KERNEL_CORRECTION = 1e-20
 """Predicted next correction of a kernel, relative to the answer, below which none follows; in single precision it is

@@ -17,7 +17,6 @@ def test_constants_are_those_of_python():
     found = {name: float(value) for name, value in re.findall(r"([A-Z_0-9]+) = ([-+.0-9e]+)[,;]", text)}
     assert len(found) > 8
     single = dict(
-        SINGLE_REFINEMENTS="KERNEL_REFINEMENTS",
         SINGLE_CORRECTION="LAST_CORRECTION",
         SINGLE_RIDGE="KKT_RIDGE",
         SINGLE_BOUND_MULTIPLIER="BOUND_MULTIPLIER",
