@@ -84,16 +84,16 @@ template <class Call> struct Center {
   Center(const Call& call, int nv)
       : bodies(call.size(0, 1)), dofs(call.size(2, 1)), nv(nv), integers{call.integers(6)}, parents(integers.take(bodies)),
         owner(integers.take(dofs)), column(integers.take(dofs)), space(call.space()) {}
-  template <class Out> void find(const Call& call, int lane, Out point, Out J) {
+  template <class Out> CenterColumns<In, In> find(const Call& call, int lane, Out point) {
     Reader<In> numbers{call.in(5, lane)};
     const DofColumns<In> columns{dofs, nv, column, numbers.take(dofs)};
     const In mass = numbers.take(bodies), center = numbers.take(3 * bodies);
-    move_center(columns, placed(call, lane), bodies, parents, owner, mass, center, space.data(), point, J);
+    return find_center(columns, placed(call, lane), bodies, parents, owner, mass, center, space.data(), point);
   }
 };
 template <class Call> void move_centers(const Call& call) {
   Center<Call> center(call, call.result_size(1, 2));
-  call.each_lane([&](int lane) { center.find(call, lane, call.out(0, lane), call.out(1, lane)); });
+  call.each_lane([&](int lane) { add_columns(center.find(call, lane, call.out(0, lane)), call.out(1, lane)); });
 }
 
 // Results of rows of tasks: error, rows, wanted velocity, curvature, pull, levers, squared lengths of the rows.
@@ -108,14 +108,14 @@ template <class Call> void find_center_rows(const Call& call) {
   const int m = call.result_size(1, 1), nv = call.result_size(1, 2);
   Center<Call> center(call, nv);
   const int *axes = center.integers.take(m), *turning = center.integers.take(nv);
-  typename Call::Real* const J = center.space.data() + 4 * center.bodies;
   call.each_lane([&](int lane) {
     typename Call::Real point[3];
-    center.find(call, lane, point + 0, J);
+    const auto columns = center.find(call, lane, point + 0);
     Reader<In> numbers{call.in(7, lane)};
     CenterGoal<In> goal{m, axes, turning};
     goal.target = numbers.take(m), goal.velocity = numbers.take(m), goal.weight = numbers.take(m), goal.gain = numbers.at;
-    center_rows(goal, point + 0, J, nv, rows_of(call, lane));
+    with_columns(columns, center.space.data() + 4 * center.bodies,
+                 [&](auto columns) { center_rows(goal, point + 0, columns, nv, rows_of(call, lane)); });
   });
 }
 

@@ -133,29 +133,57 @@ void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, I
   }
 }
 
-// The centre of mass and its Jacobian J [3, nv]: the mass that each dof moves, at its centre, over the whole mass.
+// The columns of the Jacobian of the centre of mass: the mass that each full dof moves, at its centre, over the whole mass.
+template <class In, class From> struct CenterColumns {
+  using Real = NumberAt<From>;
+  using V = Vec3<Real>;
+  Placed<From> placed;
+  DofColumns<In> of;
+  const int* owner;   // [dofs] body of each full dof
+  const Real* below;  // [bodies, 4] mass, and mass times position, of a body with all that hangs from it
+  V operator[](int dof) const {
+    const Real* carried = below + 4 * owner[dof];
+    const V arm = V::of(carried + 1) - carried[0] * V::of(placed.anchor + 3 * dof);
+    const Real factor = of.factor[dof] / below[0];
+    return factor * (carried[0] * V::of(placed.linear + 3 * dof) + cross(V::of(placed.angular + 3 * dof), arm));
+  }
+};
+template <class At> struct StoredCenterColumns {
+  At J;  // [3, nv]
+  int nv;
+  Vec3<NumberAt<At>> operator[](int j) const { return {J[j], J[nv + j], J[2 * nv + j]}; }
+};
+
+// The centre of mass, and the columns of its Jacobian.
 // mass: [bodies], center: [bodies, 3] in the body; owner: [dofs] body of each full dof; below: [bodies, 4] space
 template <class In, class From, class Mass, class Out>
-void move_center(const DofColumns<In>& d, const Placed<From>& placed, int bodies, const int* parents, const int* owner,
-                 Mass mass, In center, NumberAt<Out>* below, Out point, Out J) {
-  using Real = NumberAt<Out>;
+CenterColumns<In, From> find_center(const DofColumns<In>& d, const Placed<From>& placed, int bodies, const int* parents,
+                                    const int* owner, Mass mass, In center, NumberAt<From>* below, Out point) {
+  using Real = NumberAt<From>;
   using V = Vec3<Real>;
   for (int body = 0; body < bodies; ++body) {
     const V at = V::of(placed.position + 3 * body) + Mat3<Real>::of(placed.rotation + 9 * body) * V::of(center + 3 * body);
     below[4 * body] = mass[body], (mass[body] * at).put(below + 4 * body + 1);
   }
-  for (int body = bodies - 1; body > 0; --body)  // with all that hangs from each body
+  for (int body = bodies - 1; body > 0; --body)
     for (int i = 0; i < 4; ++i) below[4 * parents[body] + i] += below[4 * body + i];
   for (int i = 0; i < 3; ++i) point[i] = below[1 + i] / below[0];
+  return {placed, d, owner, below};
+}
+// The Jacobian J [3, nv] of the centre of mass.
+template <class In, class From, class Out> void add_columns(const CenterColumns<In, From>& columns, Out J) {
+  const DofColumns<In>& d = columns.of;
   for (int e = 0; e < 3 * d.nv; ++e) J[e] = 0;
   for (int dof = 0; dof < d.dofs; ++dof) {
     const int column = d.column[dof];
     if (column < 0) continue;
-    const Real* carried = below + 4 * owner[dof];
-    const V arm = V::of(carried + 1) - carried[0] * V::of(placed.anchor + 3 * dof);
-    const V speed = carried[0] * V::of(placed.linear + 3 * dof) + cross(V::of(placed.angular + 3 * dof), arm);
-    const Real factor = d.factor[dof] / below[0];
-    J[column] += factor * speed.x, J[d.nv + column] += factor * speed.y, J[2 * d.nv + column] += factor * speed.z;
+    const auto [x, y, z] = columns[dof];
+    J[column] += x, J[d.nv + column] += y, J[2 * d.nv + column] += z;
   }
+}
+// f(the columns of the joint velocity): as they are, where each dof has one of its own, else from J, a space [3, nv].
+template <class In, class From, class F> void with_columns(const CenterColumns<In, From>& columns, NumberAt<From>* J, F f) {
+  if (columns.of.dofs == columns.of.nv) return f(columns);
+  add_columns(columns, J), f(StoredCenterColumns<const NumberAt<From>*>{J, columns.of.nv});
 }
 }  // namespace osik

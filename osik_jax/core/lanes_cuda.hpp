@@ -30,7 +30,10 @@ template <class R, class Sizes> struct ThreadCall {
   const void* const* arguments;
   void* const* results;
   int lanes;
-  Space space() const { return Space(); }
+  Space space() const {
+    Space of_lane;
+    return of_lane;
+  }
   int size(int k, int axis) const { return Sizes::argument(k, axis); }
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
   const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }

@@ -179,10 +179,10 @@ template <class Real> class MovingRows {
     for (int i = 0; i < m; ++i) weights[i] = leaf(task.leaves[1])[i];
     const In mass = robot(StepLayout::MASS);
     for (int b = 0; b < s.bodies; ++b) masses[b] = options[1 + m + b] ? Real(mass[b]) : Real(0);
-    Real *point = frames.data(), *J = point + 3;
-    move_center(columns, placed, s.bodies, layout.parents, layout.owner, masses.data(), robot(StepLayout::CENTER_OF_MASS),
-                below.data(), point, J);
-    center_rows(goal, point, J, s.nv, to);
+    Real* point = frames.data();
+    const auto center = find_center(columns, placed, s.bodies, layout.parents, layout.owner, masses.data(),
+                                    robot(StepLayout::CENTER_OF_MASS), below.data(), point);
+    with_columns(center, point + 3, [&](auto columns) { center_rows(goal, point, columns, s.nv, to); });
   }
   // the first frame's pose and Jacobian in the axes of the second (tasks/_relative_frame.py)
   void see_from_root(Real* position, Real* rotation, Real* jacobian) {

@@ -148,23 +148,24 @@ template <class In, class Own = In> struct CenterGoal {
   Bounds<In> bounds = {};
 };
 
-// Rows of a task on the centre of mass `point` [3] with Jacobian J [3, nv].
-template <class In, class Own, class From, class Out>
-void center_rows(const CenterGoal<In, Own>& goal, From point, From J, int nv, const Rows<Out>& to) {
+// Rows of a task on the centre of mass `point` [3], whose Jacobian has these columns.
+template <class In, class Own, class From, class Columns, class Out>
+void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& columns, int nv, const Rows<Out>& to) {
   using Real = NumberAt<Out>;
   auto along = [&](int i, Real x, Real y, Real z) {
     if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
     return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
   };
-  Real turning = 0, largest = 0, square = 0;
+  Real turning = 0, largest = 0, square = 0, xx = 0, xy = 0, yy = 0, zz = 0;
   for (int j = 0; j < nv; ++j) {
-    const Real x = J[j], y = J[nv + j], z = J[2 * nv + j];
+    const auto [x, y, z] = columns[j];
     Real lever = 0;
     for (int i = 0; i < goal.m; ++i) {
       const Real entry = along(i, x, y, z);
       to.jacobian[i * nv + j] = entry, lever += goal.weight[i] * entry * entry;
     }
     to.levers[j] = sqrt(lever), turning += goal.turning[j] ? x * x + y * y + z * z : Real(0);
+    xx += x * x, xy += x * y, yy += y * y, zz += z * z;
   }
   for (int i = 0; i < goal.m; ++i) {
     const Real value = along(i, point[0], point[1], point[2]);
@@ -172,12 +173,9 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, From J, int nv, co
         goal.gain[0]);
     const Real pull = fabs(goal.weight[i] * to.pull[i]);
     largest = select((pull > largest) | (pull != pull), pull, largest);
-    Real length = 0;
-    for (int j = 0; j < nv && to.squares; ++j) {
-      const Real entry = along(i, J[j], J[nv + j], J[2 * nv + j]);
-      length += entry * entry;
-    }
-    if (to.squares) to.squares[i] = length;
+    if (!to.squares) continue;
+    const Real length = goal.normals ? along(i, along(i, xx, xy, Real(0)), along(i, xy, yy, Real(0)), Real(0)) : along(i, xx, yy, zz);
+    to.squares[i] = select(length < Real(0), Real(0), length);  // which roundoff may make it
   }
   // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
   const Real unit = select(largest > Real(0), Real(1) / largest, Real(0));

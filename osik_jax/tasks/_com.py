@@ -182,7 +182,8 @@ def _fields_by_kernel(call: Call, task: ComTask, robot: Robot, kinematics: Kinem
     weight = jnp.broadcast_to(weight, (len(weight), len(task.axes)))
     numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
     options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
-    space = 4 * len(robot.tree.body_parents) + 3 * robot.tree.nv
+    tree = robot.tree
+    space = 4 * len(tree.body_parents) + (0 if len(tree.dof_body) == tree.nv else 3 * tree.nv)
     return fields_by_core(partial(call, space=space), "center_rows", robot.tree.nv, weight, *given, options, numbers)
 
 
