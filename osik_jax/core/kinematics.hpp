@@ -161,12 +161,15 @@ CenterColumns<In, From> find_center(const DofColumns<In>& d, const Placed<From>&
                                     const int* owner, Mass mass, In center, NumberAt<From>* below, Out point) {
   using Real = NumberAt<From>;
   using V = Vec3<Real>;
+OSIK_UNROLL_4
   for (int body = 0; body < bodies; ++body) {
     const V at = V::of(placed.position + 3 * body) + Mat3<Real>::of(placed.rotation + 9 * body) * V::of(center + 3 * body);
     below[4 * body] = mass[body], (mass[body] * at).put(below + 4 * body + 1);
   }
   for (int body = bodies - 1; body > 0; --body)
+OSIK_UNROLL_4
     for (int i = 0; i < 4; ++i) below[4 * parents[body] + i] += below[4 * body + i];
+OSIK_UNROLL_4
   for (int i = 0; i < 3; ++i) point[i] = below[1 + i] / below[0];
   return {placed, d, owner, below};
 }

@@ -7,7 +7,8 @@
 
 namespace osik {
 
-// The numbers of one lane, `step` apart.
+// The numbers of one lane, `step` apart. Constant ones are arguments, which no thread writes: they may be read before
+// results that stand earlier in the text are written.
 template <class T> struct Strided {
   using Number = T;
   T* at = nullptr;
@@ -17,11 +18,20 @@ template <class T> struct Strided {
   Strided& operator+=(int i) { return at += size_t(i) * step, *this; }
   explicit operator bool() const { return at; }
 };
+template <class T> struct Strided<const T> {
+  using Number = T;
+  const T* at = nullptr;
+  int step = 1;
+  T operator[](int i) const { return __ldg(at + size_t(i) * step); }
+  Strided operator+(int i) const { return {at + size_t(i) * step, step}; }
+  Strided& operator+=(int i) { return at += size_t(i) * step, *this; }
+  explicit operator bool() const { return at; }
+};
 
 // Given: the sizes of arguments and results as functions, whether an argument is shared, and the numbers of `Space`.
 template <class R, class Sizes> struct ThreadCall {
   using Real = R;
-  using In = Strided<R>;
+  using In = Strided<const R>;
   using Out = Strided<R>;
   struct Space {
     R numbers[Sizes::SPACE];
@@ -38,7 +48,7 @@ template <class R, class Sizes> struct ThreadCall {
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
   const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }
   In in(int k, int lane) const {
-    R* first = static_cast<R*>(const_cast<void*>(arguments[k]));
+    const R* first = static_cast<const R*>(arguments[k]);
     return Sizes::argument(k, 0) > 1 ? In{first + lane, lanes} : In{first, 1};
   }
   Out out(int k, int lane) const { return {static_cast<R*>(results[k]) + lane, lanes}; }

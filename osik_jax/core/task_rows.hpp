@@ -83,6 +83,7 @@ template <class Real, class Columns> Real pose_curvature(Vec3<Real> force, Vec3<
   auto add = [](Real* sums, Real x, Real y, Real z) {
     sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
   };
+OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [moves, axis] = J[j];
     const auto turns = (axis.x != Real(0)) | (axis.y != Real(0)) | (axis.z != Real(0));
@@ -113,11 +114,13 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
   const Real error[6] = {distance.x, distance.y, distance.z, turn.x, turn.y, turn.z};
   const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
   Real squares[6] = {};
+OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [moves, axis] = J[j];
     const V v = goal.in_frame ? own * (moves + cross(offset, axis)) : moves, w = factor * axis;
     const Real column[6] = {v.x, v.y, v.z, w.x, w.y, w.z};
     Real lever = 0;
+OSIK_UNROLL
     for (int i = 0, row = 0; i < 6; ++i) {
       const Real square = column[i] * column[i];
       squares[i] += square;
@@ -127,6 +130,7 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
     to.levers[j] = sqrt(lever);
   }
   Real pull[6] = {};
+OSIK_UNROLL
   for (int i = 0, row = 0; i < 6; ++i)
     if (goal.kept[i]) {
       ask(to, goal.bounds, row, error[i], forward[i], goal.gain[0]);
@@ -157,9 +161,11 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& col
     return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
   };
   Real turning = 0, largest = 0, square = 0, xx = 0, xy = 0, yy = 0, zz = 0;
+OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [x, y, z] = columns[j];
     Real lever = 0;
+OSIK_UNROLL_4
     for (int i = 0; i < goal.m; ++i) {
       const Real entry = along(i, x, y, z);
       to.jacobian[i * nv + j] = entry, lever += goal.weight[i] * entry * entry;
