@@ -25,6 +25,8 @@ SHARED_BYTES = 227 * 1024
 DEFAULT_SHARED_BYTES = 48 * 1024
 """Shared memory [bytes] that every CUDA device offers a block by default."""
 _MOST_SPACES = 1 << 14
+_MOST_NUMBERS = 8
+"""Length of results that a thread writes side by side: of longer ones the threads of a warp write neighbours."""
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
 # a loop stays a loop unless the line before it asks to unroll it: unrolled, the text exceeds the instruction cache
 _LOOP = re.compile(r"(?<!unroll\n)(?<!unroll \d\n)(?<!UNROLL\n)(?<!UNROLL_4\n)^ *(?:for|while) \(", re.MULTILINE)
@@ -127,10 +129,9 @@ def call_lanes(
     lanes = outputs[0][0][0]
     given = tuple((2 if len(a) > 1 else 1, *a.shape[1:]) if _is_real(a) else a.shape for a in arrays)
     integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))
-    results = tuple(shape[1:] for shape, _ in outputs)
+    results = tuple((min(lanes, 2), *shape[1:]) for shape, _ in outputs)
     source = _lanes_source(method, real == jnp.float32, given, integers, results, space)
-    shapes, last = [(shape, real) for shape, _ in outputs], [_is_real(a) and len(a) > 1 for a in arrays]
-    last += [lanes > 1] * len(shapes)
+    shapes, last = [(shape, real) for shape, _ in outputs], [*_lanes_last(given), *_lanes_last(results, _MOST_NUMBERS)]
     return call(source, shapes, *arrays, problems=lanes, shared=0, per_block=64, warps=2, lanes_last=last)
 
 
@@ -161,7 +162,7 @@ def _lanes_source(
         single: whether floats are of single precision.
         given: shape of each argument; the leading axis of floats is 1 if all lanes share it.
         integers: which arguments are integers.
-        results: shape of each result without the axis of lanes.
+        results: shape of each result; the leading axis is 1 if there is one lane.
         space: as in ``call_lanes``.
     """
 
@@ -180,12 +181,27 @@ def _lanes_source(
         + f"using namespace osik;\nusing Real = {'float' if single else 'double'};\nstruct Sizes {{\n"
         + f"static constexpr int SPACE = {space};\n"
         + table("argument", given)
-        + table("result", [(2, *shape) for shape in results])
+        + table("result", results)
+        + f"static constexpr unsigned LANES_LAST = {_mask(_lanes_last(given))};\n"
+        + f"static constexpr unsigned RESULTS_LANES_LAST = {_mask(_lanes_last(results, _MOST_NUMBERS))};\n"
         + f'}};\nextern "C" __global__ void osik_kernel({", ".join(parameters)}, int problems) {{\n'
         + f"const void* arguments[] = {{{names('a', len(given))}}};\n"
         + f"void* results[] = {{{names('r', len(results))}}};\n"
         + f"{_METHODS[method]}(ThreadCall<Real, Sizes>{{arguments, results, problems}});\n}}\n"
     )
+
+
+def _lanes_last(shapes: Sequence[tuple[int, ...]], most: int | None = None) -> list[bool]:
+    """Return in which arrays the lanes are the fastest axis: in matrices, and in vectors of more than ``most`` numbers.
+
+    All others are as XLA has them, which would have to turn them.
+    """
+    is_long = [len(shape) == 2 and most is not None and shape[1] > most for shape in shapes]
+    return [shape[0] > 1 and (len(shape) > 2 or long) for shape, long in zip(shapes, is_long, strict=True)]
+
+
+def _mask(flags: Sequence[bool]) -> int:
+    return sum(flag << k for k, flag in enumerate(flags))
 
 
 def _is_real(a: Any) -> bool:

@@ -144,7 +144,7 @@ template <class Call> void find_frame_rows(const Call& call) {
   using In = typename Call::In;
   using Real = typename Call::Real;
   const int m = call.result_size(1, 1), nv = call.result_size(1, 2);
-  const int body = *call.integers(6), *moved = call.integers(6) + 1;
+  const int body = *call.integers(7), *moved = call.integers(7) + 1;
   call.each_lane([&](int lane) {
     Reader<In> numbers{call.in(5, lane)};
     const In factor = numbers.take(nv), offset = numbers.take(3), turn = numbers.take(9);
@@ -154,7 +154,7 @@ template <class Call> void find_frame_rows(const Call& call) {
     Real position[3], rotation[9];
     at.put(position + 0), (carrier * Mat3<Real>::of(turn)).put(rotation + 0);
     const CarriedColumns<In, In> columns{there, factor, moved, at};
-    pose_rows(pose_goal(numbers, m, moved + nv), position + 0, rotation + 0, columns, nv, rows_of(call, lane));
+    pose_rows(pose_goal(Reader<In>{call.in(6, lane)}, m, moved + nv), position + 0, rotation + 0, columns, nv, rows_of(call, lane));
   });
 }
 }  // namespace osik

@@ -1,7 +1,8 @@
 // A call of kinematic_calls.hpp or chain_search.hpp on a GPU. A lane is one robot of the batch, and has one thread.
 //
-// The lanes are the fastest axis of every array that is not shared, so that the threads of a warp read neighbours. The
-// text that includes this file defines Real, the sizes, and SPACE (core/_cuda.py: call_lanes).
+// The lanes are the fastest axis of large arrays, so that the threads of a warp read and write neighbours. In small ones the
+// numbers of a lane are neighbours, as XLA has them. The text that includes this file defines Real, the sizes, and SPACE
+// (core/_cuda.py: call_lanes).
 #pragma once
 #include "chain_search.hpp"
 
@@ -28,7 +29,7 @@ template <class T> struct Strided<const T> {
   explicit operator bool() const { return at; }
 };
 
-// Given: the sizes of arguments and results as functions, whether an argument is shared, and the numbers of `Space`.
+// Given: the sizes of arguments and results as functions, those whose lanes are the fastest axis, and the numbers of `Space`.
 template <class R, class Sizes> struct ThreadCall {
   using Real = R;
   using In = Strided<const R>;
@@ -48,10 +49,17 @@ template <class R, class Sizes> struct ThreadCall {
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
   const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }
   In in(int k, int lane) const {
-    const R* first = static_cast<const R*>(arguments[k]);
-    return Sizes::argument(k, 0) > 1 ? In{first + lane, lanes} : In{first, 1};
+    const In first{static_cast<const R*>(arguments[k])};
+    return Sizes::argument(k, 0) == 1 ? first : of_lane(first, lane, Sizes::LANES_LAST >> k & 1, Sizes::argument(k, 1));
   }
-  Out out(int k, int lane) const { return {static_cast<R*>(results[k]) + lane, lanes}; }
+  Out out(int k, int lane) const {
+    const Out first{static_cast<R*>(results[k])};
+    return of_lane(first, lane, Sizes::RESULTS_LANES_LAST >> k & 1, Sizes::result(k, 1));
+  }
+  // the numbers of one lane; count: how many there are, if they are neighbours
+  template <class At> At of_lane(At first, int lane, bool lanes_last, int count) const {
+    return lanes_last ? At{first.at + lane, lanes} : first + lane * (count ? count : 1);
+  }
   template <class F> void each_lane(F f) const {
     const int lane = blockIdx.x * blockDim.x + threadIdx.x;
     if (lane < lanes) f(lane);

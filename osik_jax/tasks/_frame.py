@@ -153,7 +153,7 @@ def _fields_by_kernel(call: Call, task: FrameTask, robot: Robot, kinematics: Kin
     goal, options, weight = goal_arguments(task)
     place = dof_columns(tree)[1][None], robot.frame_position[:, frame], robot.frame_rotation[:, frame]
     integers = np.concatenate([[body], tree.moves[body], options]).astype(np.int32)
-    given = *jax.tree.leaves(kinematics), side_by_side(*place, *goal), integers
+    given = *jax.tree.leaves(kinematics), side_by_side(*place), side_by_side(*goal), integers
     return fields_by_core(call, "frame_rows", tree.nv, weight, *given)
 
 

@@ -22,7 +22,7 @@ CENTER = (*PLACED, (1, 50), (9,), (2, 9))
 POSE = (2, 3), (2, 3, 3), (2, 6, 7), (1, 25), (8,)
 CHAIN = (2, 7), (2, 1, 12), (1, 347), (38,)
 """Steps of a search for the pose of a frame that seven joints carry."""
-ROWS = (6,), (6, 7), (6,), (), (6,), (7,), (6,)
+ROWS = (2, 6), (2, 6, 7), (2, 6), (2,), (2, 6), (2, 7), (2, 6)
 """Rows of a pose task or of one on the centre of mass, for seven dofs."""
 
 
@@ -43,12 +43,16 @@ TEXTS = {
     "more than 32 variables": lambda: weighted_qp._source(5, 35, 2, True, 100, 1),
     "more than 64 variables": lambda: weighted_qp._source(5, 70, 2, True, 100, 1),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
-    "bodies": lambda: _cuda._lanes_source("kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((3, 3), *[(2, 3)] * 4)),
-    "frames": lambda: _cuda._lanes_source("moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((1, 3), (1, 6, 7))),
+    "bodies": lambda: _cuda._lanes_source(
+        "kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((2, 3, 3), *[(2, 2, 3)] * 4)
+    ),
+    "frames": lambda: _cuda._lanes_source(
+        "moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((2, 1, 3), (2, 1, 6, 7))
+    ),
     "centre of mass": lambda: _cuda._lanes_source("center_rows", True, CENTER, (6,), ROWS, 33),
-    "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 44), (16,)), (6,), ROWS),
+    "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 19), (2, 25), (16,)), (7,), ROWS),
     "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
-    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((7,), (7,), (4,)), 227),
+    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((2, 7), (2, 7), (2, 4)), 227),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 
