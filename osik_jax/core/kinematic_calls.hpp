@@ -149,12 +149,10 @@ template <class Call> void find_frame_rows(const Call& call) {
     Reader<In> numbers{call.in(5, lane)};
     const In factor = numbers.take(nv), offset = numbers.take(3), turn = numbers.take(9);
     const auto there = placed(call, lane);
-    const auto carrier = Mat3<Real>::of(there.rotation + 9 * body);
-    const auto at = Vec3<Real>::of(there.position + 3 * body) + carrier * Vec3<Real>::of(offset);
     Real position[3], rotation[9];
-    at.put(position + 0), (carrier * Mat3<Real>::of(turn)).put(rotation + 0);
-    const CarriedColumns<In, In> columns{there, factor, moved, at};
-    pose_rows(pose_goal(Reader<In>{call.in(6, lane)}, m, moved + nv), position + 0, rotation + 0, columns, nv, rows_of(call, lane));
+    const CarriedColumns<In, In> columns{there, factor, moved, place_frame(there, body, offset, turn, position + 0, rotation + 0)};
+    const auto goal = pose_goal(Reader<In>{call.in(6, lane)}, m, moved + nv);
+    pose_rows(goal, position + 0, rotation + 0, columns, nv, rows_of(call, lane));
   });
 }
 }  // namespace osik

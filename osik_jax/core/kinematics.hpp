@@ -111,16 +111,21 @@ Twist<Real> motion_of(const Placed<From>& placed, int dof, Vec3<Real> at, Real f
   return {factor * speed, factor * axis};
 }
 
-// A point and a frame that go along with a body, and the Jacobian J [6, nv] of the point: rows [linear; angular].
-// body_position: [3], body_rotation: [9]; offset: [3] and turn: [9] of the frame in its body; moved: [dofs] flags
+// A frame that goes along with a body: offset [3] and turn [9] in the body, position [3] and rotation [9] in the world.
+template <class In, class From, class Out>
+Vec3<NumberAt<From>> place_frame(const Placed<From>& placed, int body, In offset, In turn, Out position, Out rotation) {
+  using Real = NumberAt<From>;
+  const Mat3<Real> carrier = Mat3<Real>::of(placed.rotation + 9 * body);
+  const Vec3<Real> at = Vec3<Real>::of(placed.position + 3 * body) + carrier * Vec3<Real>::of(offset);
+  at.put(position), (carrier * Mat3<Real>::of(turn)).put(rotation);
+  return at;
+}
+// The same, and the Jacobian J [6, nv] of its point: rows [linear; angular]. moved: [dofs] flags
 template <class In, class From, class Out>
 void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, In offset, In turn, const int* moved,
                 Out position, Out rotation, Out J) {
   using Real = NumberAt<Out>;
-  using V = Vec3<Real>;
-  const Mat3<Real> carrier = Mat3<Real>::of(placed.rotation + 9 * body);
-  const V at = V::of(placed.position + 3 * body) + carrier * V::of(offset);
-  at.put(position), (carrier * Mat3<Real>::of(turn)).put(rotation);
+  const Vec3<Real> at = place_frame(placed, body, offset, turn, position, rotation);
   const bool alone = d.dofs == d.nv;  // each dof has a column of its own
   for (int e = 0; e < 6 * d.nv && !alone; ++e) J[e] = 0;
   for (int dof = 0; dof < d.dofs; ++dof) {

@@ -161,12 +161,17 @@ template <class Real> class MovingRows {
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) weights[row] = leaf(leaves[1])[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
     Real *position = frames.data(), *turn = position + 6, *jacobian = position + 24;
-    for (int f = 0; f < count; ++f) {
-      const int* frame = options + 9 + f * (2 + s.dofs);  // number, carrier, whether each dof moves it
-      move_frame(columns, placed, frame[1], robot(StepLayout::FRAME_POSITION) + 3 * frame[0],
-                 robot(StepLayout::FRAME_ROTATION) + 9 * frame[0], frame + 2, position + 3 * f, turn + 9 * f,
-                 jacobian + 6 * nv * f);
+    auto number_of = [&](int f) { return options + 9 + f * (2 + s.dofs); };  // frame, carrier, whether each dof moves it
+    auto offset = [&](int f) { return robot(StepLayout::FRAME_POSITION) + 3 * *number_of(f); };
+    auto of_body = [&](int f) { return robot(StepLayout::FRAME_ROTATION) + 9 * *number_of(f); };
+    if (count == 1 && s.dofs == nv) {  // each dof has a column of its own
+      const auto point = place_frame(placed, number_of(0)[1], offset(0), of_body(0), position, turn);
+      const CarriedColumns<In, Real*> own{placed, columns.factor, number_of(0) + 2, point};
+      return pose_rows(goal, position, turn, own, nv, to);
     }
+    for (int f = 0; f < count; ++f)
+      move_frame(columns, placed, number_of(f)[1], offset(f), of_body(f), number_of(f) + 2, position + 3 * f, turn + 9 * f,
+                 jacobian + 6 * nv * f);
     if (count == 2) see_from_root(position, turn, jacobian);
     pose_rows(goal, position, turn, StoredColumns<const Real*>{jacobian, nv}, nv, to);
   }

@@ -38,9 +38,17 @@ template <class In, class Own = In> struct PoseGoal {
   Bounds<In> bounds;
 };
 
-// The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the sums of products of axes and of arms:
-// xx, xy, xz, yy, yz, zz.
-template <class Real> Real paired(Vec3<Real> pull, const Real* axes, const Real* arms) {
+// The sums of products of the entries of vectors: xx, xy, xz, yy, yz, zz.
+template <class Real> struct Products {
+  Real sums[6] = {};
+  void add(Real x, Real y, Real z) {
+    sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
+  }
+};
+
+// The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the products of axes and of arms.
+template <class Real> Real paired(Vec3<Real> pull, const Products<Real>& of_axes, const Products<Real>& of_arms) {
+  const Real *axes = of_axes.sums, *arms = of_arms.sums;
   Real size = fabs(pull.x);
   size = select(fabs(pull.y) > size, fabs(pull.y), size), size = select(fabs(pull.z) > size, fabs(pull.z), size);
   const auto pulls = size > Real(0);
@@ -77,23 +85,6 @@ template <class In, class From> struct CarriedColumns {
   Twist<Real> operator[](int j) const { return moved[j] ? motion_of(placed, j, at, Real(factor[j])) : Twist<Real>{}; }
 };
 
-// A bound on the curvature of a pose's error along force and torque on the frame: tasks/_curvature.py, pose_curvature.
-template <class Real, class Columns> Real pose_curvature(Vec3<Real> force, Vec3<Real> torque, const Columns& J, int nv) {
-  Real axes[6] = {}, arms[6] = {};
-  auto add = [](Real* sums, Real x, Real y, Real z) {
-    sums[0] += x * x, sums[1] += x * y, sums[2] += x * z, sums[3] += y * y, sums[4] += y * z, sums[5] += z * z;
-  };
-OSIK_UNROLL_4
-  for (int j = 0; j < nv; ++j) {
-    const auto [moves, axis] = J[j];
-    const auto turns = (axis.x != Real(0)) | (axis.y != Real(0)) | (axis.z != Real(0));
-    if (!any(turns)) continue;
-    auto arm = [&](Real a) { return select(turns, a, Real(0)); };
-    add(axes, axis.x, axis.y, axis.z), add(arms, arm(moves.x), arm(moves.y), arm(moves.z));
-  }
-  return (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
-}
-
 // Rows of a pose task, from the frame's position [3], rotation [9] and the columns of its Jacobian.
 //
 // The error of the position is p - p*; that of the rotation R is the logarithm e of R R*', or of R*'R in the frame's
@@ -114,6 +105,7 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
   const Real error[6] = {distance.x, distance.y, distance.z, turn.x, turn.y, turn.z};
   const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
   Real squares[6] = {};
+  Products<Real> axes, arms;  // of the columns that turn the frame
 OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [moves, axis] = J[j];
@@ -128,6 +120,9 @@ OSIK_UNROLL
       to.jacobian[row * nv + j] = column[i], lever += goal.weight[row] * square, ++row;
     }
     to.levers[j] = sqrt(lever);
+    const auto turns = (axis.x != Real(0)) | (axis.y != Real(0)) | (axis.z != Real(0));
+    auto arm = [&](Real a) { return select(turns, a, Real(0)); };
+    axes.add(axis.x, axis.y, axis.z), arms.add(arm(moves.x), arm(moves.y), arm(moves.z));
   }
   Real pull[6] = {};
 OSIK_UNROLL
@@ -138,8 +133,10 @@ OSIK_UNROLL
       if (to.squares) to.squares[row] = squares[i];
       ++row;
     }
-  const V force = V::of(pull + 0), torque = V::of(pull + 3);
-  to.curvature[0] = goal.in_frame ? pose_curvature(R * force, R * torque, J, nv) : pose_curvature(force, torque, J, nv);
+  // a bound on the curvature of the error along force and torque on the frame: tasks/_curvature.py, pose_curvature
+  const V along = V::of(pull + 0), about = V::of(pull + 3), force = goal.in_frame ? R * along : along;
+  const V torque = goal.in_frame ? R * about : about;
+  to.curvature[0] = (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
 }
 
 // Where a task asks the centre of mass to be, along `m` of the world's axes or normals of edges on the ground.
