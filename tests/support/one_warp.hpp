@@ -28,7 +28,7 @@ struct Index {
 struct float4 {
   float x, y, z, w;
 };
-static Index threadIdx, blockIdx;
+static Index threadIdx, blockIdx, blockDim{1};
 static ucontext_t threads[32], host;
 static char stacks[32][1 << 18];
 static uint64_t slots[2][32];
@@ -78,6 +78,7 @@ inline unsigned __ballot_sync(unsigned, bool own) {
     return bits;
   });
 }
+template <class T> T __ldg(const T* at) { return *at; }
 inline int __ffs(unsigned a) { return __builtin_ffs(int(a)); }
 inline int __clz(unsigned a) { return a ? __builtin_clz(a) : 32; }
 inline unsigned __float_as_uint(float a) { return __builtin_bit_cast(unsigned, a); }

@@ -1,12 +1,14 @@
-"""The CUDA text of the weighted QP on a CPU, one thread of a warp after the other (``one_warp.hpp``)."""
+"""CUDA texts of the core on a CPU, one thread after the other (``one_warp.hpp``)."""
 
 import ctypes
+import hashlib
 import os
 import re
 import subprocess
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +19,11 @@ _RUN = """
 extern "C" void run(void** a, int problems) {
   auto kernel = [&] { osik_kernel(ARGUMENTS, problems); };
   run_blocks(problems, (char*)osik::shared_space, BYTES, sizeof osik::shared_space, kernel);
+}
+"""
+_EACH_LANE = """
+extern "C" void run(void** a, int problems) {
+  for (blockIdx.x = 0; blockIdx.x < problems; ++blockIdx.x) osik_kernel(ARGUMENTS, problems);
 }
 """
 
@@ -42,16 +49,47 @@ def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
     space = "extern __shared__ __align__(16) double shared_space[];"
     assert (copies, waits, text.count(space)) == (1, 1, 1) and "asm" not in text
     text = text.replace(space, f"alignas(16) static double shared_space[{SHARED // 8}];")
+    run = _RUN.replace("BYTES", str(_cuda._bytes(m, n, p, single)))
+    return compiled(folder, text + run.replace("ARGUMENTS", arguments_of(text)))
+
+
+def arguments_of(text: str) -> str:
+    """What the kernel of a CUDA text is called with, from an array of pointers `a`."""
     head = re.search(r"osik_kernel\((.*?),\s*int problems\)", text, re.DOTALL)
     assert head is not None
     types = [re.sub(r"\w+$", "", parameter.strip()) for parameter in head[1].split(",")]
-    arguments = ", ".join(f"({kind})a[{k}]" for k, kind in enumerate(types))
-    run = _RUN.replace("BYTES", str(_cuda._bytes(m, n, p, single))).replace("ARGUMENTS", arguments)
-    source, target = folder / f"{m}_{n}_{p}_{single}.cpp", folder / f"{m}_{n}_{p}_{single}.so"
-    source.write_text('#include "one_warp.hpp"\n' + text + run)
+    return ", ".join(f"({kind})a[{k}]" for k, kind in enumerate(types))
+
+
+def compiled(folder: Path, text: str) -> ctypes.CDLL:
+    """A CUDA text as a C library."""
+    name = hashlib.sha256(text.encode()).hexdigest()[:16]
+    source, target = folder / f"{name}.cpp", folder / f"{name}.so"
+    source.write_text('#include "one_warp.hpp"\n' + text)
     options = ("-std=c++20", "-O1", "-w", "-shared", "-fPIC", f"-I{Path(__file__).parent}")
     subprocess.run([os.environ.get("CXX") or "c++", *options, "-o", target, source], check=True)
     return ctypes.CDLL(str(target))
+
+
+def call_of_lanes(
+    folder: Path,
+    source: str,
+    outputs: Sequence[tuple[tuple[int, ...], Any]],
+    *inputs: Any,
+    problems: int,
+    lanes_last: Sequence[bool],
+    **_: Any,
+) -> list[np.ndarray]:
+    """What ``core/_cuda.call`` does for ``call_lanes``, one lane after the other."""
+    given = [
+        np.ascontiguousarray(np.moveaxis(a, 0, -1) if last else a) for a, last in zip(inputs, lanes_last, strict=False)
+    ]
+    orders = lanes_last[len(inputs) :]
+    shapes = [(*shape[1:], shape[0]) if last else shape for (shape, _), last in zip(outputs, orders, strict=True)]
+    results = [np.full(shape, np.nan, kind) for shape, (_, kind) in zip(shapes, outputs, strict=True)]
+    pointers = (ctypes.c_void_p * (len(given) + len(results)))(*(a.ctypes.data for a in (*given, *results)))
+    compiled(folder, source + _EACH_LANE.replace("ARGUMENTS", arguments_of(source))).run(pointers, problems)
+    return [np.moveaxis(a, -1, 0) if last else a for a, last in zip(results, orders, strict=True)]
 
 
 def solve(folder: Path, problems: tuple[np.ndarray, ...], guess: np.ndarray, tolerance: float, kind: type) -> Found:
