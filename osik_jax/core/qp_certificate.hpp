@@ -62,18 +62,19 @@ template <class Team> class QPCertificate {
     Gathered dual, primal, terms;
     each_entry(t, n, [&](auto e) {
       const auto multiplier = e(GRADIENT), at = e(x), free = fabs(multiplier);
+      const auto size = e(SCALE) + e(ROW_TERMS), roundoff = EPS * size;
       const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier,
-                               Real(ROW_MULTIPLIER) * e(ROW_TERMS));
-      const auto size = e(SCALE) + e(ROW_TERMS), beyond = select(found.inactive, free, found.sign);
-      holds &= !any(!(found.holds & ((free <= Real(VALUE_TOL) * tolerance * found.force) | !found.inactive)));
-      exact &= !any(!(e.are(active, EQUALITY) | (beyond <= Real(GRADIENT_TOL) * EPS * size)));
+                               Real(ROW_MULTIPLIER) * e(ROW_TERMS), Method::RELEASE * roundoff);
+      const auto beyond = select(found.inactive, free, found.sign), small = Real(GRADIENT_TOL) * roundoff;
+      holds &= !any(!(found.holds & ((free <= Real(VALUE_TOL) * tolerance * found.force) | (free <= small) | !found.inactive)));
+      exact &= !any(!(e.are(active, EQUALITY) | (beyond <= small)));
       terms.most(size), dual.most(select(found.one_side | found.inactive, beyond, decltype(at)(0)));
     });
     t.each(0, p, [&](int q) {
       const Real* row = d.rows + q * ld;
       const Real value = sums(row, x, n).value, curved = sums(row, INVERSE_ROOT, n).size, length = sums(row, ONES, n).size;
       const auto found = check(EntryOf<Team>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q], curved,
-                               length, y[q], Real(0));
+                               length, y[q], Real(0), Real(0));
       holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
       Real longest = 0;
       for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) longest = larger(longest, Real(fabs(row[j])));
@@ -123,10 +124,11 @@ OSIK_UNROLL_4
     Which holds, one_side, inactive;
     Number force, sign, off, gap, scale;  // sign: the multiplier, if positive in the wrong direction; off: from its bound
   };
-  // What all constraints have to be, and what is asked of their multipliers.
+  // What all constraints have to be, and what is asked of their multipliers. roundoff: of the multiplier.
   template <class E, class Number>
   OSIK_FN Checked<Number> check(E e, const Real* lower, const Real* upper, const Int* active, Number value, Number compliant,
-                                Number per_curvature, Number per_unit, Number multiplier, Number force_of_rows) const {
+                                Number per_curvature, Number per_unit, Number multiplier, Number force_of_rows,
+                                Number roundoff) const {
     using Which = typename Checked<Number>::Which;
     const Which at_lower = e.are(active, AT_LOWER), at_upper = e.are(active, AT_UPPER), redundant = e.are(active, REDUNDANT);
     const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper, inactive = e.are(active, INACTIVE) | redundant;
@@ -140,7 +142,7 @@ OSIK_UNROLL_4
     const Number near = Real(VALUE_TOL) * tolerance * scale;
     const Which labelled = one_side | (equality & (low == high)) | (inactive & ((low != high) | redundant));
     const Which holds = labelled & (off <= near) & !(gap > select(redundant, REDUNDANT_TOL * near, near)) &
-                        ((sign <= Real(SIGN_TOL) * tolerance * force) | !one_side);
+                        ((sign <= Real(SIGN_TOL) * tolerance * force) | (sign <= roundoff) | !one_side);
     return {holds, one_side, inactive, force, sign, off, gap, scale};
   }
   static constexpr Real SMALLEST = sizeof(Real) == 8 ? 2.2250738585072014e-308 : 1.17549435e-38;
