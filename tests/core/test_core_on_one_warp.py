@@ -84,6 +84,18 @@ def test_recorded_problems_in_single_precision(robot, tmp_path):
     assert (found.report[:, 1:] == (0, 1)).all()
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_an_answer_that_is_roundoff_is_certified(kind, tmp_path, rng):
+    """Residuals that balance each other, as those of a robot at rest do."""
+    A, weight = rng.normal(size=(20, 9, 6)), 10.0 ** rng.uniform(-3, 2, (20, 9))
+    pulls = np.linalg.svd((weight[..., None] * A).transpose(0, 2, 1))[2][:, -1]  # A' W pulls = 0
+    limit = np.tile([np.inf, np.inf, np.inf, 0.5, 0.5, 0.5], (20, 1))
+    zero, rows, none = np.zeros((20, 6)), np.zeros((20, 0, 6)), np.zeros((20, 0))
+    given = A, pulls, weight, zero + 1e-9, zero, rows, none, -limit, limit
+    found = one_warp.solve(tmp_path, given, np.zeros((20, 6), int), TOLERANCE[kind], kind)
+    assert (found.report[:, 0] == CERTIFIED).all() and np.abs(found.x).max() < 1e6 * np.finfo(kind).eps
+
+
 def test_a_bad_problem_is_not_certified_and_disturbs_no_other(tmp_path, rng):
     p = whole_body(rng, 12)
     given = in_box(p, p.weight, WHOLE_BODY_DAMPING)
