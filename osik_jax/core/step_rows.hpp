@@ -218,7 +218,8 @@ class StepRows {
       if (task.bounded && counts && task.rows.lower[i] > task.rows.upper[i]) ordered = false;
     }
     takes = takes && (task.bounded || all_finite(task.rows.lower, m));
-    return takes && (task.kind == POSTURE || all_finite(task.rows.jacobian, m * s.nv));
+    // squared lengths are finite only where all entries of the rows are
+    return takes && (task.kind == POSTURE || all_finite(task.rows.squares, m) || all_finite(task.rows.jacobian, m * s.nv));
   }
   // options: place in q and dof of each row
   void add_posture(const Task& task, const double* given, const double* velocity, double gain) {

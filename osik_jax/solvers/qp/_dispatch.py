@@ -198,19 +198,18 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
     is_active = active != INACTIVE
     scales = constraint_scales(qp, qp.cost.diagonal(), x, y)
     # no gradient is smaller than the roundoff of its terms: of a robot at rest, x itself is roundoff
-    eps = float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
-    most = SIGN_TOL * tolerance * scales.multiplier
-    release = jnp.concatenate([BOUND_MULTIPLIER[x.dtype] * eps, jnp.zeros_like(y)])
-    roundoff = Roundoff(VALUE_TOL * tolerance * scales.value, jnp.maximum(most, release))
+    least = float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
+    release = jnp.concatenate([BOUND_MULTIPLIER[x.dtype] * least, jnp.zeros_like(y)])
+    multiplier = jnp.maximum(SIGN_TOL * tolerance * scales.multiplier, release)
+    roundoff = Roundoff(VALUE_TOL * tolerance * scales.value, multiplier)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
     # an active constraint: x_i = bound, or c'x + compliance y = bound (a soft row is missed by -compliance y)
     off = jnp.concatenate([x, apply(qp.rows, x) + qp.compliance * y]) - active_bounds(qp, active)
     # labels that exist, and "equality" where there is one
     valid_label = (jnp.abs(active) == 1) | ~is_active | ((active == EQUALITY) & qp.equality)
     at_bound = jnp.where(is_active, jnp.abs(off) <= roundoff.value, valid_label)
-    gradient_is_zero = jnp.abs(gradient) <= jnp.maximum(
-        VALUE_TOL * tolerance * scales.multiplier[:n], GRADIENT_TOL * eps
-    )
+    zero_gradient = jnp.maximum(VALUE_TOL * tolerance * scales.multiplier[:n], GRADIENT_TOL * least)
+    gradient_is_zero = jnp.abs(gradient) <= zero_gradient
     stationary = jnp.where(is_active, valid_label, jnp.concatenate([gradient_is_zero, y == 0.0]))
     valid = jnp.isfinite(jnp.concatenate([x, y])) & at_bound & stationary
     return valid & ~violated_conditions(qp, result, x, y, roundoff)
