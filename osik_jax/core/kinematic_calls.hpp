@@ -93,7 +93,7 @@ template <class Call> struct Center {
 };
 template <class Call> void move_centers(const Call& call) {
   Center<Call> center(call, call.result_size(1, 2));
-  call.each_lane([&](int lane) { add_columns(center.find(call, lane, call.out(0, lane)), call.out(1, lane)); });
+  call.each_lane([&](int lane) { put_jacobian(center.find(call, lane, call.out(0, lane)), call.out(1, lane)); });
 }
 
 // Results of rows of tasks: error, rows, wanted velocity, curvature, pull, levers, squared lengths of the rows.

@@ -143,13 +143,13 @@ template <class In, class From> struct CenterColumns {
   using Real = NumberAt<From>;
   using V = Vec3<Real>;
   Placed<From> placed;
-  DofColumns<In> of;
+  DofColumns<In> dofs;
   const int* owner;   // [dofs] body of each full dof
   const Real* below;  // [bodies, 4] mass, and mass times position, of a body with all that hangs from it
   V operator[](int dof) const {
     const Real* carried = below + 4 * owner[dof];
     const V arm = V::of(carried + 1) - carried[0] * V::of(placed.anchor + 3 * dof);
-    const Real factor = of.factor[dof] / below[0];
+    const Real factor = dofs.factor[dof] / below[0];
     return factor * (carried[0] * V::of(placed.linear + 3 * dof) + cross(V::of(placed.angular + 3 * dof), arm));
   }
 };
@@ -178,9 +178,9 @@ OSIK_UNROLL_4
   for (int i = 0; i < 3; ++i) point[i] = below[1 + i] / below[0];
   return {placed, d, owner, below};
 }
-// The Jacobian J [3, nv] of the centre of mass.
-template <class In, class From, class Out> void add_columns(const CenterColumns<In, From>& columns, Out J) {
-  const DofColumns<In>& d = columns.of;
+// The Jacobian J [3, nv] of the centre of mass: dofs with the same entry of v are added.
+template <class In, class From, class Out> void put_jacobian(const CenterColumns<In, From>& columns, Out J) {
+  const DofColumns<In>& d = columns.dofs;
   for (int e = 0; e < 3 * d.nv; ++e) J[e] = 0;
   for (int dof = 0; dof < d.dofs; ++dof) {
     const int column = d.column[dof];
@@ -189,9 +189,10 @@ template <class In, class From, class Out> void add_columns(const CenterColumns<
     J[column] += x, J[d.nv + column] += y, J[2 * d.nv + column] += z;
   }
 }
-// f(the columns of the joint velocity): as they are, where each dof has one of its own, else from J, a space [3, nv].
+// f(the columns of the Jacobian by entries of v): those of the dofs, where each has an entry of its own, else from J, a space
+// [3, nv].
 template <class In, class From, class F> void with_columns(const CenterColumns<In, From>& columns, NumberAt<From>* J, F f) {
-  if (columns.of.dofs == columns.of.nv) return f(columns);
-  add_columns(columns, J), f(StoredCenterColumns<const NumberAt<From>*>{J, columns.of.nv});
+  if (columns.dofs.dofs == columns.dofs.nv) return f(columns);
+  put_jacobian(columns, J), f(StoredCenterColumns<const NumberAt<From>*>{J, columns.dofs.nv});
 }
 }  // namespace osik

@@ -1,7 +1,7 @@
 // A call of kinematic_calls.hpp or chain_search.hpp on a GPU. A lane is one robot of the batch, and has one thread.
 //
-// The lanes are the fastest axis of large arrays, so that the threads of a warp read and write neighbours. In small ones the
-// numbers of a lane are neighbours, as XLA has them. The text that includes this file defines Real, the sizes, and SPACE
+// The lanes are the fastest axis of matrices and of long results, so that the threads of a warp read and write neighbours. In
+// all others the numbers of a lane are neighbours, as XLA has them. The text that includes this file defines Real, the sizes, and SPACE
 // (core/_cuda.py: call_lanes).
 #pragma once
 #include "chain_search.hpp"
@@ -42,8 +42,8 @@ template <class R, class Sizes> struct ThreadCall {
   void* const* results;
   int lanes;
   Space space() const {
-    Space of_lane;
-    return of_lane;
+    Space own;  // whoever uses it writes first
+    return own;
   }
   int size(int k, int axis) const { return Sizes::argument(k, axis); }
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
@@ -56,9 +56,9 @@ template <class R, class Sizes> struct ThreadCall {
     const Out first{static_cast<R*>(results[k])};
     return of_lane(first, lane, Sizes::RESULTS_LANES_LAST >> k & 1, Sizes::result(k, 1));
   }
-  // the numbers of one lane; count: how many there are, if they are neighbours
+  // the numbers of one lane; count: how many there are, if they are neighbours, or 0 for one
   template <class At> At of_lane(At first, int lane, bool lanes_last, int count) const {
-    return lanes_last ? At{first.at + lane, lanes} : first + lane * (count ? count : 1);
+    return lanes_last ? At{first.at + lane, lanes} : At{first.at + size_t(lane) * (count ? count : 1), 1};
   }
   template <class F> void each_lane(F f) const {
     const int lane = blockIdx.x * blockDim.x + threadIdx.x;

@@ -161,16 +161,16 @@ template <class Real> class MovingRows {
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) weights[row] = leaf(leaves[1])[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
     Real *position = frames.data(), *turn = position + 6, *jacobian = position + 24;
-    auto number_of = [&](int f) { return options + 9 + f * (2 + s.dofs); };  // frame, carrier, whether each dof moves it
-    auto offset = [&](int f) { return robot(StepLayout::FRAME_POSITION) + 3 * *number_of(f); };
-    auto of_body = [&](int f) { return robot(StepLayout::FRAME_ROTATION) + 9 * *number_of(f); };
+    auto frame = [&](int f) { return options + 9 + f * (2 + s.dofs); };  // number, carrier, whether each dof moves it
+    auto offset_of = [&](int f) { return robot(StepLayout::FRAME_POSITION) + 3 * frame(f)[0]; };
+    auto turn_of = [&](int f) { return robot(StepLayout::FRAME_ROTATION) + 9 * frame(f)[0]; };
     if (count == 1 && s.dofs == nv) {  // each dof has a column of its own
-      const auto point = place_frame(placed, number_of(0)[1], offset(0), of_body(0), position, turn);
-      const CarriedColumns<In, Real*> own{placed, columns.factor, number_of(0) + 2, point};
+      const auto point = place_frame(placed, frame(0)[1], offset_of(0), turn_of(0), position, turn);
+      const CarriedColumns<In, Real*> own{placed, columns.factor, frame(0) + 2, point};
       return pose_rows(goal, position, turn, own, nv, to);
     }
     for (int f = 0; f < count; ++f)
-      move_frame(columns, placed, number_of(f)[1], offset(f), of_body(f), number_of(f) + 2, position + 3 * f, turn + 9 * f,
+      move_frame(columns, placed, frame(f)[1], offset_of(f), turn_of(f), frame(f) + 2, position + 3 * f, turn + 9 * f,
                  jacobian + 6 * nv * f);
     if (count == 2) see_from_root(position, turn, jacobian);
     pose_rows(goal, position, turn, StoredColumns<const Real*>{jacobian, nv}, nv, to);

@@ -124,11 +124,12 @@ OSIK_UNROLL_4
     Which holds, one_side, inactive;
     Number force, sign, off, gap, scale;  // sign: the multiplier, if positive in the wrong direction; off: from its bound
   };
-  // What all constraints have to be, and what is asked of their multipliers. roundoff: of the multiplier.
+  // What all constraints have to be, and what is asked of their multipliers. release: a multiplier of
+  // the wrong sign up to this is none.
   template <class E, class Number>
   OSIK_FN Checked<Number> check(E e, const Real* lower, const Real* upper, const Int* active, Number value, Number compliant,
                                 Number per_curvature, Number per_unit, Number multiplier, Number force_of_rows,
-                                Number roundoff) const {
+                                Number release) const {
     using Which = typename Checked<Number>::Which;
     const Which at_lower = e.are(active, AT_LOWER), at_upper = e.are(active, AT_UPPER), redundant = e.are(active, REDUNDANT);
     const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper, inactive = e.are(active, INACTIVE) | redundant;
@@ -142,7 +143,7 @@ OSIK_UNROLL_4
     const Number near = Real(VALUE_TOL) * tolerance * scale;
     const Which labelled = one_side | (equality & (low == high)) | (inactive & ((low != high) | redundant));
     const Which holds = labelled & (off <= near) & !(gap > select(redundant, REDUNDANT_TOL * near, near)) &
-                        ((sign <= Real(SIGN_TOL) * tolerance * force) | (sign <= roundoff) | !one_side);
+                        ((sign <= Real(SIGN_TOL) * tolerance * force) | (sign <= release) | !one_side);
     return {holds, one_side, inactive, force, sign, off, gap, scale};
   }
   static constexpr Real SMALLEST = sizeof(Real) == 8 ? 2.2250738585072014e-308 : 1.17549435e-38;

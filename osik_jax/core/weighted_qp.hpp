@@ -218,12 +218,12 @@ OSIK_UNROLL_4
       c.store(GRADIENT, total);
     });
   }
-  // Whether a correction is the last: the next one would be far below roundoff if they shrink alike, or it is small and
-  // shrinks no more. `before`: the size of the one before it.
-  OSIK_FN bool is_last(Real& before) const {
+  // Whether a correction is the last: the next one would be far below roundoff if they shrink alike, or it shrinks no more,
+  // or too little for a small one. `before`: the size of the one before it; the first of all may be small by chance.
+  OSIK_FN bool is_last(int round, Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
     const bool is_roundoff = moved * moved <= CORRECTION * far * before;
-    const bool stalls = moved > Real(MIN_DECREASE) * before && moved <= Real(SMALL_CORRECTION) * far;
+    const bool stalls = (round > 1 && moved >= before) || (moved > Real(MIN_DECREASE) * before && moved <= Real(SMALL_CORRECTION) * far);
     const bool last = before < Real(INFINITE) && (is_roundoff || stalls);
     before = moved;
     return last;
@@ -268,7 +268,7 @@ OSIK_UNROLL_4
         c.store(X, x -= total);
       });
       find_gradient();
-      if (is_last(before)) break;
+      if (is_last(round, before)) break;
       t.columns(0, n, [&](auto c) {
         auto step = c.load(GRADIENT);
         c.store(STEP, step *= c.load(INVERSE));
@@ -337,7 +337,7 @@ OSIK_UNROLL_4
       });
       t.each(0, n, [&](int j) { X[j] += STEP[j]; });
       find_gradient();
-      if (is_last(before)) break;
+      if (is_last(round, before)) break;
     }
     return true;
   }

@@ -203,7 +203,8 @@ corrections shrink alike, and the first one is small by chance in a few problems
 """
 MIN_DECREASE, SMALL_CORRECTION = 0.25, 1e-3
 """Ratio of two corrections above which the second one was roundoff, if it was also below that part of the answer. A
-larger one follows where the first was small by chance, or where weak directions shrink slowly.
+larger one follows where the first was small by chance, or where weak directions shrink slowly. From the third on, one
+that is not smaller than the one before is the last.
 """
 KERNEL_PIVOT = 1e2
 """Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""

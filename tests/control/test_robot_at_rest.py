@@ -9,7 +9,7 @@ import osik_jax as osik
 from osik_jax import Status
 from osik_jax.solvers import solve_least_squares_qp
 
-STEPS, AT_REST = 400, 1e-8
+STEPS, AT_REST = 400, 1e-12
 
 
 @pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])

@@ -33,9 +33,9 @@ def made(name):
     return osik.load_robot(name), "LThigh" if name == "nao" else "link4"
 
 
-def with_lanes(tree, of_each):
+def with_lanes(tree, of_each, lanes=LANES):
     """Arrays with a leading axis: of all lanes, with a factor of each, or of length 1."""
-    factor = 1.0 + 0.1 * np.arange(LANES)
+    factor = 1.0 + 0.1 * np.arange(lanes)
     return jax.tree.map(lambda a: a * factor.reshape(-1, *[1] * a.ndim) if of_each else a[None], tree)
 
 
@@ -51,18 +51,18 @@ def everything(call, robot, q, tasks, frames):
     return found
 
 
-@pytest.mark.parametrize("of_each", [False, True])
+@pytest.mark.parametrize(("lanes", "of_each"), [(1, False), (LANES, False), (LANES, True)])
 @pytest.mark.parametrize("name", ["arm7", "nao", "coupled"])
-def test_the_text_of_a_gpu_is_that_of_a_cpu(name, of_each, tmp_path, rng, monkeypatch):
+def test_the_text_of_a_gpu_is_that_of_a_cpu(name, lanes, of_each, tmp_path, rng, monkeypatch):
     monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
     robot, frame = made(name)
-    q = jnp.asarray(robot.q0 + 0.2 * rng.standard_normal((LANES, robot.nq)))
+    q = jnp.asarray(robot.q0 + 0.2 * rng.standard_normal((lanes, robot.nq)))
     target = osik.forward_kinematics(robot, robot.q0).frame_pose(robot, frame)
     tasks = dict(
         com=osik.ComTask(robot, axes="xz", target=[0.1, 0.3]),
         frame=osik.FrameTask(robot, frame, target=target, orientation_weight=0.3),
     )
-    given = with_lanes(robot, of_each), q, with_lanes(tasks, of_each), [robot.tree.frame(frame), 1]
+    given = with_lanes(robot, of_each, lanes), q, with_lanes(tasks, of_each, lanes), [robot.tree.frame(frame), 1]
     expected, found = (jax.tree.leaves(everything(call, *given)) for call in (_library.call, _cuda.call_lanes))
     for a, b in zip(found, expected, strict=True):
         near = 1e-12 if np.ndim(b) > 1 else 1e-8  # a curvature is the root of a sum whose terms may cancel

@@ -1,9 +1,10 @@
 """Choice of backend for a QP: candidates of a kernel, certified, else the search.
 
-The certificate is that of the search itself (``violated_conditions``, ``kkt_residual``), on the data as they were
-given, so that answers do not rest on the kernel. It costs two products with the rows. On a GPU the kernel checks the
-same conditions at its end (``core/qp_certificate.hpp``), where the rows are at hand. Problems whose candidate fails
-are gathered into blocks, and the search goes on from the candidate's active set.
+The certificate is that of the search (``violated_conditions``, ``kkt_residual``), on the data as they were given, so
+that answers do not rest on the kernel; but no gradient has to be smaller than the roundoff of its terms. It costs two
+products with the rows. On a GPU the kernel checks the same conditions at its end (``core/qp_certificate.hpp``), where
+the rows are at hand. Problems whose candidate fails are gathered into blocks, and the search goes on from the
+candidate's active set.
 """
 
 from __future__ import annotations
@@ -152,9 +153,7 @@ def _certified(
     residual = jax.vmap(kkt_residual)(qp, candidate.x, candidate.row_multipliers, candidate.active)
     within_limit = candidate.iterations <= max_iterations
     result = _as_result(qp, candidate, residual, (candidate.converged != 0) & within_limit & (residual <= kkt_tol))
-    conditions = [jax.vmap(_is_certified)(qp, result, tolerance)]
-    if tolerance.dtype == jnp.float64:  # in single precision the conditions above are as sharp as roundoff
-        conditions.append(jax.vmap(_is_stationary)(qp, result))
+    conditions = jax.vmap(_is_certified)(qp, result, tolerance), jax.vmap(_is_stationary)(qp, result)
     is_certified = result.done & jnp.concatenate(conditions, 1).all(1)
     # the search has the limit too: it may not begin where more changes than that have led
     active = jnp.where(within_limit[:, None], result.active, start)
@@ -197,9 +196,9 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
     n = len(x)
     is_active = active != INACTIVE
     scales = constraint_scales(qp, qp.cost.diagonal(), x, y)
-    # no gradient is smaller than the roundoff of its terms: of a robot at rest, x itself is roundoff
-    least = float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
-    release = jnp.concatenate([BOUND_MULTIPLIER[x.dtype] * least, jnp.zeros_like(y)])
+    # of a robot at rest x itself is roundoff, and so are the scales
+    gradient_roundoff = float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
+    release = jnp.concatenate([BOUND_MULTIPLIER[x.dtype] * gradient_roundoff, jnp.zeros_like(y)])
     multiplier = jnp.maximum(SIGN_TOL * tolerance * scales.multiplier, release)
     roundoff = Roundoff(VALUE_TOL * tolerance * scales.value, multiplier)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
@@ -208,7 +207,7 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
     # labels that exist, and "equality" where there is one
     valid_label = (jnp.abs(active) == 1) | ~is_active | ((active == EQUALITY) & qp.equality)
     at_bound = jnp.where(is_active, jnp.abs(off) <= roundoff.value, valid_label)
-    zero_gradient = jnp.maximum(VALUE_TOL * tolerance * scales.multiplier[:n], GRADIENT_TOL * least)
+    zero_gradient = jnp.maximum(VALUE_TOL * tolerance * scales.multiplier[:n], GRADIENT_TOL * gradient_roundoff)
     gradient_is_zero = jnp.abs(gradient) <= zero_gradient
     stationary = jnp.where(is_active, valid_label, jnp.concatenate([gradient_is_zero, y == 0.0]))
     valid = jnp.isfinite(jnp.concatenate([x, y])) & at_bound & stationary
