@@ -150,7 +150,8 @@ template <class Call> void find_frame_rows(const Call& call) {
     const In factor = numbers.take(nv), offset = numbers.take(3), turn = numbers.take(9);
     const auto there = placed(call, lane);
     Real position[3], rotation[9];
-    const CarriedColumns<In, In> columns{there, factor, moved, place_frame(there, body, offset, turn, position + 0, rotation + 0)};
+    const auto at = place_frame(there, body, offset, turn, position + 0, rotation + 0);
+    const CarriedColumns<In, In> columns{there, factor, moved, at};
     const auto goal = pose_goal(Reader<In>{call.in(6, lane)}, m, moved + nv);
     pose_rows(goal, position + 0, rotation + 0, columns, nv, rows_of(call, lane));
   });

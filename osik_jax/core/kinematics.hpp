@@ -95,6 +95,7 @@ template <class In> struct DofColumns {
   int dofs, nv;
   const int* column;  // [dofs]
   In factor;          // [dofs]
+  bool alone() const { return dofs == nv; }  // whether each dof has a column of its own
 };
 
 // A velocity, and an angular velocity.
@@ -126,7 +127,7 @@ void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, I
                 Out position, Out rotation, Out J) {
   using Real = NumberAt<Out>;
   const Vec3<Real> at = place_frame(placed, body, offset, turn, position, rotation);
-  const bool alone = d.dofs == d.nv;  // each dof has a column of its own
+  const bool alone = d.alone();
   for (int e = 0; e < 6 * d.nv && !alone; ++e) J[e] = 0;
   for (int dof = 0; dof < d.dofs; ++dof) {
     const int column = d.column[dof];
@@ -192,7 +193,7 @@ template <class In, class From, class Out> void put_jacobian(const CenterColumns
 // f(the columns of the Jacobian by entries of v): those of the dofs, where each has an entry of its own, else from J, a space
 // [3, nv].
 template <class In, class From, class F> void with_columns(const CenterColumns<In, From>& columns, NumberAt<From>* J, F f) {
-  if (columns.dofs.dofs == columns.dofs.nv) return f(columns);
+  if (columns.dofs.alone()) return f(columns);
   put_jacobian(columns, J), f(StoredCenterColumns<const NumberAt<From>*>{J, columns.dofs.nv});
 }
 }  // namespace osik

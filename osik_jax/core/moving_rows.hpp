@@ -164,7 +164,7 @@ template <class Real> class MovingRows {
     auto frame = [&](int f) { return options + 9 + f * (2 + s.dofs); };  // number, carrier, whether each dof moves it
     auto offset_of = [&](int f) { return robot(StepLayout::FRAME_POSITION) + 3 * frame(f)[0]; };
     auto turn_of = [&](int f) { return robot(StepLayout::FRAME_ROTATION) + 9 * frame(f)[0]; };
-    if (count == 1 && s.dofs == nv) {  // each dof has a column of its own
+    if (count == 1 && columns.alone()) {
       const auto point = place_frame(placed, frame(0)[1], offset_of(0), turn_of(0), position, turn);
       const CarriedColumns<In, Real*> own{placed, columns.factor, frame(0) + 2, point};
       return pose_rows(goal, position, turn, own, nv, to);

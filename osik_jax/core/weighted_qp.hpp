@@ -49,7 +49,8 @@ template <class Team> struct WeightedQP {
   using Answer = QPAnswer<Real>;
   static constexpr Real EPS = sizeof(Real) == 8 ? EPSILON : 1.1920929e-07;
   static constexpr bool IS_SINGLE = sizeof(Real) == 4;
-  static constexpr Real VIOLATION = IS_SINGLE ? VIOLATION_TOL : 1, RELEASE = IS_SINGLE ? SINGLE_BOUND_MULTIPLIER : BOUND_MULTIPLIER;
+  static constexpr Real VIOLATION = IS_SINGLE ? VIOLATION_TOL : 1;
+  static constexpr Real RELEASE = IS_SINGLE ? SINGLE_BOUND_MULTIPLIER : BOUND_MULTIPLIER;
   static constexpr int VECTORS = Team::SPARES_SPACE ? 19 : 21, INTEGERS = 4;
   Team t;
   int max_changes, used, changes, factorizations;  // used: rows in the system of the active set

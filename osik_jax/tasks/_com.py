@@ -181,10 +181,10 @@ def _fields_by_kernel(call: Call, task: ComTask, robot: Robot, kinematics: Kinem
     weight = task.weight if task.weight.ndim == 2 else task.weight[:, None]
     weight = jnp.broadcast_to(weight, (len(weight), len(task.axes)))
     numbers = side_by_side(task.target, task.target_velocity, weight, task.gain)
-    options = np.concatenate([integers, axis_numbers(task.axes), robot.tree.turning]).astype(np.int32)
     tree = robot.tree
+    options = np.concatenate([integers, axis_numbers(task.axes), tree.turning]).astype(np.int32)
     space = 4 * len(tree.body_parents) + (0 if len(tree.dof_body) == tree.nv else 3 * tree.nv)
-    return fields_by_core(partial(call, space=space), "center_rows", robot.tree.nv, weight, *given, options, numbers)
+    return fields_by_core(partial(call, space=space), "center_rows", tree.nv, weight, *given, options, numbers)
 
 
 _by_kernel = by_kernel(_fields, _fields_by_kernel)

@@ -54,7 +54,7 @@ def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
 
 
 def arguments_of(text: str) -> str:
-    """What the kernel of a CUDA text is called with, from an array of pointers `a`."""
+    """Return C++ text of the arguments of a CUDA text's kernel: the pointers in the array `a`, cast to their types."""
     head = re.search(r"osik_kernel\((.*?),\s*int problems\)", text, re.DOTALL)
     assert head is not None
     types = [re.sub(r"\w+$", "", parameter.strip()) for parameter in head[1].split(",")]
@@ -80,7 +80,7 @@ def call_of_lanes(
     lanes_last: Sequence[bool],
     **_: Any,
 ) -> list[np.ndarray]:
-    """What ``core/_cuda.call`` does for ``call_lanes``, one lane after the other."""
+    """Compute a method of ``core/kinematic_calls.hpp`` for all lanes on a CPU, in place of ``core/_cuda.call``."""
     given = [
         np.ascontiguousarray(np.moveaxis(a, 0, -1) if last else a) for a, last in zip(inputs, lanes_last, strict=False)
     ]
