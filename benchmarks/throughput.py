@@ -1,11 +1,12 @@
 """Steps a second of the closed loop against the size of the batch, on the default device.
 
     python -m benchmarks.throughput [results.json] [--robot nao] [--batches 1,64,1024] [--schemes weighted,...]
-                                    [--precisions float64,float32] [--tasks polygon]
+                                    [--precisions float64,float32] [--tasks polygon] [--steps 20]
 
 The robot stands on both feet, keeps its centre of mass and reaches with one hand, each lane from other angles of its
 arms and for another point; joint position and velocity limits, dt 5 ms. One call is one jitted, vmapped step: solve,
-integrate, warm start carried on. A call is timed alone and blocked until ready; ``seconds`` is the median.
+integrate, warm start carried on; with ``--steps`` so many, one after another. A call is timed alone and blocked until
+ready; ``seconds`` is the median.
 
 ``error`` is the largest difference of any task's error [m or rad] to float64 on the CPU, in the first lanes, after the
 same steps. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
@@ -160,21 +161,39 @@ def compiled(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
     return program, time.perf_counter() - started
 
 
+def repeated(step: Callable[..., Any], steps: int) -> Callable[..., Any]:
+    """So many steps one after another, with the error after the last and whether all were solved."""
+
+    def many(*args: Any) -> Any:
+        *given, state = args
+        _, error, fine = jax.tree.map(lambda a: jnp.ones(a.shape, a.dtype), jax.eval_shape(step, *args))
+
+        def again(_: Any, carry: Any) -> Any:
+            state, error, solved = step(*given, carry[0])
+            return state, error, solved & carry[2]
+
+        return jax.lax.fori_loop(0, steps, again, (state, error, fine))
+
+    return step if steps == 1 else many
+
+
 @cache
-def reference(robot: str, scheme: str, tasks: str) -> dict[str, np.ndarray]:
+def reference(robot: str, scheme: str, tasks: str = "equality", steps: int = 1) -> dict[str, np.ndarray]:
     """Task errors of all lanes after the checked steps, in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         step, arguments, state = batch_of(setting(robot, tasks), SCHEMES[scheme](), LANES)
-        program, _ = compiled(step, *arguments, state)
+        program, _ = compiled(repeated(step, steps), *arguments, state)
         for _ in range(CHECKED):
             state, error, _ = program(*arguments, state)
         return {name: np.asarray(e) for name, e in error.items()}
 
 
-def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
+def measure(
+    given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, np.ndarray], steps: int
+) -> dict[str, Any]:
     """One row: how fast, how right, how much memory."""
     step, arguments, state = batch_of(given, scheme, batch)
-    program, compile_seconds = compiled(step, *arguments, state)
+    program, compile_seconds = compiled(repeated(step, steps), *arguments, state)
     solved: list[Any] = []
     seconds: list[float] = []
     errors: dict[str, float] = {}
@@ -193,8 +212,9 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
     parts = ("argument_size_in_bytes", "output_size_in_bytes", "temp_size_in_bytes")
     return dict(
         batch=batch,
+        steps=steps,
         seconds=each,
-        steps_per_second=batch / each,
+        steps_per_second=batch * steps / each,
         compile_seconds=compile_seconds,
         solved=float(np.mean(solved)),
         error=max(errors.values()),
@@ -206,19 +226,19 @@ def measure(given: Setting, scheme: osik.Scheme, batch: int, wanted: dict[str, n
 
 
 def sweep(
-    robot: str, scheme: str, precision: str, batches: list[int], tasks: str = "equality"
+    robot: str, scheme: str, precision: str, batches: list[int], tasks: str = "equality", steps: int = 1
 ) -> Iterator[dict[str, Any]]:
     """Rows of growing batches, until a call would take too long or memory runs out."""
     label: dict[str, Any] = dict(robot=robot, scheme=scheme, precision=precision, tasks=tasks)
     last: dict[str, Any] | None = None
-    wanted = reference(robot, scheme, tasks)
+    wanted = reference(robot, scheme, tasks, steps)
     with jax.enable_x64(precision == "float64"):
         given = setting(robot, tasks)
         for batch in sorted(batches):
             if last and last["seconds"] * batch / last["batch"] > LONGEST:
                 return
             try:
-                last = label | measure(given, SCHEMES[scheme](), batch, wanted)
+                last = label | measure(given, SCHEMES[scheme](), batch, wanted, steps)
             except jax.errors.JaxRuntimeError as failure:
                 if "RESOURCE_EXHAUSTED" not in str(failure):
                     raise
@@ -249,7 +269,14 @@ def kept(path: Path | None) -> list[dict[str, Any]]:
 
 def identity(row: dict[str, Any]) -> tuple[Any, ...]:
     """What a row is of."""
-    return row["robot"], row["scheme"], row["precision"], row["batch"], row.get("tasks", "equality")
+    return (
+        row["robot"],
+        row["scheme"],
+        row["precision"],
+        row["batch"],
+        row.get("tasks", "equality"),
+        row.get("steps", 1),
+    )
 
 
 def show(rows: list[dict[str, Any]]) -> None:
@@ -282,12 +309,13 @@ def main() -> None:
     parser.add_argument("--schemes", type=listed(str, SCHEMES), default=list(SCHEMES))
     parser.add_argument("--precisions", type=listed(str, PRECISIONS), default=list(PRECISIONS))
     parser.add_argument("--tasks", type=listed(str, TASKS), default=["equality", "polygon"], help=", ".join(TASKS))
+    parser.add_argument("--steps", type=int, default=1, help="of a call, one after another on the device")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     rows, new = {identity(row): row for row in kept(given.results)}, []
     for scheme in given.schemes:
         for precision in given.precisions:
-            swept = (sweep(given.robot, scheme, precision, given.batches, tasks) for tasks in given.tasks)
+            swept = (sweep(given.robot, scheme, precision, given.batches, tasks, given.steps) for tasks in given.tasks)
             for row in chain.from_iterable(swept):
                 print(json.dumps(row), flush=True)
                 rows[identity(row)] = row

@@ -26,7 +26,7 @@ template <class Team> struct NullSpace {
   using Algebra = LinearAlgebra<Team>;
   static constexpr int VECTORS = 20, INTEGERS = 3;
   Team t;
-  int n, m, ld, lm, lb, ls;  // variables, rows of the longest level; strides of Z and V, of AT, of B, of S
+  int n, m, ld, lm, lb, ls, lf;  // variables, rows of the longest level; strides of Z and V, of AT, of B, of S, of F
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
   bool identity;             // whether Z is the identity
@@ -36,9 +36,9 @@ template <class Team> struct NullSpace {
   double rank_tol;
   double *Z;   // [n, ld] the basis
   double *B;   // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; a right-hand side below them
-  double *AT;  // [n, lm] the level's matrix, transposed
+  double *AT;  // [n, lm] the level's matrix, transposed, while a level begins
   double *V;   // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
-  double *S, *F, *M;  // [min(m, n), ls] a Gram matrix, space to factor it, the inverse of its factor
+  double *S, *F, *M;  // [min(m, n), ls or lf] a Gram matrix, space to factor it, the inverse of its factor
   // vectors, as long as the longer of m and n
   double *X, *LOW, *HIGH, *CURVATURE, *MOTION, *COORDINATES, *VALUE, *WANTED, *BASE_VALUE, *BASE_WANTED, *SQUARE,
       *MISSING, *RIGHT, *DIAGONAL, *INVERSE, *SCALE, *SQUARES;
@@ -51,20 +51,26 @@ template <class Team> struct NullSpace {
   static constexpr OSIK_HOST int row_of_b(int n, int m) { return Team::stride(greater(n, m + smaller(n, m))); }
   // numbers and integers of the workspace
   static constexpr OSIK_HOST int doubles(int n, int m) {
-    return (n + greater(m, n)) * Team::stride(n) + (n + 2) * row_of_b(n, m) + n * Team::stride(m) +
-           3 * smaller(n, m) * Team::stride(smaller(n, m)) + 17 * width(n, m);
+    const int least = smaller(n, m), of_v = greater(m, n) * Team::stride(n), of_at = n * Team::stride(m);
+    const int apart = Team::SPARES_SPACE ? greater(of_v, of_at) : of_v + of_at;
+    return n * Team::stride(n) + (n + 2) * row_of_b(n, m) + apart + (Team::SPARES_SPACE ? 1 : 3) * least * Team::stride(least) +
+           17 * width(n, m);
   }
   static constexpr OSIK_HOST int integers(int n, int m) { return INTEGERS * width(n, m); }
+  static constexpr OSIK_HOST int bytes(int n, int m) {
+    return (doubles(n, m) * int(sizeof(double)) + integers(n, m) * int(sizeof(Int)) + 15) / 16 * 16;
+  }
 
   OSIK_FN NullSpace(int n, int m, double* next, Int* J)
-      : n(n), m(m), ld(Team::stride(n)), lm(Team::stride(m)), lb(row_of_b(n, m)), ls(Team::stride(smaller(n, m))) {
+      : n(n), m(m), ld(Team::stride(n)), lm(Team::stride(m)), lb(row_of_b(n, m)), ls(Team::stride(smaller(n, m))), lf(ls) {
     const int w = width(n, m);
-    for (double** v : {&X, &LOW, &HIGH, &CURVATURE, &MOTION, &COORDINATES, &VALUE, &WANTED, &BASE_VALUE, &BASE_WANTED,
-                       &SQUARE, &MISSING, &RIGHT, &DIAGONAL, &INVERSE, &SCALE, &SQUARES})
-      *v = next, next += w;
-    WORK = next, Z = WORK + lb, B = Z + n * ld, AT = B + (n + 1) * lb, V = AT + n * lm, S = V + greater(m, n) * ld;
-    F = S + smaller(n, m) * ls, M = F + smaller(n, m) * ls;
-    for (Int** v : {&IN_COST, &IN_COST_AT_BASE, &PIVOT}) *v = J, J += w;
+    double** const vectors[] = {&X, &LOW, &HIGH, &CURVATURE, &MOTION, &COORDINATES, &VALUE, &WANTED, &BASE_VALUE, &BASE_WANTED,
+                                &SQUARE, &MISSING, &RIGHT, &DIAGONAL, &INVERSE, &SCALE, &SQUARES};
+    for (double** v : vectors) *v = next, next += w;
+    WORK = next, Z = WORK + lb, B = Z + n * ld, AT = B + (n + 1) * lb, S = next + doubles(n, m) - 17 * w - smaller(n, m) * ls;
+    if constexpr (Team::SPARES_SPACE) V = AT, M = F = B + m, lf = lb;  // in the columns of B that are not in use yet
+    else V = AT + n * lm, M = S, F = M - smaller(n, m) * ls, S = F - smaller(n, m) * ls;
+    IN_COST = J, IN_COST_AT_BASE = J + w, PIVOT = J + 2 * w;
   }
 
   OSIK_FN int free() const { return n - first; }
@@ -74,7 +80,11 @@ template <class Team> struct NullSpace {
   OSIK_FN double distance(int a, double value) const {
     return (level.equality[a] ? level.lower[a] : clip(value, level.lower[a], level.upper[a])) - value;
   }
-  OSIK_FN void evaluate(const double* x, double* value) { Algebra::combine(t, AT, x, value, lm, n, 0, rows, false); }
+  OSIK_FN void evaluate(const double* x, double* value) {
+    if constexpr (Team::SPARES_SPACE)
+      t.each(0, rows, [&](int a) { value[a] = t.own_dot(level.matrix + a * level.row, x, 0, n, level.column); });
+    else Algebra::combine(t, AT, x, value, lm, n, 0, rows, false);
+  }
   // the norm of what the rows miss where their values are value + MISSING
   OSIK_FN double missed(const double* value) {
     return sqrt(t.sum(0, rows, [&](int a) {
@@ -140,12 +150,12 @@ template <class Team> struct NullSpace {
   OSIK_FN bool factor(double ridge) {  // false where a pivot is not positive
     const int count = by_rows ? rows : free();
     t.each(0, count, [&](int k) {
-      for (int j = 0; j < count; ++j) F[k * ls + j] = S[k * ls + j];
-      F[k * ls + k] = DIAGONAL[k] + ridge;
+      for (int j = 0; j < count; ++j) F[k * lf + j] = S[k * ls + j];
+      F[k * lf + k] = DIAGONAL[k] + ridge;
     });
-    return Algebra::inverse_factor(t, F, M, INVERSE, SCALE, ls, count, 0.0);
+    return Algebra::inverse_factor(t, F, M, INVERSE, SCALE, lf, count, 0.0);
   }
-  OSIK_FN void solve_factored(double* y) { Algebra::apply_inverse(t, M, INVERSE, y, SCALE, ls, by_rows ? rows : free()); }
+  OSIK_FN void solve_factored(double* y) { Algebra::apply_inverse(t, M, INVERSE, y, SCALE, lf, by_rows ? rows : free()); }
 
   // ---- damping
   // MISSING = the rows' change along the damped step B (B'B + ridge)^-1 wanted = (B B' + ridge)^-1 B wanted; false where

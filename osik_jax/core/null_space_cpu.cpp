@@ -73,6 +73,9 @@ void saturate(const xla::Call& call) {
 }  // namespace
 
 extern "C" {
+// Bytes of shared memory that a warp needs for one problem, a multiple of 16; m: rows of the longest level.
+int osik_projection_bytes(int n, int m) { return ClassicalProjection<WarpSizes<>>::bytes(n, m); }
+
 void* osik_projection(xla::CallFrame* frame) { return xla::handle<project>(frame); }
 void* osik_row_factors(xla::CallFrame* frame) { return xla::handle<factor_rows>(frame); }
 void* osik_saturation(xla::CallFrame* frame) { return xla::handle<saturate>(frame); }

@@ -9,8 +9,8 @@ problems that it cannot solve. A scheme's backend is that of its whole step.
     backend   weighted QP                          hierarchy                           null space
     "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,
                                                                                        any shape
-              CUDA: any precision, least squares   CUDA: any precision                 CUDA: with bounds,
-                                                                                       any precision
+              CUDA: any precision, least squares   CUDA: any precision                 CUDA: classical or with
+                                                                                       bounds, any precision
     "jax"     none: plain JAX alone, on any platform
 
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks

@@ -10,7 +10,7 @@ import pytest
 from refusals import refuses
 
 import osik_jax as osik
-from benchmarks import jumps, throughput
+from benchmarks import jumps, scaling, throughput
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +45,28 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
     other = tmp_path / "results.json"
     other.write_text(path.read_text())
     (first,) = json.loads(path.read_text())["rows"]
-    monkeypatch.setattr(throughput, "measure", lambda given, scheme, batch, wanted: first | dict(batch=batch, calls=9))
+    monkeypatch.setattr(throughput, "measure", lambda given, scheme, batch, *_: first | dict(batch=batch, calls=9))
     run(monkeypatch, other, "5")
     assert json.loads(other.read_text())["rows"] == [first, first | dict(batch=5, calls=9)]
     run(monkeypatch, other, "3")
     assert [row["calls"] for row in json.loads(other.read_text())["rows"]] == [9, 9]
     monkeypatch.setattr(throughput, "machine", lambda: {"device": "another"})
     refuses(ValueError, "another machine", throughput.kept, other)
+
+
+@pytest.mark.release
+def test_steps_of_a_call_are_those_of_several():
+    step, given, state = throughput.batch_of(throughput.setting("arm7"), osik.WeightedQP(), 3)
+    at_once = jax.jit(throughput.repeated(step, 4))(*given, state)
+    for _ in range(4):
+        state, error, fine = jax.jit(step)(*given, state)
+    jax.tree.map(np.testing.assert_array_equal, at_once, (state, error, fine))
+
+
+@pytest.mark.release
+def test_lanes_of_a_device_are_measured():
+    (row,) = scaling.run("arm7", "weighted", "float64", 4, [1])
+    assert row["solved"] == row["efficiency"] == 1.0 and row["error"] < 1e-12
 
 
 @pytest.mark.release

@@ -11,6 +11,7 @@ from osik_jax.retargeting import _banded as banded
 from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
+from osik_jax.solvers.null_space import _projection_cuda as projection
 from osik_jax.solvers.qp import _cuda as weighted_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
@@ -43,6 +44,7 @@ TEXTS = {
     "more than 32 variables": lambda: weighted_qp._source(5, 35, 2, True, 100, 1),
     "more than 64 variables": lambda: weighted_qp._source(5, 70, 2, True, 100, 1),
     "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
+    "classical projection": lambda: projection._source(35, (12, 3, 3)),
     "bodies": lambda: _cuda._lanes_source(
         "kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((2, 3, 3), *[(2, 2, 3)] * 4)
     ),

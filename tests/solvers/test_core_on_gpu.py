@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from null_space_families import FAMILIES, check_derivatives_of_saturation, saturated
+from null_space_families import FAMILIES, check_derivatives_of_saturation, classical, saturated
 from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 from saturation_families import FAMILIES as SATURATED
@@ -159,6 +159,25 @@ def test_the_kernel_settles_alone(rng):
     cold = kernel(qp, jnp.zeros_like(guess), tolerance)
     assert cold.converged.all()
     assert off(p.A, cold.x, p.solution, p.b).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_classical_projection_lane_by_lane_as_the_plain_method(name):
+    p = FAMILIES[name]
+    found, expected = (classical(p, backend=backend) for backend in ("core", "jax"))
+    assert (found.status == Status.SOLVED).all() and (expected.status == Status.SOLVED).all()
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-9 * (1.0 + np.abs(expected.x).max()))
+    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-11)
+
+
+def test_a_bad_lane_of_the_classical_projection_disturbs_no_other():
+    p = jax.tree.map(np.array, FAMILIES["a humanoid's"])
+    good = classical(p, backend="core")
+    p.levels[1][0][3, 0, 0] = np.nan
+    bad = classical(p, backend="core")
+    others = np.arange(len(p.secondary)) != 3
+    assert bad.status[3] == Status.NUMERICAL_ERROR and np.isfinite(bad.x[3]).all()
+    np.testing.assert_array_equal(np.asarray(bad.x)[others], np.asarray(good.x)[others])
 
 
 @pytest.mark.parametrize("precision", ["float64", "float32"])

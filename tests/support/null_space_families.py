@@ -92,11 +92,16 @@ FAMILIES = {
 @partial(jax.jit, static_argnames="backend")
 def saturated(p: Problems, *, backend: Backend = "auto") -> NullSpaceSolution:
     """Answers of a batch of a family, between -0.4 and 0.4."""
+    return classical(p, 0.4, backend=backend)
+
+
+def classical(p: Problems, bound: float | None = None, *, backend: Backend = "auto") -> NullSpaceSolution:
+    """The same without bounds, or between others."""
 
     def one(p: Problems) -> NullSpaceSolution:
-        bound = jnp.full_like(p.secondary, 0.4)
+        box = () if bound is None else (jnp.full_like(p.secondary, -bound), jnp.full_like(p.secondary, bound))
         levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
-        return solve_nullspace(levels, -bound, bound, secondary=p.secondary, damping=damping, backend=backend)
+        return solve_nullspace(levels, *box, secondary=p.secondary, damping=damping, backend=backend)
 
     return jax.vmap(one)(p)
 

@@ -41,7 +41,12 @@ class Found(NamedTuple):
 @cache
 def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
     """The kernel of a shape as a C library."""
-    text = _cuda._source(m, n, p, single, 1000, 1)
+    return of_warps(folder, _cuda._source(m, n, p, single, 1000, 1), _cuda._bytes(m, n, p, single))
+
+
+@cache
+def of_warps(folder: Path, text: str, shared: int) -> ctypes.CDLL:
+    """A kernel whose problems have a warp each, and so many bytes of shared memory, as a C library."""
     text, copies = re.subn(
         r'asm volatile\("cp\.async\.ca.*?\);', "*to = there ? *from : Real(0);", text, flags=re.DOTALL
     )
@@ -49,8 +54,7 @@ def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
     space = "extern __shared__ __align__(16) double shared_space[];"
     assert (copies, waits, text.count(space)) == (1, 1, 1) and "asm" not in text
     text = text.replace(space, f"alignas(16) static double shared_space[{SHARED // 8}];")
-    run = _RUN.replace("BYTES", str(_cuda._bytes(m, n, p, single)))
-    return compiled(folder, text + run.replace("ARGUMENTS", arguments_of(text)))
+    return compiled(folder, text + _RUN.replace("BYTES", str(shared)).replace("ARGUMENTS", arguments_of(text)))
 
 
 def arguments_of(text: str) -> str:
@@ -69,6 +73,17 @@ def compiled(folder: Path, text: str) -> ctypes.CDLL:
     options = ("-std=c++20", "-O1", "-w", "-shared", "-fPIC", f"-I{Path(__file__).parent}")
     subprocess.run([os.environ.get("CXX") or "c++", *options, "-o", target, source], check=True)
     return ctypes.CDLL(str(target))
+
+
+def call_of_warps(
+    folder: Path, source: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, problems: int, shared: int
+) -> list[np.ndarray]:
+    """Solve each problem with a warp on a CPU, in place of ``core/_cuda.call``."""
+    arrays = [np.ascontiguousarray(a) for a in inputs]
+    results = [np.full(shape, -1, kind) for shape, kind in outputs]
+    pointers = (ctypes.c_void_p * (len(arrays) + len(results)))(*(a.ctypes.data for a in (*arrays, *results)))
+    of_warps(folder, source, shared).run(pointers, problems)
+    return results
 
 
 def call_of_lanes(

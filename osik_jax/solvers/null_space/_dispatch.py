@@ -1,7 +1,7 @@
-"""Choice of backend for the classical projection: on a CPU, the core solves all levels of one problem after another.
+"""Choice of backend for the classical projection: the core solves all levels of one problem after another.
 
-``core/null_space.hpp`` computes what ``_projection.py`` defines, in double precision; nothing is searched, so nothing
-is certified. That file is the definition, what runs elsewhere, and the derivative.
+``core/null_space.hpp`` computes what ``_projection.py`` defines, in double precision, on a CPU or a GPU; nothing is
+searched, so nothing is certified. That file is the definition, what runs elsewhere, and the derivative.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ...execution._lanes import in_lanes
 from ...execution._rules import custom_jvp
 from .._damping import Damping
 from ..hqp import Level
+from . import _projection_cuda
 from ._projection import solve_forward
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
@@ -55,15 +56,27 @@ def _by_kernel_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backe
 def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Array], Answer]:
     """Return the function that solves one problem on the current platform."""
     plain = jax.vmap(partial(_plain, backend=backend))
-    return in_lanes(partial(on_platforms, dict(core=_by_core), plain))
+
+    def solve(levels: list[Level], secondary: Array, *rest: Any) -> Answer:
+        kernels: dict[str, Callable[..., Answer]] = dict(core=partial(_by_core, _library.call))
+        rows = tuple(level.matrix.shape[1] for level in levels)
+        if takes(backend, "core-cuda", fits=_projection_cuda.fits(secondary.shape[1], rows)):
+            kernels["core-cuda"] = partial(_by_core, _projection_cuda.call)
+        return on_platforms(kernels, plain, levels, secondary, *rest)
+
+    return in_lanes(solve)
 
 
 def _by_core(
-    levels: list[Level], secondary: Float[Array, "B n"], damping: Damping, rank_tol: Float[Array, " B"]
+    call: Callable[..., list[Array]],
+    levels: list[Level],
+    secondary: Float[Array, "B n"],
+    damping: Damping,
+    rank_tol: Float[Array, " B"],
 ) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
     batch, n = secondary.shape
     equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
     rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
     outputs = [((batch, n), float), ((batch, n, n), float)]
-    x, projector = _library.call("projection", outputs, secondary, *damping, rank_tol, *rows)
+    x, projector = call("projection", outputs, secondary, *damping, rank_tol, *rows)
     return x, projector

@@ -1,0 +1,82 @@
+"""The classical projection on a GPU (``core/null_space.hpp``), one warp of 32 threads per problem."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ...core import _cuda, _library
+
+_MAX_ROWS = 64  # the triangular solves of a warp hold two entries a thread
+_KERNEL = """
+using namespace osik;
+using Method = ClassicalProjection<Warp<double, N, M, 0>>;
+extern "C" __global__ void __launch_bounds__(32) osik_kernel(
+    const double* secondary, const double* constant, const double* unmet, const double* demand, const double* bends,
+    const double* rank_tol, LEVELS, double* x, double* projector, int problems) {
+  const size_t b = blockIdx.x;
+  const double* const matrices[] = {MATRIX};
+  const double* const lowers[] = {LOWER};
+  const double* const uppers[] = {UPPER};
+  const int* const equalities[] = {EQUAL};
+  Method method(N, M, shared_space, reinterpret_cast<Method::Int*>(shared_space + Method::doubles(N, M)));
+  method.rank_tol = rank_tol[b];
+  method.begin();
+  for (int k = 0; k < L; ++k) {
+    const int rows = ROWS[k];
+    const size_t e = b * L + k, first = b * rows;
+    method.solve_level({matrices[k] + first * N, lowers[k] + first, uppers[k] + first, bends + e * N,
+                        equalities[k] + first, constant[e], unmet[e], demand[e], rows, 1, rows});
+  }
+  method.end(secondary + b * N, x + b * N, projector + b * N * N);
+}
+"""
+
+
+@cache
+def _bytes(n: int, m: int) -> int:
+    """Return the shared memory of one problem, a multiple of 16."""
+    library = _library.core().library
+    assert library is not None
+    return library.osik_projection_bytes(n, m)
+
+
+def fits(n: int, rows: Sequence[int]) -> bool:
+    """Return whether a GPU has room for a problem of n variables and levels of so many rows."""
+    return _cuda.installed() and max(n, *rows) <= _MAX_ROWS and _bytes(n, max(rows)) <= _cuda.SHARED_BYTES
+
+
+@cache
+def _source(n: int, rows: tuple[int, ...]) -> str:
+    def names(kind: str) -> list[str]:
+        return [f"{kind}{k}" for k in range(len(rows))]
+
+    columns = {"MATRIX": names("matrix"), "LOWER": names("lower"), "UPPER": names("upper"), "EQUAL": names("equal")}
+    levels = [name for level in zip(*columns.values(), strict=True) for name in level]
+    text = _KERNEL.replace("LEVELS", ", ".join(f"const {'int' if 'equal' in a else 'double'}* {a}" for a in levels))
+    for key, own in columns.items():
+        text = text.replace(key, ", ".join(own))
+    return _cuda.text_of("null_space.hpp") + _cuda.constants(N=n, M=max(rows), L=len(rows), ROWS=rows) + text
+
+
+def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Array, *given: Array) -> list[Array]:
+    """Solve a batch on the default GPU: as ``_library.call`` of the method "projection" does on a CPU."""
+    (batch, n), kind = secondary.shape, secondary.dtype
+    numbers, levels = given[:5], list(given[5:])
+    # column by column, so that the threads of a warp read neighbours
+    levels[::4] = [jnp.swapaxes(matrix, 1, 2) for matrix in levels[::4]]
+    rows = tuple(a.shape[1] for a in levels[1::4])
+    arrays = [a.astype(jnp.int32) if a.dtype == bool else _cuda.as_double(a) for a in (*numbers, *levels)]
+    results = _cuda.call(
+        _source(n, rows),
+        [(shape, jnp.float64) for shape, _ in outputs],
+        _cuda.as_double(secondary),
+        *arrays,
+        problems=batch,
+        shared=_bytes(n, max(rows)),
+    )
+    return [a.astype(kind) for a in results]

@@ -1,0 +1,28 @@
+"""The GPU's text of the classical projection, on a CPU, beside the CPU's own call. Shared memory holds NaN at first."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import one_warp
+import pytest
+from core_checks import needs_core
+from null_space_families import FAMILIES
+
+from osik_jax.core import _cuda, _library
+from osik_jax.solvers import Damping, Level
+from osik_jax.solvers.null_space import _dispatch, _projection_cuda
+
+pytestmark = needs_core
+
+
+@pytest.mark.parametrize("p", FAMILIES.values(), ids=FAMILIES)
+def test_the_answers_are_those_of_the_cpu(p, tmp_path, monkeypatch):
+    levels = [jax.vmap(lambda *of: Level(*of).scaled())(*level) for level in p.levels]
+    damping = Damping(*(jnp.stack(parts, 1) for parts in zip(*p.damping, strict=True)))
+    given = levels, p.secondary, damping, jnp.full(len(p.secondary), 1e-10)
+    expected = _dispatch._by_core(_library.call, *given)
+    monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_warps, tmp_path))
+    for found, other in zip(_dispatch._by_core(_projection_cuda.call, *given), expected, strict=True):
+        np.testing.assert_allclose(found, other, rtol=0, atol=1e-10 * (1.0 + np.abs(other).max()))
