@@ -8,16 +8,24 @@ import numpy as np
 import one_warp
 import pytest
 from core_checks import needs_core
-from null_space_families import FAMILIES
+from null_space_families import FAMILIES, random_problems
 
 from osik_jax.core import _cuda, _library
 from osik_jax.solvers import Damping, Level
 from osik_jax.solvers.null_space import _dispatch, _projection_cuda
 
 pytestmark = needs_core
+CASES = FAMILIES | {
+    "more than 32 of each": random_problems(20, 40, (12, 45, 3), inequalities=True, damped=True, lanes=3),
+    "no rows": random_problems(21, 5, (0, 0), lanes=1),
+}
 
 
-@pytest.mark.parametrize("p", FAMILIES.values(), ids=FAMILIES)
+@pytest.mark.variants(
+    slow=["independent", "damped", "one variable", "tiny", "huge", "zeros", "repeated", "dependent and damped"],
+    release=["inequalities", "damped inequalities", "dependent", "as many zero rows as are left"],
+)
+@pytest.mark.parametrize("p", CASES.values(), ids=CASES)
 def test_the_answers_are_those_of_the_cpu(p, tmp_path, monkeypatch):
     levels = [jax.vmap(lambda *of: Level(*of).scaled())(*level) for level in p.levels]
     damping = Damping(*(jnp.stack(parts, 1) for parts in zip(*p.damping, strict=True)))
