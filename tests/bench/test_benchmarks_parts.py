@@ -23,7 +23,7 @@ def test_rows_of_all_parts(tmp_path, monkeypatch, capsys):
     assert all(row["seconds"] > 0.0 and row["compile_seconds"] > 0.0 and row["batch"] == 3 for row in rows.values())
     operations = {part: row["operations"] for part, row in rows.items()}
     assert operations["dispatch"] == operations["forward kinematics"] == 1  # a kernel is one
-    assert 1 < operations["rows"] < operations["step"] < operations["gradient"]
+    assert 1 < operations["step"] < operations["rows"] < operations["gradient"]  # a step is one call of the core
     slowest = rows["step"]["slowest"]
     assert len(slowest) == 4 and all(seconds > 0.0 for _, seconds in slowest)
     assert "gradient" in capsys.readouterr().out
