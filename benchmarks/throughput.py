@@ -9,9 +9,10 @@ integrate, warm start carried on; with ``--steps`` so many, one after another. A
 ready; ``seconds`` is the median.
 
 ``error`` is the largest difference of any task's error [m or rad] to float64 on the CPU, in the first lanes, after the
-same steps. ``program_bytes`` is what XLA allots to the program, with its arguments and results; ``device_peak_bytes``
-the most that the device has held in this process, where it says so. A sweep ends where a call would take too long or
-memory runs out. A results file keeps its rows of other schemes, precisions and batches, so a sweep may be run in parts.
+same steps; ``solved`` the share of calls whose steps were all SOLVED. ``program_bytes`` is what XLA allots to the
+program, with its arguments and results; ``device_peak_bytes`` the most that the device has held in this process, where
+it says so. A sweep ends where a call would take too long or memory runs out. A results file keeps its other rows, so a
+sweep may be run in parts.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ DT = 0.005
 LANES = 64
 """Different situations; larger batches repeat them."""
 CHECKED = 10
-"""Steps after which errors are compared; they warm up too."""
+"""Calls after which errors are compared; they warm up too."""
 TIMED = (5, 100)
 """Calls that are timed, at least and at most,"""
 SECONDS = 5.0
@@ -179,7 +180,7 @@ def repeated(step: Callable[..., Any], steps: int) -> Callable[..., Any]:
 
 @cache
 def reference(robot: str, scheme: str, tasks: str = "equality", steps: int = 1) -> dict[str, np.ndarray]:
-    """Task errors of all lanes after the checked steps, in float64 on the CPU."""
+    """Task errors of all lanes after the checked calls, in float64 on the CPU."""
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         step, arguments, state = batch_of(setting(robot, tasks), SCHEMES[scheme](), LANES)
         program, _ = compiled(repeated(step, steps), *arguments, state)
@@ -289,11 +290,21 @@ def show(rows: list[dict[str, Any]]) -> None:
             print(json.dumps(row))
         return
     table = Table(
-        "scheme", "tasks", "precision", "batch", "ms a call", "steps/s", "solved", "error", "compile [s]", "MiB"
+        "scheme",
+        "tasks",
+        "precision",
+        "batch",
+        "steps",
+        "ms a call",
+        "steps/s",
+        "solved",
+        "error",
+        "compile [s]",
+        "MiB",
     )
     for r in rows:
         table.add_row(
-            *(r["scheme"], r.get("tasks", "equality"), r["precision"], f"{r['batch']:,}"),
+            *(r["scheme"], r.get("tasks", "equality"), r["precision"], f"{r['batch']:,}", f"{r.get('steps', 1)}"),
             *(f"{1e3 * r['seconds']:.3g}", f"{r['steps_per_second']:,.0f}", f"{r['solved']:.4f}", f"{r['error']:.1e}"),
             *(f"{r['compile_seconds']:.1f}", f"{r['program_bytes'] / 2**20:.2g}"),
         )
@@ -311,6 +322,8 @@ def main() -> None:
     parser.add_argument("--tasks", type=listed(str, TASKS), default=["equality", "polygon"], help=", ".join(TASKS))
     parser.add_argument("--steps", type=int, default=1, help="of a call, one after another on the device")
     given = parser.parse_args()
+    if given.steps < 1:
+        parser.error(f"--steps is {given.steps}; a call has one or more")
     jax.config.update("jax_enable_x64", True)
     rows, new = {identity(row): row for row in kept(given.results)}, []
     for scheme in given.schemes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
 import re
@@ -19,9 +20,11 @@ from jaxtyping import Array
 
 from . import _build, _library
 
-SHARED_BYTES = 227 * 1024
-"""Largest shared memory of a block [bytes], on compute capability 9.0. Devices with less use the search in plain JAX.
-"""
+_OLDEST = 8  # compute capability that the texts need: copies to shared memory in the background, sums over a warp
+_CAPABILITY, _SHARED_BYTES = (
+    75,
+    97,
+)  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR, ..._MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
 DEFAULT_SHARED_BYTES = 48 * 1024
 """Shared memory [bytes] that every CUDA device offers a block by default."""
 _MOST_SPACES = 1 << 14
@@ -34,8 +37,33 @@ _SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
 
 
 def installed() -> bool:
-    """Return whether the core and NVRTC are installed."""
-    return _library.core().library is not None and nvrtc() is not None
+    """Return whether the core and NVRTC are installed, for a device that can run their texts."""
+    capable = (_attribute(_CAPABILITY) or _OLDEST) >= _OLDEST
+    return _library.core().library is not None and nvrtc() is not None and capable
+
+
+def shared_bytes() -> int:
+    """Return the largest shared memory of a block [bytes]: that of the first device, or 227 KiB if it is not known.
+
+    Problems that need more are solved in plain JAX.
+    """
+    return _attribute(_SHARED_BYTES) or 227 * 1024
+
+
+@cache
+def _attribute(which: int) -> int | None:
+    """Return an attribute of the first device, by CUDA's driver; None if there is none."""
+    try:
+        driver = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return None
+    device, value = ctypes.c_int(), ctypes.c_int()
+    calls = (
+        lambda: driver.cuInit(0),
+        lambda: driver.cuDeviceGet(ctypes.byref(device), 0),
+        lambda: driver.cuDeviceGetAttribute(ctypes.byref(value), which, device),
+    )
+    return value.value if all(call() == 0 for call in calls) else None
 
 
 @cache

@@ -24,7 +24,7 @@ struct NullSpaceLevel {
 template <class Team> struct NullSpace {
   using Int = typename Team::Int;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 20, INTEGERS = 3;
+  static constexpr int VECTORS = 17, INTEGERS = 3;
   Team t;
   int n, m, ld, lm, lb, ls, lf;  // variables, rows of the longest level; strides of Z and V, of AT, of B, of S, of F
   NullSpaceLevel level;
@@ -36,9 +36,11 @@ template <class Team> struct NullSpace {
   double rank_tol;
   double *Z;   // [n, ld] the basis
   double *B;   // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; a right-hand side below them
-  double *AT;  // [n, lm] the level's matrix, transposed, while a level begins
+  double *AT;  // [n, lm] the level's matrix, transposed
   double *V;   // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
   double *S, *F, *M;  // [min(m, n), ls or lf] a Gram matrix, space to factor it, the inverse of its factor
+  // A team that spares space has V in the place of AT, once B is filled, and until a level is solved in its row space F and
+  // M in the columns of B from m on.
   // vectors, as long as the longer of m and n
   double *X, *LOW, *HIGH, *CURVATURE, *MOTION, *COORDINATES, *VALUE, *WANTED, *BASE_VALUE, *BASE_WANTED, *SQUARE,
       *MISSING, *RIGHT, *DIAGONAL, *INVERSE, *SCALE, *SQUARES;
@@ -54,7 +56,7 @@ template <class Team> struct NullSpace {
     const int least = smaller(n, m), of_v = greater(m, n) * Team::stride(n), of_at = n * Team::stride(m);
     const int apart = Team::SPARES_SPACE ? greater(of_v, of_at) : of_v + of_at;
     return n * Team::stride(n) + (n + 2) * row_of_b(n, m) + apart + (Team::SPARES_SPACE ? 1 : 3) * least * Team::stride(least) +
-           17 * width(n, m);
+           VECTORS * width(n, m);
   }
   static constexpr OSIK_HOST int integers(int n, int m) { return INTEGERS * width(n, m); }
   static constexpr OSIK_HOST int bytes(int n, int m) {
@@ -67,8 +69,8 @@ template <class Team> struct NullSpace {
     double** const vectors[] = {&X, &LOW, &HIGH, &CURVATURE, &MOTION, &COORDINATES, &VALUE, &WANTED, &BASE_VALUE, &BASE_WANTED,
                                 &SQUARE, &MISSING, &RIGHT, &DIAGONAL, &INVERSE, &SCALE, &SQUARES};
     for (double** v : vectors) *v = next, next += w;
-    WORK = next, Z = WORK + lb, B = Z + n * ld, AT = B + (n + 1) * lb, S = next + doubles(n, m) - 17 * w - smaller(n, m) * ls;
-    if constexpr (Team::SPARES_SPACE) V = AT, M = F = B + m, lf = lb;  // in the columns of B that are not in use yet
+    WORK = next, Z = WORK + lb, B = Z + n * ld, AT = B + (n + 1) * lb, S = next + doubles(n, m) - VECTORS * w - smaller(n, m) * ls;
+    if constexpr (Team::SPARES_SPACE) V = AT, M = F = B + m, lf = lb;
     else V = AT + n * lm, M = S, F = M - smaller(n, m) * ls, S = F - smaller(n, m) * ls;
     IN_COST = J, IN_COST_AT_BASE = J + w, PIVOT = J + 2 * w;
   }

@@ -69,3 +69,19 @@ def test_nvrtc_compiles_every_text(name):
     assert nvrtc.nvrtcCreateProgram(ctypes.byref(program), TEXTS[name]().encode(), b"osik.cu", 0, None, None) == 0
     options = b"--gpu-architecture=sm_90", b"--std=c++20", b"--device-as-default-execution-space"
     assert nvrtc.nvrtcCompileProgram(program, 3, (ctypes.c_char_p * 3)(*options)) == 0
+
+
+@needs_core
+@pytest.mark.parametrize("shared, capability, fit", [(227, 9, True), (99, 8, False), (227, 7, False)])
+def test_what_does_not_fit_a_device_is_left_to_plain_jax(shared, capability, fit, monkeypatch):
+    device = {_cuda._SHARED_BYTES: shared * 1024, _cuda._CAPABILITY: capability}
+    monkeypatch.setattr(_cuda, "_attribute", device.get)
+    monkeypatch.setattr(_cuda, "nvrtc", lambda: "libnvrtc.so")
+    levels = Layout(64, 3, 64, (64, 64, 0), (-1,) * 64, ())
+    assert projection.fits(48, (48,)) == hierarchy.fits(levels) == fit
+    assert projection.fits(7, (3, 3)) == (capability >= 8)
+
+
+def test_a_device_that_is_not_known_is_asked_for_nothing():
+    if _cuda._attribute(_cuda._CAPABILITY) is None:  # no driver
+        assert _cuda.shared_bytes() == 227 * 1024

@@ -17,6 +17,8 @@ from osik_jax.solvers.null_space import _dispatch, _projection_cuda
 pytestmark = needs_core
 CASES = FAMILIES | {
     "more than 32 of each": random_problems(20, 40, (12, 45, 3), inequalities=True, damped=True, lanes=3),
+    "more than 64 rows": random_problems(22, 6, (70, 3), damped=True, lanes=2),
+    "more than 64 variables": random_problems(23, 70, (6, 3), damped=True, lanes=2),
     "no rows": random_problems(21, 5, (0, 0), lanes=1),
 }
 

@@ -46,7 +46,7 @@ def _bytes(layout: Layout) -> int:
 
 def fits(layout: Layout) -> bool:
     """Return whether a GPU has room for a problem."""
-    return _cuda.installed() and layout.rows <= _MAX_ROWS and _bytes(layout) <= _cuda.SHARED_BYTES
+    return _cuda.installed() and layout.rows <= _MAX_ROWS and _bytes(layout) <= _cuda.shared_bytes()
 
 
 @cache

@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 from ...core import _cuda, _library
 
-_MAX_ROWS = 64  # the triangular solves of a warp hold two entries a thread
+_MAX_RANK = 64  # the triangular solves of a warp hold two entries a thread
 _KERNEL = """
 using namespace osik;
 using Method = ClassicalProjection<Warp<double, N, M, 0>>;
@@ -47,7 +47,8 @@ def _bytes(n: int, m: int) -> int:
 
 def fits(n: int, rows: Sequence[int]) -> bool:
     """Return whether a GPU has room for a problem of n variables and levels of so many rows."""
-    return _cuda.installed() and max(n, *rows) <= _MAX_ROWS and _bytes(n, max(rows)) <= _cuda.SHARED_BYTES
+    most = max(rows)
+    return _cuda.installed() and min(n, most) <= _MAX_RANK and _bytes(n, most) <= _cuda.shared_bytes()
 
 
 @cache

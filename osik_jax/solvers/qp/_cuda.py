@@ -46,7 +46,7 @@ def fits(qp: QP) -> bool:
     if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
         return False
     m, n = qp.cost.matrix.shape[-2:]
-    return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.SHARED_BYTES
+    return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.shared_bytes()
 
 
 @cache
