@@ -34,7 +34,7 @@ LAST_VELOCITY = "last_velocity"
 """Input of a controller whose tasks or limits remember the velocity of the last step."""
 PLATFORMS = ("cpu", "cuda")
 _PIVOTED_QR = ("lapack_dgeqp3_ffi", "lapack_sgeqp3_ffi", "cuhybrid_geqp3")
-"""Calls of a pivoted QR, which hierarchies need; JAX guarantees them for its own release alone."""
+"""Calls of a pivoted QR, which hierarchies and saturation need; JAX guarantees them for its own release alone."""
 
 
 def export_controller(

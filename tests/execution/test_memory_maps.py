@@ -64,7 +64,7 @@ body = '<body><joint name="a" axis="0 1 0"/><geom size=".1"/><site name="tip" po
 robot = osik.Robot.from_mjcf(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
 counts = [counted_maps()]
 for rows in ("position", "orientation"):
-    osik.solve(robot, robot.q0, {"tip": osik.FrameTask(robot, "tip", rows=rows)})
+    osik.solve(robot, robot.q0, {"tip": osik.FrameTask(robot, "tip", rows=rows)}, scheme=osik.HierarchicalQP(backend="jax"))
 counts.append(counted_maps())
 jax.clear_caches()
 gc.collect()
