@@ -241,6 +241,12 @@ def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
     return (*range(1, axes), 0) if lanes_last else tuple(range(axes))
 
 
+@cache
+def space_of(method: str, *sizes: int) -> int:
+    """Return the shared memory that a problem of these sizes takes [bytes], by the core's ``osik_{method}_bytes``."""
+    return getattr(_library.core().library, f"osik_{method}_bytes")(*sizes)
+
+
 def problems_of_a_block(problems: int) -> int:
     """Return how many problems each block solves, so that the workspace of all blocks in global memory is bounded."""
     return -(-problems // _MOST_SPACES)

@@ -36,12 +36,8 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
 """
 
 
-@cache
 def _bytes(layout: Layout) -> int:
-    """Return the shared memory of one problem, a multiple of 16."""
-    library = _library.core().library
-    assert library is not None
-    return library.osik_hierarchy_bytes(layout.levels, layout.rows, layout.variables, len(layout.level_of_hard))
+    return _cuda.space_of("hierarchy", layout.levels, layout.rows, layout.variables, len(layout.level_of_hard))
 
 
 def fits(layout: Layout) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ...core import _cuda, _library
+from ...core import _cuda
 
 _MAX_RANK = 64  # the triangular solves of a warp hold two entries a thread
 _KERNEL = """
@@ -37,18 +37,14 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
 """
 
 
-@cache
-def _bytes(n: int, m: int) -> int:
-    """Return the shared memory of one problem, a multiple of 16."""
-    library = _library.core().library
-    assert library is not None
-    return library.osik_projection_bytes(n, m)
-
-
 def fits(n: int, rows: Sequence[int]) -> bool:
     """Return whether a GPU has room for a problem of n variables and levels of so many rows."""
     most = max(rows)
-    return _cuda.installed() and min(n, most) <= _MAX_RANK and _bytes(n, most) <= _cuda.shared_bytes()
+    return (
+        _cuda.installed()
+        and min(n, most) <= _MAX_RANK
+        and _cuda.space_of("projection", n, most) <= _cuda.shared_bytes()
+    )
 
 
 @cache
@@ -78,6 +74,6 @@ def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Arra
         _cuda.as_double(secondary),
         *arrays,
         problems=batch,
-        shared=_bytes(n, max(rows)),
+        shared=_cuda.space_of("projection", n, max(rows)),
     )
     return [a.astype(kind) for a in results]

@@ -49,12 +49,8 @@ def fits(qp: QP) -> bool:
     return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.shared_bytes()
 
 
-@cache
 def _bytes(m: int, n: int, p: int, single: bool) -> int:
-    """Return the shared memory of one problem, a multiple of 16."""
-    library = _library.core().library
-    assert library is not None
-    return library.osik_weighted_qp_bytes(m, n, p, int(single))
+    return _cuda.space_of("weighted_qp", m, n, p, int(single))
 
 
 @cache
