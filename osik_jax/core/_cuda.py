@@ -38,8 +38,8 @@ _SYSTEM_INCLUDE = re.compile(r"^#include <.*>\n", re.MULTILINE)
 
 def installed() -> bool:
     """Return whether the core and NVRTC are installed, for a device that can run their texts."""
-    capable = (_attribute(_CAPABILITY) or _OLDEST) >= _OLDEST
-    return _library.core().library is not None and nvrtc() is not None and capable
+    found = _library.core().library is not None and nvrtc() is not None
+    return found and (_attribute(_CAPABILITY) or _OLDEST) >= _OLDEST
 
 
 def shared_bytes() -> int:
