@@ -21,10 +21,8 @@ from jaxtyping import Array
 from . import _build, _library
 
 _OLDEST = 8  # compute capability that the texts need: copies to shared memory in the background, sums over a warp
-_CAPABILITY, _SHARED_BYTES = (
-    75,
-    97,
-)  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR, ..._MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
+_CAPABILITY = 75  # CU_DEVICE_ATTRIBUTE_COMPUTE_CAPABILITY_MAJOR
+_SHARED_BYTES = 97  # CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
 DEFAULT_SHARED_BYTES = 48 * 1024
 """Shared memory [bytes] that every CUDA device offers a block by default."""
 _MOST_SPACES = 1 << 14
@@ -52,7 +50,7 @@ def shared_bytes() -> int:
 
 @cache
 def _attribute(which: int) -> int | None:
-    """Return an attribute of the first device, by CUDA's driver; None if there is none."""
+    """Return an attribute of the first device, by CUDA's driver; None if that does not say."""
     try:
         driver = ctypes.CDLL("libcuda.so.1")
     except OSError:
