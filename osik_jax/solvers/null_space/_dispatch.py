@@ -57,8 +57,8 @@ def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Arr
     """Return the function that solves one problem on the current platform."""
     plain = jax.vmap(partial(_plain, backend=backend))
 
-    def solve(levels: list[Level], secondary: Array, *rest: Any) -> Answer:
-        kernels: dict[str, Callable[..., Answer]] = dict(core=partial(_by_core, _library.call))
+    def solve(levels: list[Level], secondary: Float[Array, "B n"], *rest: Any) -> Any:
+        kernels: dict[str, Callable[..., Any]] = dict(core=partial(_by_core, _library.call))
         rows = tuple(level.matrix.shape[1] for level in levels)
         if takes(backend, "core-cuda", fits=_projection_cuda.fits(secondary.shape[1], rows)):
             kernels["core-cuda"] = partial(_by_core, _projection_cuda.call)
