@@ -270,14 +270,8 @@ def kept(path: Path | None) -> list[dict[str, Any]]:
 
 def identity(row: dict[str, Any]) -> tuple[Any, ...]:
     """What a row is of."""
-    return (
-        row["robot"],
-        row["scheme"],
-        row["precision"],
-        row["batch"],
-        row.get("tasks", "equality"),
-        row.get("steps", 1),
-    )
+    of_call = row["batch"], row.get("tasks", "equality"), row.get("steps", 1)
+    return row["robot"], row["scheme"], row["precision"], *of_call
 
 
 def show(rows: list[dict[str, Any]]) -> None:
@@ -289,19 +283,8 @@ def show(rows: list[dict[str, Any]]) -> None:
         for row in rows:
             print(json.dumps(row))
         return
-    table = Table(
-        "scheme",
-        "tasks",
-        "precision",
-        "batch",
-        "steps",
-        "ms a call",
-        "steps/s",
-        "solved",
-        "error",
-        "compile [s]",
-        "MiB",
-    )
+    heads = "scheme, tasks, precision, batch, steps, ms a call, steps/s, solved, error, compile [s], MiB"
+    table = Table(*heads.split(", "))
     for r in rows:
         table.add_row(
             *(r["scheme"], r.get("tasks", "equality"), r["precision"], f"{r['batch']:,}", f"{r.get('steps', 1)}"),
