@@ -89,11 +89,6 @@ def text_of(header: str) -> str:
     return rolled(inlined(header))
 
 
-def text_of_parts(folder: str, parts: Sequence[str]) -> str:
-    """Return the CUDA files of a kernel whose text is in several."""
-    return "\n".join((_build.FOLDER / folder / f"{part}.cu").read_text() for part in parts)
-
-
 def rolled(text: str) -> str:
     """Return CUDA text with loop unrolling disabled, except for loops marked for unrolling."""
     return _LOOP.sub(r"#pragma unroll 1\n\g<0>", text)
@@ -243,6 +238,12 @@ def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
 def space_of(method: str, *sizes: int) -> int:
     """Return the shared memory that a problem of these sizes takes [bytes], by the core's ``osik_{method}_bytes``."""
     return getattr(_library.core().library, f"osik_{method}_bytes")(*sizes)
+
+
+@cache
+def space_beside(method: str, *sizes: int) -> int:
+    """Return how many numbers a problem has in global memory, by the core's ``osik_{method}_outside``."""
+    return getattr(_library.core().library, f"osik_{method}_outside")(*sizes)
 
 
 def problems_of_a_block(problems: int) -> int:

@@ -741,9 +741,12 @@ template <class Team> struct Hierarchy {
     feasible_tol = p.tolerances[3];
     const bool warm = t.count(0, size.L * m, [&](int e) { return p.guess_own[e] != 0; }) > 0;
     changes = factorizations = 0;
-    Outcome all = solve_levels(p, to, warm);
-    // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
-    if (warm && !(all.done && largest <= MAX_DETOUR * x_max)) all = solve_levels(p, to, false);
+    Outcome all;
+    for (bool guessed = warm;; guessed = false) {
+      all = solve_levels(p, to, guessed);
+      // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
+      if (!guessed || (all.done && largest <= MAX_DETOUR * x_max)) break;
+    }
     t.each(0, n, [&](int i) {  // a bound that levels narrowed for those below them is none of the box
       const int at = ACTIVE_BOUND[i];
       const bool narrowed = at < 0 ? HARD_LOWER[i] > p.hard_lower[i] : HARD_UPPER[i] < p.hard_upper[i];

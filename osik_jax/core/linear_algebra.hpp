@@ -121,10 +121,12 @@ template <class Team> struct LinearAlgebra {
   // Householder QR with column pivoting of R [rows, n] over the columns [first, n): Q' R replaces R. A column is a pivot
   // while it is longer than `least`; the longest remaining column is taken first.
   // V: [rank, ld_V] reflections, scale: [rank], pivot: [rank] columns, squares: [n] squared lengths of the columns.
-  // Returns the rank.
+  // Returns the rank. OUTSIDE: V is in global memory.
+  template <bool OUTSIDE = false>
   OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* squares, Real* scales, Int* pivot, int ld, int ld_V,
                                   int rows, int first, int n, Real least) {
-    t.are_shared(R, V, squares, scales, pivot);
+    t.are_shared(R, squares, scales, pivot);
+    if constexpr (!OUTSIDE) t.are_shared(V);
     int rank = 0;
     if (rows > 0)
       t.columns(first, n, [&](auto c) {
@@ -171,10 +173,13 @@ template <class Team> struct LinearAlgebra {
     return even += odd;
   }
 
-  // out[j] = sum_k v[k] M[k, j] over the first `rows` rows of M, for start <= j < stop; `add`: added to what out has
+  // out[j] = sum_k v[k] M[k, j] over the first `rows` rows of M, for start <= j < stop; `add`: added to what out has;
+  // OUTSIDE: M is in global memory
+  template <bool OUTSIDE = false>
   OSIK_CALL static void combine(Team t, const Real* M, const Real* v, Real* out, int ld, int rows, int start, int stop,
                                 bool add) {
-    t.are_shared(M, v, out);
+    t.are_shared(v, out);
+    if constexpr (!OUTSIDE) t.are_shared(M);
     t.columns(start, stop, [&](auto c) {
       auto total = weighted_sum(c, v, M, ld, 0, rows);
       c.store(out, add ? total += c.load(out) : total);
@@ -198,7 +203,7 @@ OSIK_UNROLL
   // M <- Q'M of the first `count` rows and n columns of M, with the reflections of pivoted_qr, two at a time
   OSIK_CALL static void apply_reflections(Team t, const Real* V, const Real* scales, Real* M, int ld_V, int ld,
                                           int rank, int count, int n) {
-    t.are_shared(V, scales, M);
+    t.are_shared(scales, M);
     for (int k = 0; k < rank; k += 2) {
       const bool two = k + 1 < rank;
       const Real *v = V + k * ld_V, *w = two ? v + ld_V : v, scale_v = scales[k], scale_w = two ? scales[k + 1] : 0;
@@ -261,7 +266,6 @@ OSIK_UNROLL
   // `upper`: of a symmetric product, on and above the diagonal
   OSIK_CALL static void product(Team t, const Real* A, int row, int column, const Real* M, int ld, Real* out, int ld_out,
                                 int rows, int inner, int n, bool upper = false) {
-    t.are_shared(A, M, out);
     const Real factor[4] = {1, 1, 1, 1};
     for (int first = 0; first < rows; first += 4) {
       const Real* r[4];

@@ -13,7 +13,8 @@
 
 namespace osik {
 
-// The data of a level, weights multiplied in. Entry i of row a is at matrix[a row + i column].
+// The data of a level, weights multiplied in. Entry i of row a is at matrix[a row + i column]; row is 1 for a team that
+// spares space.
 struct NullSpaceLevel {
   const double *matrix, *lower, *upper, *bends;  // [rows, n], [rows], [rows], [n]
   const int* equality;                           // [rows] flags
@@ -21,12 +22,16 @@ struct NullSpaceLevel {
   int rows, row, column;
 };
 
+struct NullSpaceSizes {
+  int n, m;  // variables, rows of the longest level
+};
+
 template <class Team> struct NullSpace {
   using Int = typename Team::Int;
+  using Sizes = NullSpaceSizes;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 17, INTEGERS = 3;
+  static constexpr int VECTORS = 17, INTEGERS = 10;
   Team t;
-  int n, m, ld, lm, lb, ls, lf;  // variables, rows of the longest level; strides of Z and V, of AT, of B, of S, of F
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
   bool identity;             // whether Z is the identity
@@ -34,45 +39,100 @@ template <class Team> struct NullSpace {
   bool gram_in_cost;         // whether S is that of the rows in the cost at X
   double longest_square, frobenius, damping;  // of the level's longest row, of its matrix, of the level
   double rank_tol;
-  double *Z;   // [n, ld] the basis
-  double *B;   // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; a right-hand side below them
-  double *AT;  // [n, lm] the level's matrix, transposed
-  double *V;   // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
-  double *S, *F, *M;  // [min(m, n), ls or lf] a Gram matrix, space to factor it, the inverse of its factor
-  // A team that spares space has V in the place of AT, once B is filled, and until a level is solved in its row space F and
-  // M in the columns of B from m on.
-  // vectors, as long as the longer of m and n
-  double *X, *LOW, *HIGH, *CURVATURE, *MOTION, *COORDINATES, *VALUE, *WANTED, *BASE_VALUE, *BASE_WANTED, *SQUARE,
-      *MISSING, *RIGHT, *DIAGONAL, *INVERSE, *SCALE, *SQUARES;
-  double* WORK;  // as long as a row of B
-  Int *IN_COST, *IN_COST_AT_BASE, *PIVOT;
 
+  // ---- the workspace: where each array begins, in bytes
   static constexpr OSIK_HOST int smaller(int a, int b) { return a < b ? a : b; }
   static constexpr OSIK_HOST int greater(int a, int b) { return a < b ? b : a; }
-  static constexpr OSIK_HOST int width(int n, int m) { return Team::stride(greater(n, m)); }
-  static constexpr OSIK_HOST int row_of_b(int n, int m) { return Team::stride(greater(n, m + smaller(n, m))); }
-  // numbers and integers of the workspace
-  static constexpr OSIK_HOST int doubles(int n, int m) {
-    const int least = smaller(n, m), of_v = greater(m, n) * Team::stride(n), of_at = n * Team::stride(m);
-    const int apart = Team::SPARES_SPACE ? greater(of_v, of_at) : of_v + of_at;
-    return n * Team::stride(n) + (n + 2) * row_of_b(n, m) + apart + (Team::SPARES_SPACE ? 1 : 3) * least * Team::stride(least) +
-           VECTORS * width(n, m);
+  template <int K> struct SizeAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) {
+      const int n = Team::variables(s.n), m = Team::level_rows(s.m), of_b = Team::stride(greater(n, m + smaller(n, m)));
+      const int of_s = Team::stride(smaller(n, m));
+      const int size[] = {n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s, Team::stride(greater(n, m))};
+      return size[K];
+    }
+  };
+  template <int K> using Size = typename Team::template Fixed<SizeAt<K>, Sizes>;
+  Size<0> n;
+  Size<1> m;
+  Size<2> ld;  // strides of Z and V, of AT, of B, of S, of F
+  Size<3> lm;
+  Size<4> lb;
+  Size<5> ls;
+  Size<6> lf;
+  // the numbers before matrix `which`, in the order of the matrices below; the last is the end
+  static constexpr OSIK_HOST int numbers_before(int which, const Sizes& s) {
+    const int n = Team::variables(s.n), least = smaller(n, Team::level_rows(s.m)) * SizeAt<5>::of(s), apart = Team::SPARES_SPACE ? 0 : 1;
+    const int size[] = {SizeAt<4>::of(s), n * SizeAt<2>::of(s), (n + 1) * SizeAt<4>::of(s), apart * n * SizeAt<3>::of(s),
+                        apart * least, apart * least, apart * numbers_outside(s)};
+    int count = VECTORS * SizeAt<7>::of(s);
+    for (int i = 0; i < which; ++i) count += size[i];
+    return count;
   }
-  static constexpr OSIK_HOST int integers(int n, int m) { return INTEGERS * width(n, m); }
-  static constexpr OSIK_HOST int bytes(int n, int m) {
-    return (doubles(n, m) * int(sizeof(double)) + integers(n, m) * int(sizeof(Int)) + 15) / 16 * 16;
+  // of V and S, which are in global memory if the team spares space
+  static constexpr OSIK_HOST int numbers_outside(const Sizes& s) {
+    const int n = Team::variables(s.n), m = Team::level_rows(s.m);
+    return greater(m, n) * SizeAt<2>::of(s) + smaller(n, m) * SizeAt<5>::of(s);
   }
+  static constexpr OSIK_HOST int bytes(const Sizes& s) {
+    return (int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * INTEGERS * SizeAt<7>::of(s) + 15) / 16 * 16;
+  }
+  template <int K, int COLUMN = 0> struct MatrixAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) {
+      return int(sizeof(double)) * (numbers_before(K, s) + COLUMN * Team::level_rows(s.m));
+    }
+  };
+  template <int K> struct VectorAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) { return int(sizeof(double)) * K * SizeAt<7>::of(s); }
+  };
+  template <int K> struct LabelsAt {
+    static constexpr OSIK_HOST int of(const Sizes& s) {
+      return int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * K * SizeAt<7>::of(s);
+    }
+  };
+  template <class At> using Matrix = typename Team::template Array<double, At, Sizes>;
+  template <int K> using Numbers = typename Team::template Array<double, VectorAt<K>, Sizes>;
+  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, Sizes>;
+  template <int K> using InPlaceAt = MatrixAt<Team::SPARES_SPACE ? 2 : K, Team::SPARES_SPACE>;
+  Matrix<MatrixAt<0>> WORK;  // as long as a row of B
+  Matrix<MatrixAt<1>> Z;     // [n, ld] the basis
+  Matrix<MatrixAt<2>> B;     // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; a right-hand side below them
+  Matrix<MatrixAt<3>> AT;    // [n, lm] the level's matrix, transposed; as it is given, if the team spares space
+  // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: both in the columns of B from m on, if the
+  // team spares space, until the level is solved in its row space
+  Matrix<InPlaceAt<4>> F;
+  Matrix<InPlaceAt<5>> M;
+  double *V;  // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
+  double *S;  // [min(m, n), ls] a Gram matrix
+  // vectors, as long as the longer of m and n
+  Numbers<0> X;
+  Numbers<1> LOW;
+  Numbers<2> HIGH;
+  Numbers<3> CURVATURE;
+  Numbers<4> MOTION;
+  Numbers<5> COORDINATES;
+  Numbers<6> WANTED;
+  Numbers<7> MISSING;
+  Numbers<8> VALUE;
+  Numbers<9> BASE_VALUE;
+  Numbers<10> BASE_WANTED;
+  Numbers<11> SQUARE;
+  Numbers<12> RIGHT;
+  Numbers<13> DIAGONAL;
+  Numbers<14> INVERSE;
+  Numbers<15> SCALE;
+  Numbers<16> SQUARES;
+  Labels<0> IN_COST;
+  Labels<1> IN_COST_AT_BASE;
+  Labels<2> PIVOT;
 
-  OSIK_FN NullSpace(int n, int m, double* next, Int* J)
-      : n(n), m(m), ld(Team::stride(n)), lm(Team::stride(m)), lb(row_of_b(n, m)), ls(Team::stride(smaller(n, m))), lf(ls) {
-    const int w = width(n, m);
-    double** const vectors[] = {&X, &LOW, &HIGH, &CURVATURE, &MOTION, &COORDINATES, &VALUE, &WANTED, &BASE_VALUE, &BASE_WANTED,
-                                &SQUARE, &MISSING, &RIGHT, &DIAGONAL, &INVERSE, &SCALE, &SQUARES};
-    for (double** v : vectors) *v = next, next += w;
-    WORK = next, Z = WORK + lb, B = Z + n * ld, AT = B + (n + 1) * lb, S = next + doubles(n, m) - VECTORS * w - smaller(n, m) * ls;
-    if constexpr (Team::SPARES_SPACE) V = AT, M = F = B + m, lf = lb;
-    else V = AT + n * lm, M = S, F = M - smaller(n, m) * ls, S = F - smaller(n, m) * ls;
-    IN_COST = J, IN_COST_AT_BASE = J + w, PIVOT = J + 2 * w;
+  template <class... Arrays> OSIK_FN void place(char* space, const Sizes& s, Arrays&... arrays) { (arrays.place(space, s), ...); }
+  // outside: space of V and S, if the team spares space
+  OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr)
+      : n(s), m(s), ld(s), lm(s), lb(s), ls(s), lf(s) {
+    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE, BASE_VALUE,
+          BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
+    V = Team::SPARES_SPACE ? outside : reinterpret_cast<double*>(space) + numbers_before(6, s);
+    S = V + greater(m, n) * ld;
   }
 
   OSIK_FN int free() const { return n - first; }
@@ -107,10 +167,15 @@ template <class Team> struct NullSpace {
   OSIK_METHOD void begin_level(const NullSpaceLevel& given) {
     level = given;
     rows = int(t.most(0.0, 0, given.rows, [&](int a, double so_far) { return is_nothing(a) ? so_far : a + 1.0; }));
-    Algebra::transpose(t, level.matrix, level.row, level.column, AT, lm, rows, n);
+    const double* turned = level.matrix;
+    int apart = level.column;
+    if constexpr (!Team::SPARES_SPACE) {
+      Algebra::transpose(t, level.matrix, level.row, level.column, AT, lm, rows, n);
+      turned = AT, apart = lm;
+    }
     t.columns(0, rows, [&](auto c) {
       auto total = typename decltype(c)::P(0.0);
-      for (int i = 0; i < n; ++i) total.square(c.load(AT + i * lm));
+      for (int i = 0; i < n; ++i) total.square(c.load(turned + i * apart));
       c.store(SQUARE, total);
     });
     longest_square = t.most(0.0, 0, rows, [&](int a, double) { return SQUARE[a]; });
@@ -122,10 +187,10 @@ template <class Team> struct NullSpace {
     });
     if (identity)
       t.each(0, n, [&](int i) {
-        for (int a = 0; a < rows; ++a) B[i * lb + a] = AT[i * lm + a];
+        for (int a = 0; a < rows; ++a) B[i * lb + a] = turned[i * apart + a];
       });
     else
-      Algebra::product(t, free_basis(), ld, 1, AT, lm, free_rows(), lb, free(), n, rows);
+      Algebra::product(t, free_basis(), ld, 1, turned, apart, free_rows(), lb, free(), n, rows);
     gram_in_cost = false;
   }
 
@@ -173,7 +238,7 @@ template <class Team> struct NullSpace {
       }
       t.each(0, free(), [&](int j) { COORDINATES[j] = t.own_dot(B + (first + j) * lb, RIGHT, 0, rows); });
     } else {
-      Algebra::combine(t, V, wanted, COORDINATES, ld, rows, 0, free(), false);
+      Algebra::template combine<Team::SPARES_SPACE>(t, V, wanted, COORDINATES, ld, rows, 0, free(), false);
       solve_factored(COORDINATES);
     }
     Algebra::combine(t, free_rows(), COORDINATES, MISSING, lb, free(), 0, rows, false);
@@ -224,11 +289,11 @@ template <class Team> struct NullSpace {
     double least = mean;
     for (int j = 0; j < count; ++j) least /= INVERSE[j] * mean;
     if (!(least >= INDEPENDENT_ROWS * trace && least - damping > 2.0 * rows * cutoff * cutoff)) return false;
-    Algebra::combine(t, V, WANTED, COORDINATES, ld, rows, 0, count, false);
+    Algebra::template combine<Team::SPARES_SPACE>(t, V, WANTED, COORDINATES, ld, rows, 0, count, false);
     solve_factored(COORDINATES);
     Algebra::combine(t, free_rows(), COORDINATES, MISSING, lb, count, 0, rows, false);
     t.each(0, rows, [&](int a) { MISSING[a] = WANTED[a] - MISSING[a]; });
-    Algebra::combine(t, V, MISSING, RIGHT, ld, rows, 0, count, false);
+    Algebra::template combine<Team::SPARES_SPACE>(t, V, MISSING, RIGHT, ld, rows, 0, count, false);
     t.axpy(RIGHT, -damping, COORDINATES, 0, count);
     solve_factored(RIGHT);
     t.axpy(COORDINATES, 1.0, RIGHT, 0, count);
@@ -257,7 +322,7 @@ template <class Team> struct NullSpace {
         if (!IN_COST[a])
           for (int j = first; j < n; ++j) B[j * lb + a] = 0.0;
       });
-      rank = Algebra::pivoted_qr(t, free_rows(), V, SQUARES, SCALE, PIVOT, lb, ld, count, 0, rows, cutoff);
+      rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, free_rows(), V, SQUARES, SCALE, PIVOT, lb, ld, count, 0, rows, cutoff);
       solve_in_row_space();
       if (rank < count) {
         Algebra::apply_reflections(t, V, SCALE, free_basis(), ld, ld, rank, count, n);

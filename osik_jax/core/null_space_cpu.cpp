@@ -20,9 +20,9 @@ void project(const xla::Call& call) {
   int m = 0;
   for (int k = 0; k < L; ++k) m = m < call.size(first_level + 4 * k, 1) ? call.size(first_level + 4 * k, 1) : m;
   using Method = ClassicalProjection<Team>;
-  std::vector<double> space(Method::doubles(n, m));
-  std::vector<int> labels(Method::integers(n, m));
-  Method method(n, m, space.data(), labels.data());
+  const NullSpaceSizes sizes{n, m};
+  std::vector<double> space(Method::bytes(sizes) / sizeof(double));
+  Method method(sizes, reinterpret_cast<char*>(space.data()));
   for (size_t b = 0; b < size_t(batch); ++b) {
     method.rank_tol = call.in<double>(5)[b];
     method.begin();
@@ -54,16 +54,15 @@ void saturate(const xla::Call& call) {
   const int batch = call.size(0, 0), L = call.size(0, 1), m = call.size(0, 2), n = call.size(0, 3);
   auto numbers = [&](int k) { return call.in<double>(k); };
   using Method = Saturation<Team>;
-  const int rows = m > n ? m : n;  // joints that stop a level are factored like rows
-  std::vector<double> space(Method::doubles(n, rows));
-  std::vector<int> labels(Method::integers(n, rows));
-  Method method(n, rows, space.data(), labels.data());
+  const NullSpaceSizes sizes{n, m};
+  std::vector<double> space(Method::bytes(sizes) / sizeof(double));
+  Method method(sizes, reinterpret_cast<char*>(space.data()));
   for (size_t b = 0; b < size_t(batch); ++b) {
     const size_t l = b * L;
     const SaturationProblem p{numbers(0) + l * m * n, numbers(1) + l * m, numbers(2) + l * m, numbers(4) + l,
                               numbers(5) + l, numbers(6) + l, numbers(7) + l * n, numbers(8) + l * n,
                               numbers(9) + b * n, numbers(10) + b * n, call.in<int>(3) + l * m, numbers(11)[b],
-                              call.in<int>(12)[0], L, m};
+                              call.in<int>(12)[0], L, m, n, 1};
     const SaturationAnswer a{call.out<double>(0) + b * n, call.out<double>(1) + b * n * n, call.out<double>(2) + l,
                              call.out<int>(3) + l, call.out<int>(4) + l * n, call.out<int>(5) + l * n,
                              call.out<int>(6) + l, call.out<int>(7) + b * n, call.out<int>(8) + b * 2};
@@ -73,8 +72,10 @@ void saturate(const xla::Call& call) {
 }  // namespace
 
 extern "C" {
-// Bytes of shared memory that a warp needs for one problem, a multiple of 16; m: rows of the longest level.
-int osik_projection_bytes(int n, int m) { return ClassicalProjection<WarpSizes<>>::bytes(n, m); }
+// Bytes of shared memory that a warp needs for one problem, a multiple of 16, and numbers beside it; m: rows of the longest
+// level.
+int osik_null_space_bytes(int n, int m) { return NullSpace<WarpSizes<>>::bytes({n, m}); }
+int osik_null_space_outside(int n, int m) { return NullSpace<WarpSizes<>>::numbers_outside({n, m}); }
 
 void* osik_projection(xla::CallFrame* frame) { return xla::handle<project>(frame); }
 void* osik_row_factors(xla::CallFrame* frame) { return xla::handle<factor_rows>(frame); }

@@ -37,6 +37,7 @@ struct SaturationProblem {
   double rank_tol;
   int max_changes;  // limit on the changes of the active set, for each level
   int L, m;         // levels, rows of each
+  int row, column;  // entry i of row a of level k is at matrix[k m n + a row + i column]
 };
 
 // The results of one problem. Sides are -1 (lower), 1 (upper) or 2 (pinned), 0 for none.
@@ -51,21 +52,37 @@ template <class Team> struct Saturation : NullSpace<Team> {
   using Base::t, Base::n, Base::m, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::level, Base::free;
   using Base::Z, Base::B, Base::AT, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
       Base::IN_COST, Base::MISSING;
-  static constexpr int VECTORS = 11, INTEGERS = 7;
   enum Step { CHOOSE, REPLACE, STOP };  // a joint leaves or enters; one enters in place of another; one stops the motion
+  template <int K> using Numbers = typename Base::template Numbers<K>;
+  template <int K> using Labels = typename Base::template Labels<K>;
 
+  // The arrays of the search are in the place of those from which a level's damping and motion were computed.
   // coordinates of the saturated joints, each with 1 along its own joint's column and 0 along the others'. [n, lb]
-  double* DUALS;
+  typename Base::template Matrix<typename Base::template MatrixAt<2>> DUALS;
   double* BEFORE;     // [n, ld] the free rows of the basis before the search
   const double* target;  // [n]
   // joints: the point of the search; the target's part in it; a direction; the combination that stops the motion; the
   // point at scale 0; the last point that was accepted
-  double *POINT, *TARGET_PART, *DIRECTION, *NORMAL, *START, *KEPT;
-  double* COLUMN;  // coordinates of a joint
+  Numbers<8> POINT;
+  Numbers<9> TARGET_PART;
+  Numbers<10> DIRECTION;
+  Numbers<11> NORMAL;
+  Numbers<12> START;
+  Numbers<13> KEPT;
+  typename Base::template Matrix<typename Base::template MatrixAt<0>> COLUMN;  // coordinates of a joint
   // saturated joints, in the order of their coordinates: multipliers, their part of a column, way to their bounds
-  double *MULTIPLIER, *RATE, *GAP;
-  Int *SIDE, *PASSED, *BLOCKING, *FIXED, *KEPT_SIDE;  // joints; PASSED: free ones that saturated ones put on their bounds
-  Int *JOINT, *STOPS;  // saturated joints: which they are, and whether they stop the motion
+  Numbers<14> MULTIPLIER;
+  Numbers<15> RATE;
+  Numbers<16> GAP;
+  // joints; PASSED: free ones that saturated ones put on their bounds
+  Labels<3> SIDE;
+  Labels<4> PASSED;
+  Labels<5> BLOCKING;
+  Labels<6> FIXED;
+  Labels<7> KEPT_SIDE;
+  // saturated joints: which they are, and whether they stop the motion
+  Labels<8> JOINT;
+  Labels<9> STOPS;
   int count, stop;  // number of saturated joints; the joint that stops the motion, -1 for none
   double scale;
   // the search: changes of the active set, and their limit
@@ -77,14 +94,10 @@ template <class Team> struct Saturation : NullSpace<Team> {
   double sign, push, stop_rate;       // of the entering joint, its multiplier so far; of the scale
   bool dropping, crossing, is_known;
 
-  static constexpr OSIK_HOST int doubles(int n, int m) { return Base::doubles(n, m) + VECTORS * Team::stride(n); }
-  static constexpr OSIK_HOST int integers(int n, int m) { return Base::integers(n, m) + INTEGERS * Team::stride(n); }
-
-  OSIK_FN Saturation(int n, int m, double* next, Int* J) : Base(n, m, next, J), DUALS(B), BEFORE(this->V) {
-    next += Base::doubles(n, m), J += Base::integers(n, m);
-    for (double** v : {&POINT, &TARGET_PART, &DIRECTION, &NORMAL, &START, &KEPT, &COLUMN, &MULTIPLIER, &RATE, &GAP})
-      *v = next, next += ld;
-    for (Int** v : {&SIDE, &PASSED, &BLOCKING, &FIXED, &KEPT_SIDE, &JOINT, &STOPS}) *v = J, J += ld;
+  OSIK_FN Saturation(const NullSpaceSizes& s, char* space, double* outside = nullptr)
+      : Base(s, space, outside), BEFORE(this->V) {
+    this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE, PASSED,
+                BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
   }
 
   OSIK_FN double bound(int i) const { return SIDE[i] > 0 ? HIGH[i] : LOW[i]; }
@@ -573,7 +586,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
       ++columns;
     }
     if (columns == 0) return;
-    const int rank = Algebra::pivoted_qr(t, this->free_rows(), this->V, this->SQUARES, this->SCALE, this->PIVOT, lb, ld,
+    const int rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, this->free_rows(), this->V, this->SQUARES, this->SCALE, this->PIVOT, lb, ld,
                                          free(), 0, columns, BLOCKING_RANK);
     Algebra::apply_reflections(t, this->V, this->SCALE, this->free_basis(), ld, ld, rank, free(), n);
     this->identity = false, first += rank;
@@ -603,7 +616,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_METHOD bool solve_level(const SaturationProblem& p, const SaturationAnswer& to, int k, int& all_changes) {
     const int at = k * p.m;
     this->begin_level({p.matrix + at * n, p.lower + at, p.upper + at, p.bends + k * n, p.equality + at, p.constant[k],
-                       p.unmet[k], p.demand[k], p.m, n, 1});
+                       p.unmet[k], p.demand[k], p.m, p.row, p.column});
     target = p.targets + k * n;
     this->compute_damping(true);
     this->find_motion();

@@ -241,7 +241,6 @@ class Step : StepRows {
 
   // ---- the projections (schemes/_null_space.py)
   Numbers targets, separate, scales;  // [L, n] only the last level has a target; damping of each level [3, L]; [L]
-  std::vector<int> projection_labels;
   std::vector<ClassicalProjection<Team>> projection;
   std::vector<Saturation<Team>> saturation;
 
@@ -288,7 +287,7 @@ class Step : StepRows {
     int *sides = found_labels.data(), report[2];
     const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
                               targets.data(), low_speed.data(), high_speed.data(), equality.data(),
-                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m};
+                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m, n, 1};
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];
@@ -344,12 +343,11 @@ class Step : StepRows {
       return;
     }
     targets.resize(L * n), separate.resize(3 * L + n), scales.resize(L);
-    auto begin = [&]<class Method>(std::vector<Method>& method, int rows) {
-      solver_space.resize(Method::doubles(n, rows)), projection_labels.resize(Method::integers(n, rows));
-      method.emplace_back(n, rows, solver_space.data(), projection_labels.data());
-    };
-    if (s.scheme == CLASSICAL) begin(projection, m);
-    else begin(saturation, m > n ? m : n);  // joints that stop a level are factored like rows
+    const NullSpaceSizes sizes{n, m};
+    solver_space.resize(NullSpace<Team>::bytes(sizes) / sizeof(double));
+    char* space = reinterpret_cast<char*>(solver_space.data());
+    if (s.scheme == CLASSICAL) projection.emplace_back(sizes, space);
+    else saturation.emplace_back(sizes, space);
   }
 
   // slack and error of each row, in the order of the tasks' names; what is not finite is 0

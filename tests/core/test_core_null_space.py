@@ -12,6 +12,7 @@ from null_space_families import FAMILIES, LANES, Problems, check_active, random_
 from recorded import SCALED, check_recorded_saturated, check_scales, recorded_saturated, recorded_scales
 from used_memory import used_memory
 
+from osik_jax.core import _library
 from osik_jax.execution import _candidates
 from osik_jax.execution._backends import Backend
 from osik_jax.solvers import Damping, Level, Status, solve_nullspace
@@ -139,14 +140,14 @@ def test_saturation_of_recorded_problems_whatever_rounding_does():
     """Without the end of searches that go round, 1 in 20 copies of one of them would not end."""
     copies = 64
     p = recorded_saturated(copies)
-    check_recorded_saturated(jax.jit(lambda p: _saturation._by_core(p, 330))(p), p, copies)
+    check_recorded_saturated(jax.jit(lambda p: _saturation.by_core(_library.call, p, 330))(p), p, copies)
 
 
 @pytest.mark.parametrize("kind", SCALED)
 def test_saturation_goes_to_the_largest_scale_there_is(kind):
     """Far targets, of which most joints are saturated on the way, and rows that were summed in single precision."""
     p, largest = recorded_scales(kind, 16)
-    check_scales(jax.jit(lambda p: _saturation._by_core(p, 330))(p), p, largest, kind)
+    check_scales(jax.jit(lambda p: _saturation.by_core(_library.call, p, 330))(p), p, largest, kind)
 
 
 @jax.jit

@@ -20,7 +20,8 @@ from weighted_families import soft_problems
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
 from osik_jax.solvers import Damping, Level, Status, solve_least_squares_qp, solve_nullspace
-from osik_jax.solvers.null_space import _cuda as null_space_kernel
+from osik_jax.solvers.null_space import _cuda as null_space
+from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.null_space._padding import pad_levels
 from osik_jax.solvers.qp import _cuda
 from osik_jax.solvers.qp._cost import LeastSquares
@@ -222,7 +223,7 @@ def test_saturation_leaves_nothing_to_the_search(rng):
         levels = [level.scaled() for level in as_levels(p.levels)]
         return pad_levels(levels, p.lower, p.upper, p.secondary, damping, 1e-10)
 
-    found = jax.jit(lambda p: null_space_kernel.solve(jax.vmap(padded)(p), 120))(p)
+    found = jax.jit(lambda p: _saturation.by_core(null_space.saturate, jax.vmap(padded)(p), 120))(p)
     assert found.done.all()
     assert (jnp.abs(found.x - solve_full(p, backend="jax").x) < 1e-8).all()
 
@@ -230,7 +231,7 @@ def test_saturation_leaves_nothing_to_the_search(rng):
 def test_recorded_saturated_problems_whatever_rounding_does():
     copies = 256
     p = recorded_saturated(copies)
-    check_recorded_saturated(jax.jit(lambda p: null_space_kernel.solve(p, 330))(p), p, copies)
+    check_recorded_saturated(jax.jit(lambda p: _saturation.by_core(null_space.saturate, p, 330))(p), p, copies)
 
 
 def test_derivatives_of_saturation(rng):

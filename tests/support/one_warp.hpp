@@ -16,9 +16,9 @@
 #define __shared__
 #define __align__(bytes)
 #define __launch_bounds__(threads)
-#define __isShared(p) is_any(p)
-#define __isGlobal(p) is_any(p)
-#define __builtin_assume(fact) ((void)(fact))
+#define __isShared(p) is_in_shared_memory(p)
+#define __isGlobal(p) (!is_in_shared_memory(p))
+#define __builtin_assume(fact) ((fact) ? void() : stop_at(#fact))
 
 using std::fabs, std::hypot, std::sqrt;
 
@@ -34,7 +34,9 @@ static char stacks[32][1 << 18];
 static uint64_t slots[2][32];
 static int turn[32], kinds[2][32];
 
-template <class T> bool is_any(T) { return true; }
+static const char *shared_from, *shared_to;
+inline bool is_in_shared_memory(const void* p) { return shared_from <= p && p <= shared_to; }
+inline void stop_at(const char* fact) { fprintf(stderr, "not so: %s\n", fact), abort(); }
 
 inline void run_thread(int which) {
   threadIdx.x = which;
@@ -89,7 +91,7 @@ inline double rsqrt(double a) { return 1 / std::sqrt(a); }
 // Run `kernel` for each block. Shared memory holds NaN at first; what is written beyond `bytes` of it is an error.
 template <class F> void run_blocks(int blocks, char* shared, size_t bytes, size_t size, F kernel) {
   static F* now;
-  now = &kernel;
+  now = &kernel, shared_from = shared, shared_to = shared + size;
   auto entry = +[](int me) {
     threadIdx.x = me;
     (*now)();

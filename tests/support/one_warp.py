@@ -76,9 +76,15 @@ def compiled(folder: Path, text: str) -> ctypes.CDLL:
 
 
 def call_of_warps(
-    folder: Path, source: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, problems: int, shared: int
+    folder: Path,
+    source: str,
+    outputs: Sequence[tuple[tuple[int, ...], Any]],
+    *inputs: Any,
+    problems: int,
+    shared: int,
+    **_: Any,
 ) -> list[np.ndarray]:
-    """Solve each problem with a warp on a CPU, in place of ``core/_cuda.call``."""
+    """Solve each problem with a warp on a CPU, in place of ``core/_cuda.call``; blocks that have none do nothing."""
     arrays = [np.ascontiguousarray(a) for a in inputs]
     results = [np.full(shape, -1, kind) for shape, kind in outputs]
     pointers = (ctypes.c_void_p * (len(arrays) + len(results)))(*(a.ctypes.data for a in (*arrays, *results)))

@@ -112,10 +112,11 @@ class _State(NamedTuple):
 def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:
     search = partial(_solve_levels, max_iterations, backend)
     kernels = {}
-    if takes(backend, "core-cuda", fits=_cuda.fits(problem)):
-        kernels["core-cuda"] = _kernel_candidates(max_iterations, search, _cuda.solve, None)
+    _, _, m, n = problem.levels.matrix.shape
+    if takes(backend, "core-cuda", fits=_cuda.fits(n, (m,))):
+        kernels["core-cuda"] = _kernel_candidates(max_iterations, search, partial(by_core, _cuda.saturate), None)
     if takes(backend, "core", fits=True):
-        kernels["core"] = _kernel_candidates(max_iterations, search, _by_core, BLOCK)
+        kernels["core"] = _kernel_candidates(max_iterations, search, partial(by_core, _library.call), BLOCK)
     return certified_or_searched(kernels, search, problem)
 
 
@@ -166,15 +167,18 @@ def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> Sa
     return SaturatedResult(end.x, end.projector, scales, joints, active, end.iterations, end.done)
 
 
-def _by_core(problem: Problem, max_iterations: int) -> SaturatedResult:
-    """Return the core's answers, and in ``done`` whether each problem has one."""
-    results = _library.call(
+def by_core(call: Callable[..., list[Array]], problem: Problem, max_iterations: int) -> SaturatedResult:
+    """Return the core's answers for a batch, and in ``done`` whether each problem has one."""
+    batch, count, _, n = problem.levels.matrix.shape
+    joints = (count,), (count, n), (count, n), (count,), (n,), (2,)
+    x, projector, scales, ended, at_bound, blocking, blocker, active, report = call(
         "saturation",
-        _cuda.answer_shapes(problem),
+        _library.shapes_of(batch, ((n,), (n, n), (count,)), joints),  # as in ``SaturationAnswer``
         *(*problem.levels, *problem.damping, problem.targets, problem.lower, problem.upper, problem.rank_tol),
         np.array([max_iterations], np.int32),
     )
-    return _cuda.of_core(results)
+    found = ActiveJoints(ended != 0, at_bound, blocking, blocker, ended)
+    return SaturatedResult(x, projector, scales, found, active, report[:, 1], report[:, 0] != 0)
 
 
 def _level_problem(
