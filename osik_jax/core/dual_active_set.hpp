@@ -51,7 +51,7 @@ template <class Team> struct DualActiveSet {
   }
   // J = U^-1 with U'U the Hessian of the m rows of B, by Givens rotations, which square nothing. A pinned variable has a
   // 1 in U and nothing in J, so that no step moves it.
-  OSIK_METHOD void factor(const Real* B, int ld, const Real* damping, const Real* lower, const Real* upper, int m) {
+  OSIK_CALL void factor(const Real* B, int ld, const Real* damping, const Real* lower, const Real* upper, int m) {
     count = 0;
     t.each(0, N * lN, [&](int e) { R[e] = J[e] = 0; });
     t.each(0, n, [&](int j) { R[j * lN + j] = lower[j] < upper[j] ? sqrt(damping[j]) : Real(1); });
@@ -89,7 +89,7 @@ template <class Team> struct DualActiveSet {
   }
   // The constraint whose activation raises the dual objective most, -1 for none. A full step raises it by half of
   // gap^2 / |J2'n|^2. Equalities come first; those that the active constraints imply are passed over.
-  OSIK_METHOD int most_violated(const Int* label, const Int* implied) {
+  OSIK_CALL int most_violated(const Int* label, const Int* implied) {
     return t.best(Real(0), 0, N, [&](int i) {
               if (label[i] != INACTIVE || implied[i]) return Real(0);
               if (c.lower[i] == c.upper[i]) return Real(INFINITE);
@@ -100,7 +100,7 @@ template <class Team> struct DualActiveSet {
               return off * off / larger(outside, Team::SMALLEST_PIVOT);
             }).which;
   }
-  OSIK_METHOD void add(Real* d) {  // a Householder reflection of the columns of J2 turns d2 into one number
+  OSIK_CALL void add(Real* d) {  // a Householder reflection of the columns of J2 turns d2 into one number
     Real* w = REFLECTED;
     const Real length = sqrt(t.dot(d, d, count, N)), head = d[count], turned = head > 0 ? -length : length;
     t.each(0, count + 1, [&](int k) {
@@ -115,7 +115,7 @@ template <class Team> struct DualActiveSet {
     });
     for (int k = count; k < N; ++k) t.axpy(J + k * lN, -d[k], w, 0, N);
   }
-  OSIK_METHOD void drop(int place) {  // a column of T goes; Givens rotations make T triangular again
+  OSIK_CALL void drop(int place) {  // a column of T goes; Givens rotations make T triangular again
     for (int k = place; k < count - 1; ++k) {
       t.each(0, k + 2, [&](int i) { R[i * lN + k] = R[i * lN + k + 1]; });
       const Real a = R[k * lN + k], b = R[(k + 1) * lN + k], length = hypot(a, b);
@@ -129,7 +129,7 @@ template <class Team> struct DualActiveSet {
   // Find the active constraints from where it ended before, or from the pinned variables alone.
   // label: [N]; implied: [N] becomes 1 for constraints that the active ones imply.
   // Returns the changes of the active set, -1 where rows cannot hold together or the limit is met.
-  OSIK_METHOD int run(const Constraints& given, Int* label, Int* implied) {
+  OSIK_CALL int run(const Constraints& given, Int* label, Int* implied) {
     c = given;
     t.each(0, N, [&](int i) {
       ROOT[i] = i < n ? Real(0) : sqrt(c.compliance[i - n]);
@@ -145,7 +145,7 @@ template <class Team> struct DualActiveSet {
     }
   }
   // Make a constraint active; active inequalities whose multiplier reaches 0 on the way leave.
-  OSIK_METHOD bool enter(int entering, Real side, Int* label, Int* implied, int& changes) {
+  OSIK_CALL bool enter(int entering, Real side, Int* label, Int* implied, int& changes) {
     Real* d = ALONG;
     Real pushed = 0;
     while (true) {

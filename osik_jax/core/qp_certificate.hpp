@@ -45,7 +45,7 @@ template <class Team> class QPCertificate {
 
   // x: [n], y: [p] multipliers of the rows, active: [n + p] labels; residuals up to kkt_tol are certified
   template <class Data>
-  OSIK_METHOD Certificate judge(const Data& d, const Real* x, const Real* y, const Int* active, Real kkt_tol) {
+  OSIK_CALL Certificate judge(const Data& d, const Real* x, const Real* y, const Int* active, Real kkt_tol) {
     t.are_shared(x, y, active);
     tolerance = d.tolerance;
     add_terms(d, x);
@@ -88,7 +88,7 @@ template <class Team> class QPCertificate {
  private:
   OSIK_FN RowSums<Real> sums(const Real* row, const Real* x, int n) const { return row_sums(t, row, x, n); }
   // the cost's gradient at x, the sizes of its terms, and roots of its curvatures
-  template <class Data> OSIK_METHOD void add_terms(const Data& d, const Real* x) {
+  template <class Data> OSIK_CALL void add_terms(const Data& d, const Real* x) {
     t.are_shared(x);
     each_entry(t, n, [&](auto e) { e.put(fabs(e(x)), SIZE); });
     t.each(0, m, [&](int i) {
@@ -109,7 +109,7 @@ OSIK_UNROLL_4
     });
   }
   // the sizes of x, or those of its Newton step by the curvatures alone where x is roundoff beside it
-  OSIK_METHOD void measure() {
+  OSIK_CALL void measure() {
     Gathered rooted, size, rooted_newton, newton;
     each_entry(t, n, [&](auto e) {
       const auto step = fabs(e(GRADIENT)) * e(INVERSE_ROOT) * e(INVERSE_ROOT);

@@ -34,7 +34,7 @@ template <class Team> struct RowFactors {
     Algebra::combine(t, rows, COEFFICIENTS, v, ld, k, 0, length, true);
   }
   // the k-th direction from the longest remaining row; false where that is no longer than the cutoff
-  OSIK_METHOD bool next_direction(int k, double cutoff) {
+  OSIK_CALL bool next_direction(int k, double cutoff) {
     const Best<double> b = t.best(-1.0, 0, m, [&](int a) { return SQUARES[a]; });
     if (b.which < 0) return false;  // NaN
     double* direction = BASIS + k * ln;
@@ -45,7 +45,7 @@ template <class Team> struct RowFactors {
     return length > cutoff;
   }
   // the rows' coefficients on the k-th direction, which is removed from them
-  OSIK_METHOD void project_rows(int k) {
+  OSIK_CALL void project_rows(int k) {
     const double* direction = BASIS + k * ln;
     t.columns(0, m, [&](auto c) {
       using P = typename decltype(c)::P;
@@ -61,7 +61,7 @@ template <class Team> struct RowFactors {
     });
   }
   // the k-th column, of these coefficients and the root of the damping, orthogonal to those before it
-  OSIK_METHOD void next_column(int k, double root, double* triangle) {
+  OSIK_CALL void next_column(int k, double root, double* triangle) {
     double* column = COLUMNS + k * lc;
     const int length = m + k + 1;
     t.once([&] { column[m + k] = root; });
@@ -74,7 +74,7 @@ template <class Team> struct RowFactors {
     t.once([&] { triangle[k * m + k] = norm; });
   }
   // matrix: [m, n]; basis: [m, n]; orthonormal: [2 m, m]; triangle: [m, m], the identity from the rank on
-  OSIK_METHOD void solve(const double* matrix, double cutoff, double damping, double* basis, double* orthonormal,
+  OSIK_CALL void solve(const double* matrix, double cutoff, double damping, double* basis, double* orthonormal,
                          double* triangle) {
     const double root = sqrt(damping);
     t.each(0, n * lm, [&](int e) { REST[e] = 0.0; });

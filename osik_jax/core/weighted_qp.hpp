@@ -162,7 +162,7 @@ template <class Team> struct WeightedQP {
   }
 
   // ---- one problem
-  OSIK_METHOD void begin(const Data& d) {
+  OSIK_CALL void begin(const Data& d) {
     t.fetch_rows(B, ld, d.matrix, m), t.fetch_rows(B + m * ld, ld, d.rows, p);
     t.fetch(GAP, d.weight, m), t.fetch(TARGET, d.target, m), t.fetch(COMPLIANCE + m, d.compliance, p);
     t.fetch(DAMPING, d.damping, n), t.fetch(CENTER, d.center, n);
@@ -200,14 +200,14 @@ OSIK_UNROLL_4
   OSIK_FN Real* row(int a) const { return B + USED[a] * ld; }
 
   // ---- what a point leaves of the two equations
-  OSIK_METHOD void find_gap() {  // target - B x for the rows of A, target - B x - E z for those of C
+  OSIK_CALL void find_gap() {  // target - B x for the rows of A, target - B x - E z for those of C
     t.rows_times([&](int i) { return B + i * ld; }, [&](int i) { return END[i]; }, X, GAP, k);
     t.each(0, k, [&](int i) {
       const Real target = i < m ? TARGET[i] : LABEL[n + i - m] == INACTIVE ? 0 : bound(n + i - m) - COMPLIANCE[i] * Z[i];
       GAP[i] = target - GAP[i];
     });
   }
-  OSIK_METHOD void find_gradient() {  // D (x - center) - B' z, with z the residuals of the rows of A
+  OSIK_CALL void find_gradient() {  // D (x - center) - B' z, with z the residuals of the rows of A
     find_gap();
     t.each(0, m, [&](int i) { Z[i] = GAP[i]; });
     t.columns(0, n, [&](auto c) {
@@ -232,7 +232,7 @@ OSIK_UNROLL_4
   static constexpr Real CORRECTION = sizeof(Real) == 8 ? KERNEL_CORRECTION : SINGLE_CORRECTION;
 
   // ---- the minimiser on the active set; returns whether the factors are regular
-  OSIK_METHOD bool solve_on_active_set() {
+  OSIK_CALL bool solve_on_active_set() {
     ++factorizations;
     t.each(0, m, [&](int i) { USED[i] = i; });
     used = m;
@@ -244,7 +244,7 @@ OSIK_UNROLL_4
     return used <= n && !IS_SINGLE ? solve_by_rows() : solve_by_hessian();
   }
   static constexpr Real RIDGE = IS_SINGLE ? SINGLE_RIDGE * EPS : 0;
-  OSIK_METHOD bool solve_by_rows() {
+  OSIK_CALL bool solve_by_rows() {
     t.columns(0, n, [&](auto c) { c.store(X, c.load(CENTER)), c.store(INVERSE, c.load(DAMPING).inverse()); });
     t.each(0, n, [&](int j) {
       if (LABEL[j] != INACTIVE) X[j] = bound(j), INVERSE[j] = 0;
@@ -280,7 +280,7 @@ OSIK_UNROLL_4
     return true;
   }
   // H_F = B_F' B_F + D_F, with a row and a column of the identity for active variables; V = M C_F' and V D^-1 V' + E
-  OSIK_METHOD bool factor_hessian() { return invert_hessian() && invert_complement(); }
+  OSIK_CALL bool factor_hessian() { return invert_hessian() && invert_complement(); }
   OSIK_FN bool invert_hessian() {
     if constexpr (Team::HOLDS_COLUMNS) {
       t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? 1 : 0, PIVOT[j] = 1; });
@@ -315,7 +315,7 @@ OSIK_UNROLL_4
     return Algebra::inverse_factor(t, T, TM, SMALL_PIVOT, DIAGONAL, lp, used - m, Real(KERNEL_PIVOT) * EPS);
   }
   // H_F dx - C_F' dy = -gradient, C_F dx + E dy = gap: (V' D^-1 V + E) dy = gap + V' D^-1 M gradient
-  OSIK_METHOD bool solve_by_hessian() {
+  OSIK_CALL bool solve_by_hessian() {
     if (!factor_hessian()) return false;
     const int rows = used - m;
     // in single precision from the point before, towards which corrections may be slow
@@ -344,7 +344,7 @@ OSIK_UNROLL_4
   }
 
   // ---- roundoff of values and multipliers, as constraint_scales in solvers/qp/_problem.py: invariant to units
-  OSIK_METHOD void find_roundoff() {
+  OSIK_CALL void find_roundoff() {
     t.columns(0, n, [&](auto c) {  // the Newton step of the cost, by the diagonal of its Hessian
       auto total = c.load(GRADIENT);
       for (int i = m; i < k; ++i) total.fma(Z[i], c.load(B + i * ld));
@@ -370,7 +370,7 @@ OSIK_UNROLL_4
     });
     if (t.count(0, n, [&](int j) { return LABEL[j] != INACTIVE; })) find_bound_roundoff();
   }
-  OSIK_METHOD void find_bound_roundoff() {  // of the multiplier of a variable on its bound: that of its gradient's terms
+  OSIK_CALL void find_bound_roundoff() {  // of the multiplier of a variable on its bound: that of its gradient's terms
     t.each(0, k, [&](int i) { TERMS[i] = i < m ? fabs(TARGET[i]) + t.own_size_on(B + i * ld, X, n) : fabs(Z[i]); });
     t.columns(0, n, [&](auto c) {
       auto size = c.load(X).size();
@@ -402,7 +402,7 @@ OSIK_UNROLL_4
   }
 
   // ---- the search; returns whether there is a candidate
-  OSIK_METHOD bool search() {
+  OSIK_CALL bool search() {
     int fewest = N + 1, lives = MAX_EXCHANGES;
     while (true) {
       const bool regular = solve_on_active_set();
@@ -420,7 +420,7 @@ OSIK_UNROLL_4
     }
   }
   // The dual method from the pinned variables alone. Its end, solved anew, may miss a bound: then it goes on.
-  OSIK_METHOD bool search_dual() {
+  OSIK_CALL bool search_dual() {
     t.each(0, N, [&](int i) { LABEL[i] = i < n && lower[i] == upper[i] ? EQUALITY : INACTIVE, NEXT[i] = 0; });
     for (int times = 0;; ++times) {
       if (!solve_on_active_set()) return false;
@@ -447,7 +447,7 @@ OSIK_UNROLL_4
     Real tolerance;
   };
   OSIK_FN Copied copied() const { return {B, TARGET, COMPLIANCE, DAMPING, CENTER, B + m * ld, COMPLIANCE + m, lower, upper, tolerance}; }
-  OSIK_METHOD void solve(const Data& d, const Answer& to) {
+  OSIK_CALL void solve(const Data& d, const Answer& to) {
     begin(d);
     first_labels(d.guess, LABEL);
     const bool found = search() && changes <= max_changes;
