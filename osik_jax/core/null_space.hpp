@@ -30,7 +30,7 @@ template <class Team> struct NullSpace {
   using Int = typename Team::Int;
   using Sizes = NullSpaceSizes;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 17, INTEGERS = 10;
+  static constexpr int VECTORS = 17, INTEGERS = 10;  // of both projections, and of saturation
   Team t;
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
@@ -45,9 +45,10 @@ template <class Team> struct NullSpace {
   static constexpr OSIK_HOST int greater(int a, int b) { return a < b ? b : a; }
   template <int K> struct SizeAt {
     static constexpr OSIK_HOST int of(const Sizes& s) {
-      const int n = Team::variables(s.n), m = Team::level_rows(s.m), of_b = Team::stride(greater(n, m + smaller(n, m)));
-      const int of_s = Team::stride(smaller(n, m));
-      const int size[] = {n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s, Team::stride(greater(n, m))};
+      const int n = Team::variables(s.n), m = Team::level_rows(s.m), least = smaller(n, m), most = greater(n, m);
+      const int of_b = Team::stride(greater(n, m + least)), of_s = Team::stride(least);
+      const int size[] = {n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s,
+                          Team::stride(most)};
       return size[K];
     }
   };
@@ -61,9 +62,10 @@ template <class Team> struct NullSpace {
   Size<6> lf;
   // the numbers before matrix `which`, in the order of the matrices below; the last is the end
   static constexpr OSIK_HOST int numbers_before(int which, const Sizes& s) {
-    const int n = Team::variables(s.n), least = smaller(n, Team::level_rows(s.m)) * SizeAt<5>::of(s), apart = Team::SPARES_SPACE ? 0 : 1;
-    const int size[] = {SizeAt<4>::of(s), n * SizeAt<2>::of(s), (n + 1) * SizeAt<4>::of(s), apart * n * SizeAt<3>::of(s),
-                        apart * least, apart * least, apart * numbers_outside(s)};
+    const int n = Team::variables(s.n), of_b = SizeAt<4>::of(s), apart = Team::SPARES_SPACE ? 0 : 1;
+    const int of_f = apart * smaller(n, Team::level_rows(s.m)) * SizeAt<5>::of(s);
+    const int size[] = {of_b, n * SizeAt<2>::of(s), (n + 1) * of_b, apart * n * SizeAt<3>::of(s), of_f, of_f,
+                        apart * numbers_outside(s)};
     int count = VECTORS * SizeAt<7>::of(s);
     for (int i = 0; i < which; ++i) count += size[i];
     return count;
@@ -95,10 +97,10 @@ template <class Team> struct NullSpace {
   template <int K> using InPlaceAt = MatrixAt<Team::SPARES_SPACE ? 2 : K, Team::SPARES_SPACE>;
   Matrix<MatrixAt<0>> WORK;  // as long as a row of B
   Matrix<MatrixAt<1>> Z;     // [n, ld] the basis
-  Matrix<MatrixAt<2>> B;     // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; a right-hand side below them
+  Matrix<MatrixAt<2>> B;     // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
   Matrix<MatrixAt<3>> AT;    // [n, lm] the level's matrix, transposed; as it is given, if the team spares space
-  // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: both in the columns of B from m on, if the
-  // team spares space, until the level is solved in its row space
+  // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: if the team spares space, both are in the
+  // columns of B from m on, until the level is solved in its row space
   Matrix<InPlaceAt<4>> F;
   Matrix<InPlaceAt<5>> M;
   double *V;  // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
@@ -125,12 +127,14 @@ template <class Team> struct NullSpace {
   Labels<1> IN_COST_AT_BASE;
   Labels<2> PIVOT;
 
-  template <class... Arrays> OSIK_FN void place(char* space, const Sizes& s, Arrays&... arrays) { (arrays.place(space, s), ...); }
+  template <class... Arrays> OSIK_FN void place(char* space, const Sizes& s, Arrays&... arrays) {
+    (arrays.place(space, s), ...);
+  }
   // outside: space of V and S, if the team spares space
   OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr)
       : n(s), m(s), ld(s), lm(s), lb(s), ls(s), lf(s) {
-    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE, BASE_VALUE,
-          BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
+    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE,
+          BASE_VALUE, BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
     V = Team::SPARES_SPACE ? outside : reinterpret_cast<double*>(space) + numbers_before(6, s);
     S = V + greater(m, n) * ld;
   }
@@ -322,7 +326,8 @@ template <class Team> struct NullSpace {
         if (!IN_COST[a])
           for (int j = first; j < n; ++j) B[j * lb + a] = 0.0;
       });
-      rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, free_rows(), V, SQUARES, SCALE, PIVOT, lb, ld, count, 0, rows, cutoff);
+      rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, free_rows(), V, SQUARES, SCALE, PIVOT, lb, ld, count, 0,
+                                                              rows, cutoff);
       solve_in_row_space();
       if (rank < count) {
         Algebra::apply_reflections(t, V, SCALE, free_basis(), ld, ld, rank, count, n);

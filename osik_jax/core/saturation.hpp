@@ -37,7 +37,6 @@ struct SaturationProblem {
   double rank_tol;
   int max_changes;  // limit on the changes of the active set, for each level
   int L, m;         // levels, rows of each
-  int row, column;  // entry i of row a of level k is at matrix[k m n + a row + i column]
 };
 
 // The results of one problem. Sides are -1 (lower), 1 (upper) or 2 (pinned), 0 for none.
@@ -50,16 +49,16 @@ template <class Team> struct Saturation : NullSpace<Team> {
   using Base = NullSpace<Team>;
   using typename Base::Algebra, typename Base::Int;
   using Base::t, Base::n, Base::m, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::level, Base::free;
-  using Base::Z, Base::B, Base::AT, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
+  using Base::Z, Base::B, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
       Base::IN_COST, Base::MISSING;
   enum Step { CHOOSE, REPLACE, STOP };  // a joint leaves or enters; one enters in place of another; one stops the motion
   template <int K> using Numbers = typename Base::template Numbers<K>;
   template <int K> using Labels = typename Base::template Labels<K>;
 
-  // The arrays of the search are in the place of those from which a level's damping and motion were computed.
+  // The search's numbers are in the place of those from which the level's damping and motion were computed.
   // coordinates of the saturated joints, each with 1 along its own joint's column and 0 along the others'. [n, lb]
   typename Base::template Matrix<typename Base::template MatrixAt<2>> DUALS;
-  double* BEFORE;     // [n, ld] the free rows of the basis before the search
+  double* BEFORE;        // [n, ld] the free rows of the basis before the search
   const double* target;  // [n]
   // joints: the point of the search; the target's part in it; a direction; the combination that stops the motion; the
   // point at scale 0; the last point that was accepted
@@ -96,8 +95,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
 
   OSIK_FN Saturation(const NullSpaceSizes& s, char* space, double* outside = nullptr)
       : Base(s, space, outside), BEFORE(this->V) {
-    this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE, PASSED,
-                BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
+    this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE,
+                PASSED, BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
   }
 
   OSIK_FN double bound(int i) const { return SIDE[i] > 0 ? HIGH[i] : LOW[i]; }
@@ -586,9 +585,10 @@ template <class Team> struct Saturation : NullSpace<Team> {
       ++columns;
     }
     if (columns == 0) return;
-    const int rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, this->free_rows(), this->V, this->SQUARES, this->SCALE, this->PIVOT, lb, ld,
-                                         free(), 0, columns, BLOCKING_RANK);
-    Algebra::apply_reflections(t, this->V, this->SCALE, this->free_basis(), ld, ld, rank, free(), n);
+    double *V = this->V, *scales = this->SCALE;
+    const int rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(
+        t, this->free_rows(), V, this->SQUARES, scales, this->PIVOT, lb, ld, free(), 0, columns, BLOCKING_RANK);
+    Algebra::apply_reflections(t, V, scales, this->free_basis(), ld, ld, rank, free(), n);
     this->identity = false, first += rank;
     t.each(0, n, [&](int i) {
       if (BLOCKING[i])
@@ -616,7 +616,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_METHOD bool solve_level(const SaturationProblem& p, const SaturationAnswer& to, int k, int& all_changes) {
     const int at = k * p.m;
     this->begin_level({p.matrix + at * n, p.lower + at, p.upper + at, p.bends + k * n, p.equality + at, p.constant[k],
-                       p.unmet[k], p.demand[k], p.m, p.row, p.column});
+                       p.unmet[k], p.demand[k], p.m, n, 1});
     target = p.targets + k * n;
     this->compute_damping(true);
     this->find_motion();

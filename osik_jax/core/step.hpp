@@ -287,7 +287,7 @@ class Step : StepRows {
     int *sides = found_labels.data(), report[2];
     const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
                               targets.data(), low_speed.data(), high_speed.data(), equality.data(),
-                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m, n, 1};
+                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m};
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];

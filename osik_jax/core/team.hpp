@@ -26,7 +26,7 @@
 #define OSIK_UNROLL_4 _Pragma("unroll 4")
 // Calls keep the text short: it has to fit into the instruction cache.
 #define OSIK_CALL __device__ __noinline__
-// A method with few places in the program. Calls of it would keep the members in the memory of each thread, out of registers.
+// Methods that few places use are in line, so that members stay in registers and not in the memory of each thread.
 #define OSIK_METHOD OSIK_FN
 #else
 #define OSIK_FN inline __attribute__((always_inline))

@@ -113,7 +113,7 @@ def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) 
     search = partial(_solve_levels, max_iterations, backend)
     kernels = {}
     _, _, m, n = problem.levels.matrix.shape
-    if takes(backend, "core-cuda", fits=_cuda.fits(n, (m,))):
+    if takes(backend, "core-cuda", fits=_cuda.fits(n, m)):
         kernels["core-cuda"] = _kernel_candidates(max_iterations, search, partial(by_core, _cuda.saturate), None)
     if takes(backend, "core", fits=True):
         kernels["core"] = _kernel_candidates(max_iterations, search, partial(by_core, _library.call), BLOCK)
