@@ -1,6 +1,6 @@
 """GPU kernel of saturation in the null space (``core/saturation_cuda``), one warp of 32 threads per problem.
 
-It is the method of ``core/saturation.hpp``, which takes 1.5 times as long there.
+It is the method of ``core/saturation.hpp``, which takes 1.3 to 1.6 times as long there.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Arra
     arrays = [a.astype(jnp.int32) if a.dtype == bool else _cuda.as_double(a) for a in (secondary, *numbers, *levels)]
     per_block, sizes = _cuda.problems_of_a_block(batch), (n, max(rows))
     outside = -(-batch // per_block), _cuda.space_beside("null_space", *sizes)
-    *results, _ = _cuda.call(
+    results = _cuda.call(
         _source(n, rows, per_block),
         [(shape, jnp.float64) for shape in (*(shape for shape, _ in outputs), outside)],
         *arrays,
@@ -83,4 +83,4 @@ def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Arra
         shared=_cuda.space_of("null_space", *sizes),
         per_block=per_block,
     )
-    return [a.astype(kind) for a in results]
+    return [a.astype(kind) for a in results[:-1]]  # without what is beside
