@@ -246,8 +246,8 @@ def space_of(method: str, *sizes: int) -> int:
 
 
 @cache
-def space_beside(method: str, *sizes: int) -> int:
-    """Return how many numbers a problem has in global memory, by the core's ``osik_{method}_outside``."""
+def space_outside(method: str, *sizes: int) -> int:
+    """Return how many numbers of a problem are in global memory, by the core's ``osik_{method}_outside``."""
     return getattr(_library.core().library, f"osik_{method}_outside")(*sizes)
 
 

@@ -30,7 +30,7 @@ template <class Team> struct NullSpace {
   using Int = typename Team::Int;
   using Sizes = NullSpaceSizes;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 17, INTEGERS = 10;  // of both projections, and of saturation
+  static constexpr int VECTORS = 17, INTEGERS = Team::SPARES_SPACE ? 3 : 10;  // the last seven: of saturation
   Team t;
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
@@ -70,7 +70,7 @@ template <class Team> struct NullSpace {
     for (int i = 0; i < which; ++i) count += size[i];
     return count;
   }
-  // of V and S, which are in global memory if the team spares space
+  // the numbers of V and S, which are in global memory if the team spares space
   static constexpr OSIK_HOST int numbers_outside(const Sizes& s) {
     const int n = Team::variables(s.n), m = Team::level_rows(s.m);
     return greater(m, n) * SizeAt<2>::of(s) + smaller(n, m) * SizeAt<5>::of(s);
@@ -98,7 +98,7 @@ template <class Team> struct NullSpace {
   Matrix<MatrixAt<0>> WORK;  // as long as a row of B
   Matrix<MatrixAt<1>> Z;     // [n, ld] the basis
   Matrix<MatrixAt<2>> B;     // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
-  Matrix<MatrixAt<3>> AT;    // [n, lm] the level's matrix, transposed; as it is given, if the team spares space
+  Matrix<MatrixAt<3>> AT;    // [n, lm] the level's matrix, transposed; not for a team that spares space
   // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: if the team spares space, both are in the
   // columns of B from m on, until the level is solved in its row space
   Matrix<InPlaceAt<4>> F;

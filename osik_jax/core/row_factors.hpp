@@ -75,7 +75,7 @@ template <class Team> struct RowFactors {
   }
   // matrix: [m, n]; basis: [m, n]; orthonormal: [2 m, m]; triangle: [m, m], the identity from the rank on
   OSIK_CALL void solve(const double* matrix, double cutoff, double damping, double* basis, double* orthonormal,
-                         double* triangle) {
+                       double* triangle) {
     const double root = sqrt(damping);
     t.each(0, n * lm, [&](int e) { REST[e] = 0.0; });
     t.each(0, m * ln, [&](int e) { BASIS[e] = 0.0; });

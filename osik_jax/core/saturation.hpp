@@ -48,14 +48,17 @@ struct SaturationAnswer {
 template <class Team> struct Saturation : NullSpace<Team> {
   using Base = NullSpace<Team>;
   using typename Base::Algebra, typename Base::Int;
-  using Base::t, Base::n, Base::m, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::level, Base::free;
+  static_assert(!Team::SPARES_SPACE, "levels are given row by row; on a GPU: saturation_cuda");
+  using Base::t, Base::n, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::free;
   using Base::Z, Base::B, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
       Base::IN_COST, Base::MISSING;
   enum Step { CHOOSE, REPLACE, STOP };  // a joint leaves or enters; one enters in place of another; one stops the motion
   template <int K> using Numbers = typename Base::template Numbers<K>;
   template <int K> using Labels = typename Base::template Labels<K>;
 
-  // The search's numbers are in the place of those from which the level's damping and motion were computed.
+  // The search's numbers are in the place of those from which the level's damping and motion were computed. WANTED,
+  // MISSING, COORDINATES and IN_COST stay, which the search reads.
+
   // coordinates of the saturated joints, each with 1 along its own joint's column and 0 along the others'. [n, lb]
   typename Base::template Matrix<typename Base::template MatrixAt<2>> DUALS;
   double* BEFORE;        // [n, ld] the free rows of the basis before the search
@@ -93,8 +96,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
   double sign, push, stop_rate;       // of the entering joint, its multiplier so far; of the scale
   bool dropping, crossing, is_known;
 
-  OSIK_FN Saturation(const NullSpaceSizes& s, char* space, double* outside = nullptr)
-      : Base(s, space, outside), BEFORE(this->V) {
+  OSIK_FN Saturation(const NullSpaceSizes& s, char* space) : Base(s, space), BEFORE(this->V) {
     this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE,
                 PASSED, BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
   }
@@ -586,7 +588,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
     }
     if (columns == 0) return;
     double *V = this->V, *scales = this->SCALE;
-    const int rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(
+    const int rank = Algebra::pivoted_qr(
         t, this->free_rows(), V, this->SQUARES, scales, this->PIVOT, lb, ld, free(), 0, columns, BLOCKING_RANK);
     Algebra::apply_reflections(t, V, scales, this->free_basis(), ld, ld, rank, free(), n);
     this->identity = false, first += rank;

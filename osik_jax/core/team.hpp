@@ -26,7 +26,8 @@
 #define OSIK_UNROLL_4 _Pragma("unroll 4")
 // Calls keep the text short: it has to fit into the instruction cache.
 #define OSIK_CALL __device__ __noinline__
-// Methods that few places use are in line, so that members stay in registers and not in the memory of each thread.
+// A method of the hierarchy or the null space, which few places use: a call on a CPU, in line on a GPU, so that members
+// stay in registers and not in the memory of each thread.
 #define OSIK_METHOD OSIK_FN
 #else
 #define OSIK_FN inline __attribute__((always_inline))
@@ -71,7 +72,7 @@ template <class R = double> struct WarpSizes {
   template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
   template <class At, class Sizes> using Fixed = NoSize<At, Sizes>;
   static constexpr bool COPIES = false;        // rows are read from global memory
-  static constexpr bool SPARES_SPACE = true;   // inverse_factor is in place; what is seldom used is in global memory
+  static constexpr bool SPARES_SPACE = true;   // inverse_factor is in place; what does not fit well is in global memory
   static constexpr int WIDE = sizeof(R) == 4 ? 4 : 1;  // numbers that a thread reads at once
   static constexpr OSIK_HOST int padded(int n) { return (n + WIDE - 1) / WIDE * WIDE; }
   // an odd number of wide ones, so that threads read different banks of memory

@@ -34,6 +34,7 @@ static char stacks[32][1 << 18];
 static uint64_t slots[2][32];
 static int turn[32], kinds[2][32];
 
+// What the text says of an address is checked. An empty array may begin where shared memory ends.
 static const char *shared_from, *shared_to;
 inline bool is_in_shared_memory(const void* p) { return shared_from <= p && p <= shared_to; }
 inline void stop_at(const char* fact) { fprintf(stderr, "not so: %s\n", fact), abort(); }

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from osik_jax.solvers.qp import _cuda
@@ -86,7 +87,7 @@ def call_of_warps(
 ) -> list[np.ndarray]:
     """Solve each problem with a warp on a CPU, in place of ``core/_cuda.call``; blocks that have none do nothing."""
     arrays = [np.ascontiguousarray(a) for a in inputs]
-    results = [np.full(shape, -1, kind) for shape, kind in outputs]
+    results = [np.full(shape, np.nan if jnp.issubdtype(kind, jnp.floating) else -1, kind) for shape, kind in outputs]
     pointers = (ctypes.c_void_p * (len(arrays) + len(results)))(*(a.ctypes.data for a in (*arrays, *results)))
     of_warps(folder, source, shared).run(pointers, problems)
     return results

@@ -62,7 +62,7 @@ def _source(n: int, rows: tuple[int, ...], per_block: int) -> str:
     for key, own in columns.items():
         text = text.replace(key, ", ".join(own))
     sizes = _cuda.constants(N=n, M=max(rows), L=len(rows), ROWS=rows, PER_BLOCK=per_block)
-    return _cuda.text_of("null_space.hpp") + sizes + text
+    return _cuda.text_of("null_space.hpp") + sizes + _cuda.rolled(text)
 
 
 def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Array, *given: Array) -> list[Array]:
@@ -74,7 +74,7 @@ def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Arra
     rows = tuple(a.shape[1] for a in levels[1::4])
     arrays = [a.astype(jnp.int32) if a.dtype == bool else _cuda.as_double(a) for a in (secondary, *numbers, *levels)]
     per_block, sizes = _cuda.problems_of_a_block(batch), (n, max(rows))
-    outside = -(-batch // per_block), _cuda.space_beside("null_space", *sizes)
+    outside = -(-batch // per_block), _cuda.space_outside("null_space", *sizes)
     results = _cuda.call(
         _source(n, rows, per_block),
         [(shape, jnp.float64) for shape in (*(shape for shape, _ in outputs), outside)],
@@ -83,4 +83,4 @@ def call(_: str, outputs: Sequence[tuple[tuple[int, ...], Any]], secondary: Arra
         shared=_cuda.space_of("null_space", *sizes),
         per_block=per_block,
     )
-    return [a.astype(kind) for a in results[:-1]]  # without what is beside
+    return [a.astype(kind) for a in results[:-1]]  # without what is outside

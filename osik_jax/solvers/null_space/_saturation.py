@@ -14,9 +14,9 @@ no admissible scale, and then drops the whole task. The motion d always has one.
 joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
 whose scale would otherwise be 0.
 
-The core takes a problem through all levels (``core/saturation.hpp``), on CPUs one after another, on CUDA devices by a
-warp of threads each; problems without an answer of its are searched here, which is the definition, what runs elsewhere,
-and the derivative.
+The core takes a problem through all levels: ``core/saturation.hpp`` on CPUs, ``core/saturation_cuda`` on CUDA devices,
+a warp of threads for each problem. Problems that it does not solve are searched here, which is the definition, what
+runs elsewhere, and the derivative.
 
 When not to use it: where a large motion along a wrong direction is better than a small one along the right, and where
 rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` fits it by least squares.
