@@ -35,7 +35,6 @@ template <class Team> struct DualActiveSet {
   Constraints c;
 
   static constexpr OSIK_HOST int doubles(int n, int p) { return (2 * (n + p) + VECTORS) * Team::stride(n + p); }
-  static constexpr OSIK_HOST int integers(int n, int p) { return n + p; }
   OSIK_FN void begin(int variables, int rows, Real* F, Int* order) {
     n = variables, p = rows, N = n + p, lN = Team::stride(N), ORDER = order;
     R = F, J = R + N * lN, F = J + N * lN;
