@@ -247,7 +247,7 @@ template <class Team> struct Hierarchy {
     // With damping the step has a curvature in every direction: it uses all pivots above roundoff. A row that is left
     // out of the step stays in the gradient, and the two would contradict each other where a bound is released.
     const double least = (damping > 0.0 ? DAMPED_RANK : rank_tol) * longest;
-    rank = Algebra::pivoted_qr(t, R, V, WORK, SCALE, PIVOT, ld, lm, rows, first_free, n, least);
+    rank = Algebra::pivoted_qr(t, R, V, V, WORK, SCALE, PIVOT, ld, lm, rows, first_free, n, least);
     if (damping > 0.0) {
       gram(rank, first_free, true);
       cholesky(rank, damping + FACTOR_RIDGE * longest * longest, true);

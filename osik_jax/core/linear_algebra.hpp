@@ -29,6 +29,7 @@ template <class Team> struct LinearAlgebra {
     t.are_shared(M, v, out);
     t.columns(start, n, [&](auto c) {
       auto total = typename decltype(c)::P(0);
+OSIK_UNROLL_4
       for (int i = 0; i < n; ++i) total.fma(v[i], c.load(M + i * ld));
       c.store(out, total);
     });
@@ -113,6 +114,7 @@ template <class Team> struct LinearAlgebra {
     t.each(0, count, [&](int i) { work[i] *= inverse[i]; });
     t.columns(0, count, [&](auto c) {
       auto total = typename decltype(c)::P(0);
+OSIK_UNROLL_4
       for (int i = c.at; i < count; ++i) total.fma(work[i], c.load(M + i * ld));
       c.store(b, total);
     });
@@ -121,12 +123,11 @@ template <class Team> struct LinearAlgebra {
   // Householder QR with column pivoting of R [rows, n] over the columns [first, n): Q' R replaces R. A column is a pivot
   // while it is longer than `least`; the longest remaining column is taken first.
   // V: [rank, ld_V] reflections, scale: [rank], pivot: [rank] columns, squares: [n] squared lengths of the columns.
-  // Returns the rank. OUTSIDE: V is in global memory.
+  // Returns the rank. OUTSIDE: V is in global memory, and the reflection at work in `near` [rows] too.
   template <bool OUTSIDE = false>
-  OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* squares, Real* scales, Int* pivot, int ld, int ld_V,
-                                  int rows, int first, int n, Real least) {
+  OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* near, Real* squares, Real* scales, Int* pivot, int ld,
+                                  int ld_V, int rows, int first, int n, Real least) {
     t.are_shared(R, squares, scales, pivot);
-    if constexpr (!OUTSIDE) t.are_shared(V);
     int rank = 0;
     if (rows > 0)
       t.columns(first, n, [&](auto c) {
@@ -141,8 +142,13 @@ template <class Team> struct LinearAlgebra {
       if (!(norm > least)) break;
       const int k = rank, which = b.which;
       Real* v = V + k * ld_V;
+      if constexpr (OUTSIDE) v = near;
+      t.are_shared(v);
       const Real head = R[k * ld + which], scale = Real(1) / (norm * (norm + fabs(head)));
-      t.each(k, rows, [&](int a) { v[a] = a > k ? R[a * ld + which] : head + (head < 0 ? -norm : norm); });
+      t.each(k, rows, [&](int a) {
+        v[a] = a > k ? R[a * ld + which] : head + (head < 0 ? -norm : norm);
+        if constexpr (OUTSIDE) V[k * ld_V + a] = v[a];
+      });
       t.columns(first, n, [&](auto c) {  // R <- R - scale v (v' R), and the squares of the columns below row k
         using P = typename decltype(c)::P;
         const P total = weighted_sum(c, v, R, ld, k, rows);
@@ -168,50 +174,64 @@ template <class Team> struct LinearAlgebra {
   template <class C> OSIK_FN static auto weighted_sum(C c, const Real* v, const Real* M, int ld, int start, int stop) {
     typename C::P even(0), odd(0);
     int a = start;
+OSIK_UNROLL_4
     for (; a + 1 < stop; a += 2) even.fma(v[a], c.load(M + a * ld)), odd.fma(v[a + 1], c.load(M + (a + 1) * ld));
     if (a < stop) even.fma(v[a], c.load(M + a * ld));
     return even += odd;
   }
 
-  // out[j] = sum_k v[k] M[k, j] over the first `rows` rows of M, for start <= j < stop; `add`: added to what out has;
-  // OUTSIDE: M is in global memory
-  template <bool OUTSIDE = false>
+  // out[j] = sum_k v[k] M[k, j] over the first `rows` rows of M, for start <= j < stop; `add`: added to what out has
   OSIK_CALL static void combine(Team t, const Real* M, const Real* v, Real* out, int ld, int rows, int start, int stop,
                                 bool add) {
-    t.are_shared(v, out);
-    if constexpr (!OUTSIDE) t.are_shared(M);
+    t.are_shared(M, v, out);
     t.columns(start, stop, [&](auto c) {
       auto total = weighted_sum(c, v, M, ld, 0, rows);
       c.store(out, add ? total += c.load(out) : total);
     });
   }
 
-  // out[i, a] = A[a row + i column] for `rows` rows and n columns of A, four rows at a time
+  // out[i, a] = A[a row + i column] for `rows` rows and n columns of A
   OSIK_CALL static void transpose(Team t, const Real* A, int row, int column, Real* out, int ld, int rows, int n) {
     t.are_shared(out);
-    for (int first = 0; first < rows; first += 4) {
-      const Real* r[4];
-      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
-      t.each(0, n, [&](int i) {
-OSIK_UNROLL
-        for (int b = 0; b < 4; ++b)
-          if (first + b < rows) out[i * ld + first + b] = r[b][i * column];
+    if constexpr (Team::SPARES_SPACE) {
+      t.each(0, rows, [&](int a) {
+OSIK_UNROLL_4
+        for (int i = 0; i < n; ++i) t.fetch_one(out + i * ld + a, A + a * row + i * column);
       });
+      t.arrive();
+    } else {
+      for (int first = 0; first < rows; first += 4) {
+        const Real* r[4];
+        for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
+        t.each(0, n, [&](int i) {
+OSIK_UNROLL
+          for (int b = 0; b < 4; ++b)
+            if (first + b < rows) out[i * ld + first + b] = r[b][i * column];
+        });
+      }
     }
   }
 
-  // M <- Q'M of the first `count` rows and n columns of M, with the reflections of pivoted_qr, two at a time
-  OSIK_CALL static void apply_reflections(Team t, const Real* V, const Real* scales, Real* M, int ld_V, int ld,
-                                          int rank, int count, int n) {
+  // M <- Q'M of the first `count` rows and n columns of M, with the reflections of pivoted_qr, two at a time.
+  // OUTSIDE: V is in global memory, and the reflections at work in `near` [2, ld_near] too.
+  template <bool OUTSIDE = false>
+  OSIK_CALL static void apply_reflections(Team t, const Real* V, Real* near, const Real* scales, Real* M, int ld_V,
+                                          int ld_near, int ld, int rank, int count, int n) {
     t.are_shared(scales, M);
     for (int k = 0; k < rank; k += 2) {
       const bool two = k + 1 < rank;
       const Real *v = V + k * ld_V, *w = two ? v + ld_V : v, scale_v = scales[k], scale_w = two ? scales[k + 1] : 0;
+      if constexpr (OUTSIDE) {
+        t.each(k, count, [&](int a) { near[a] = v[a], near[ld_near + a] = w[a]; });
+        v = near, w = near + ld_near;
+      }
+      t.are_shared(v, w);
       const Real cross = two ? scale_v * t.dot(v, w, k + 1, count) : Real(0);
       t.columns(0, n, [&](auto c) {
         using P = typename decltype(c)::P;
         P along_v(0), along_w(0), head = c.load(M + k * ld);
         along_v.fma(v[k], head);
+OSIK_UNROLL_4
         for (int a = k + 1; a < count; ++a) {
           const P x = c.load(M + a * ld);
           along_v.fma(v[a], x), along_w.fma(w[a], x);
@@ -248,6 +268,7 @@ OSIK_UNROLL
     t.narrow_columns(start, n, [&](auto c) {
       using P = typename decltype(c)::P;
       P total[4] = {P(0), P(0), P(0), P(0)};
+OSIK_UNROLL_4
       for (int i = lower && c.at > from ? c.at : from; i < to; ++i) {
         const P z = c.load(Z + i * ld);
 OSIK_UNROLL

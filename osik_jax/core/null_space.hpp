@@ -158,43 +158,39 @@ template <class Team> struct NullSpace {
       return off * off;
     }));
   }
-  OSIK_FN bool is_nothing(int a) const {  // a row that only fills up the level
-    if (level.equality[a] || level.lower[a] > -INFINITE || level.upper[a] < INFINITE) return false;
-    const double* row = level.matrix + a * level.row;
-    const int whole = n / 8 * 8;  // own_square may read a vector beyond its end, and this may be the last row there is
-    double square = t.own_square(row, 0, whole, level.column);
-    for (int i = whole; i < n; ++i) square += row[i * level.column] * row[i * level.column];
-    return square == 0.0;
-  }
 
   // ---- the level's rows
   OSIK_METHOD void begin_level(const NullSpaceLevel& given) {
     level = given;
-    rows = int(t.most(0.0, 0, given.rows, [&](int a, double so_far) { return is_nothing(a) ? so_far : a + 1.0; }));
-    const double* turned = level.matrix;
-    int apart = level.column;
-    if constexpr (!Team::SPARES_SPACE) {
-      Algebra::transpose(t, level.matrix, level.row, level.column, AT, lm, rows, n);
-      turned = AT, apart = lm;
-    }
-    t.columns(0, rows, [&](auto c) {
+    double* turned = Team::SPARES_SPACE ? B : AT;
+    const int apart = Team::SPARES_SPACE ? lb : lm;
+    Algebra::transpose(t, level.matrix, level.row, level.column, turned, apart, level.rows, n);
+    t.columns(0, level.rows, [&](auto c) {
       auto total = typename decltype(c)::P(0.0);
+OSIK_UNROLL_4
       for (int i = 0; i < n; ++i) total.square(c.load(turned + i * apart));
       c.store(SQUARE, total);
     });
+    rows = int(t.most(0.0, 0, level.rows, [&](int a, double so_far) {  // without those that only fill up the level
+      const bool bounded = level.equality[a] || level.lower[a] > -INFINITE || level.upper[a] < INFINITE;
+      return bounded || SQUARE[a] != 0.0 ? a + 1.0 : so_far;
+    }));
     longest_square = t.most(0.0, 0, rows, [&](int a, double) { return SQUARE[a]; });
     frobenius = sqrt(t.sum(0, rows, [&](int a) { return SQUARE[a]; }));
-    evaluate(X, VALUE);
+    Algebra::combine(t, turned, X, VALUE, apart, n, 0, rows, false);
     t.each(0, rows, [&](int a) {
       WANTED[a] = distance(a, VALUE[a]);
       IN_COST[a] = level.equality[a] || WANTED[a] != 0.0;
     });
-    if (identity)
+    if constexpr (Team::SPARES_SPACE) {
+      if (!identity) t.turn(Z, ld, B, lb, first, rows);
+    } else if (identity) {
       t.each(0, n, [&](int i) {
-        for (int a = 0; a < rows; ++a) B[i * lb + a] = turned[i * apart + a];
+        for (int a = 0; a < rows; ++a) B[i * lb + a] = AT[i * lm + a];
       });
-    else
-      Algebra::product(t, free_basis(), ld, 1, turned, apart, free_rows(), lb, free(), n, rows);
+    } else {
+      Algebra::product(t, free_basis(), ld, 1, AT, lm, free_rows(), lb, free(), n, rows);
+    }
     gram_in_cost = false;
   }
 
@@ -209,6 +205,14 @@ template <class Team> struct NullSpace {
         if (!in_cost[a])
           for (int b = 0; b < rows; ++b) S[a * ls + b] = S[b * ls + a] = 0.0;
       });
+    } else if constexpr (Team::SPARES_SPACE) {
+      t.pairs(free(), [&](int j, int k) {
+        double total = 0.0;
+OSIK_UNROLL_4
+        for (int a = 0; a < rows; ++a) total += in_cost[a] ? free_rows()[j * lb + a] * free_rows()[k * lb + a] : 0.0;
+        S[j * ls + k] = total;
+        if (j == k) DIAGONAL[j] = total;
+      });
     } else {
       t.each(0, rows, [&](int a) {
         for (int j = 0; j < free(); ++j) V[a * ld + j] = in_cost[a] ? B[(first + j) * lb + a] : 0.0;
@@ -220,11 +224,16 @@ template <class Team> struct NullSpace {
   }
   OSIK_FN bool factor(double ridge) {  // false where a pivot is not positive
     const int count = by_rows ? rows : free();
-    t.each(0, count, [&](int k) {
-      for (int j = 0; j < count; ++j) F[k * lf + j] = S[k * ls + j];
-      F[k * lf + k] = DIAGONAL[k] + ridge;
+    t.columns(0, count, [&](auto c) {
+OSIK_UNROLL_4
+      for (int k = 0; k < count; ++k) c.store(F + k * lf, c.load(S + k * ls));
     });
+    t.each(0, count, [&](int k) { F[k * lf + k] = DIAGONAL[k] + ridge; });
     return Algebra::inverse_factor(t, F, M, INVERSE, SCALE, lf, count, 0.0);
+  }
+  // out = B v for the free coordinates; v: [rows], 0 for rows that are not in the cost
+  OSIK_FN void rows_along(const double* v, double* out) {
+    t.each(0, free(), [&](int j) { out[j] = t.own_dot(free_rows() + j * lb, v, 0, rows); });
   }
   OSIK_FN void solve_factored(double* y) { Algebra::apply_inverse(t, M, INVERSE, y, SCALE, lf, by_rows ? rows : free()); }
 
@@ -240,9 +249,9 @@ template <class Team> struct NullSpace {
         t.each(0, rows, [&](int a) { MISSING[a] = wanted[a] - ridge * RIGHT[a]; });
         return true;
       }
-      t.each(0, free(), [&](int j) { COORDINATES[j] = t.own_dot(B + (first + j) * lb, RIGHT, 0, rows); });
+      rows_along(RIGHT, COORDINATES);
     } else {
-      Algebra::template combine<Team::SPARES_SPACE>(t, V, wanted, COORDINATES, ld, rows, 0, free(), false);
+      rows_along(wanted, COORDINATES);
       solve_factored(COORDINATES);
     }
     Algebra::combine(t, free_rows(), COORDINATES, MISSING, lb, free(), 0, rows, false);
@@ -293,11 +302,11 @@ template <class Team> struct NullSpace {
     double least = mean;
     for (int j = 0; j < count; ++j) least /= INVERSE[j] * mean;
     if (!(least >= INDEPENDENT_ROWS * trace && least - damping > 2.0 * rows * cutoff * cutoff)) return false;
-    Algebra::template combine<Team::SPARES_SPACE>(t, V, WANTED, COORDINATES, ld, rows, 0, count, false);
+    rows_along(WANTED, COORDINATES);
     solve_factored(COORDINATES);
     Algebra::combine(t, free_rows(), COORDINATES, MISSING, lb, count, 0, rows, false);
-    t.each(0, rows, [&](int a) { MISSING[a] = WANTED[a] - MISSING[a]; });
-    Algebra::template combine<Team::SPARES_SPACE>(t, V, MISSING, RIGHT, ld, rows, 0, count, false);
+    t.each(0, rows, [&](int a) { MISSING[a] = IN_COST[a] ? WANTED[a] - MISSING[a] : 0.0; });
+    rows_along(MISSING, RIGHT);
     t.axpy(RIGHT, -damping, COORDINATES, 0, count);
     solve_factored(RIGHT);
     t.axpy(COORDINATES, 1.0, RIGHT, 0, count);
@@ -315,6 +324,16 @@ template <class Team> struct NullSpace {
     Algebra::least_squares_of_rows(t, C, WORK, INVERSE, lb, rank, columns);
     t.each(0, rank, [&](int k) { COORDINATES[k] = C[rank * lb + k]; });
   }
+  // the reflections of B's first columns, whose rank is returned, and those of Z by them. Where V is in global memory,
+  // RIGHT and DIAGONAL have those at work.
+  OSIK_METHOD int reflect_rows(int columns, double cutoff) {
+    return Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, free_rows(), V, RIGHT, SQUARES, SCALE, PIVOT, lb, ld, free(),
+                                                            0, columns, cutoff);
+  }
+  OSIK_METHOD void reflect_basis() {
+    Algebra::template apply_reflections<Team::SPARES_SPACE>(t, V, RIGHT, SCALE, free_basis(), ld, DIAGONAL - RIGHT, ld,
+                                                            rank, free(), n);
+  }
   // MOTION = the motion that the level asks for; the rows of Z that it determines follow those before `first`
   OSIK_METHOD void find_motion() {
     const double cutoff = rank_tol * sqrt(t.sum(0, rows, [&](int a) { return IN_COST[a] ? SQUARE[a] : 0.0; }));
@@ -326,11 +345,10 @@ template <class Team> struct NullSpace {
         if (!IN_COST[a])
           for (int j = first; j < n; ++j) B[j * lb + a] = 0.0;
       });
-      rank = Algebra::template pivoted_qr<Team::SPARES_SPACE>(t, free_rows(), V, SQUARES, SCALE, PIVOT, lb, ld, count, 0,
-                                                              rows, cutoff);
+      rank = reflect_rows(rows, cutoff);
       solve_in_row_space();
       if (rank < count) {
-        Algebra::apply_reflections(t, V, SCALE, free_basis(), ld, ld, rank, count, n);
+        reflect_basis();
         identity = identity && rank == 0;
       } else {  // no coordinate is left for the levels below, and Z may stay as it is
         for (int k = rank - 1; k >= 0; --k) {

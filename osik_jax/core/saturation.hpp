@@ -587,11 +587,9 @@ template <class Team> struct Saturation : NullSpace<Team> {
       ++columns;
     }
     if (columns == 0) return;
-    double *V = this->V, *scales = this->SCALE;
-    const int rank = Algebra::pivoted_qr(
-        t, this->free_rows(), V, this->SQUARES, scales, this->PIVOT, lb, ld, free(), 0, columns, BLOCKING_RANK);
-    Algebra::apply_reflections(t, V, scales, this->free_basis(), ld, ld, rank, free(), n);
-    this->identity = false, first += rank;
+    this->rank = this->reflect_rows(columns, BLOCKING_RANK);
+    this->reflect_basis();
+    this->identity = false, first += this->rank;
     t.each(0, n, [&](int i) {
       if (BLOCKING[i])
         for (int j = first; j < n; ++j) Z[j * ld + i] = 0.0;

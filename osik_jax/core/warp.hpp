@@ -203,8 +203,12 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     Real even = 0, odd = 0;
     int j = start;
 #pragma unroll 1
-    for (; j + 1 < stop; j += 2) even += a[j * step] * b[j], odd += a[(j + 1) * step] * b[j + 1];
-    if (j < stop) even += a[j * step] * b[j];
+    for (; j + 3 < stop; j += 4) {
+      even += a[j * step] * b[j], odd += a[(j + 1) * step] * b[j + 1];
+      even += a[(j + 2) * step] * b[j + 2], odd += a[(j + 3) * step] * b[j + 3];
+    }
+#pragma unroll 1
+    for (; j < stop; ++j) even += a[j * step] * b[j];
     return even + odd;
   }
   // f of four numbers of each of two padded rows at a time
@@ -242,20 +246,33 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     for (; j + 1 < stop; j += 2) even += a[j * step] * a[j * step], odd += a[(j + 1) * step] * a[(j + 1) * step];
     return j < stop ? even + odd + a[j * step] * a[j * step] : even + odd;
   }
+  // a[j step] = f(j, a[j step]); four are read before the first is written, so that reads need not wait for writes
+  template <class F> OSIK_FN static void own_update(Real* a, int step, int start, int stop, F f) {
+    int j = start;
+#pragma unroll 1
+    for (; j + 3 < stop; j += 4) {
+      Real x[4];
+#pragma unroll
+      for (int b = 0; b < 4; ++b) x[b] = f(j + b, a[(j + b) * step]);
+#pragma unroll
+      for (int b = 0; b < 4; ++b) a[(j + b) * step] = x[b];
+    }
+#pragma unroll 1
+    for (; j < stop; ++j) a[j * step] = f(j, a[j * step]);
+  }
   OSIK_FN static void own_axpy(Real* a, Real by, const Real* b, int start, int stop) {
-#pragma unroll 2
-    for (int j = start; j < stop; ++j) a[j] += by * b[j];
+    own_update(a, 1, start, stop, [&](int j, Real x) { return x + by * b[j]; });
   }
   OSIK_FN static void own_axpy_on(Real* a, Real by, const Real* b, int start, int n) { own_axpy(a, by, b, start, n); }
   OSIK_FN static int own_end(const Real*, int n) { return n; }
   // Numbers that begin to arrive in shared memory while the threads go on; zeros where there are none.
-  OSIK_FN static void fetch_one(Real* to, const Real* from, bool there) {
+  OSIK_FN static void fetch_one(Real* to, const Real* from, bool there = true) {
     are_global(from);
     asm volatile("cp.async.ca.shared.global [%0], [%1], %2, %3;"
                  ::"r"(unsigned(__cvta_generic_to_shared(to))), "l"(from), "n"(sizeof(R)), "r"(there ? int(sizeof(R)) : 0));
   }
   OSIK_FN void fetch(Real* to, const Real* from, int count) const {
-    for (int i = me(); i < count; i += 32) fetch_one(to + i, from + i, true);
+    for (int i = me(); i < count; i += 32) fetch_one(to + i, from + i);
   }
   OSIK_FN void fetch_rows(Real* to, int ld, const Real* from, int rows) const {
     constexpr int PADDED = Warp::padded(N);
@@ -311,6 +328,33 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     });
   }
 
+  // B <- Z B in the place of B [N, ld_B], of which the first `columns` columns count, without the rows before `first`
+  OSIK_FN void turn(const Real* Z, int ld, Real* B, int ld_B, int first, int columns) const {
+    constexpr int HELD = (N + 31) / 32, SOME = 4;
+#pragma unroll 1
+    for (int a = 0; a < columns; a += SOME) {
+      Real total[HELD][SOME];
+#pragma unroll
+      for (int h = 0; h < HELD; ++h) {
+        const int j = first + me() + 32 * h;
+        const Real* row = Z + (j < N ? j : N - 1) * ld;
+#pragma unroll
+        for (int b = 0; b < SOME; ++b) total[h][b] = 0;
+#pragma unroll 2
+        for (int i = 0; i < N; ++i)
+#pragma unroll
+          for (int b = 0; b < SOME; ++b) total[h][b] += row[i] * B[i * ld_B + a + b];
+      }
+      __syncwarp();
+#pragma unroll
+      for (int h = 0; h < HELD; ++h)
+#pragma unroll
+        for (int b = 0; b < SOME; ++b)
+          if (first + me() + 32 * h < N && a + b < columns) B[(first + me() + 32 * h) * ld_B + a + b] = total[h][b];
+      __syncwarp();
+    }
+  }
+
   // LinearAlgebra::inverse_factor, in the place of S. Thread j has column j: of what is left of S from row k on, of the
   // inverse M in the columns before k.
   OSIK_FN bool inverse_factor(Real* S, Real* inverse, Real* diagonal, int ld, int count, Real smallest) const {
@@ -328,11 +372,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
       each(0, count, [&](int j) {
         const bool is_pivot = j == k;  // whose column of S is done, so that that of M begins
         const Real factor = is_pivot ? by : by * row[j];
-        Real* column = S + j;
         if (is_pivot) inverse[k] = by;
-#pragma unroll 4
-        for (int i = k + 1; i < count; ++i)
-          column[i * ld] = (is_pivot ? Real(0) : column[i * ld]) - row[i] * factor;
+        own_update(S + j, ld, k + 1, count, [&](int i, Real x) { return (is_pivot ? Real(0) : x) - row[i] * factor; });
       });
     }
     each(0, Warp::padded(count), [&](int j) {
