@@ -195,6 +195,11 @@ template <class Team> struct Hierarchy {
     Algebra::gram(t, R, S, DIAGONAL, ld, lm, count, start, n, lower);
     return t.sum(0, count, [&](int a) { return DIAGONAL[a]; });
   }
+  OSIK_FN double gram_of_columns(int start) {  // R'R of the columns from `start` on, in the same way, to the upper triangle
+    Algebra::product(t, R + start, 1, ld, R + start, ld, S, lm, n - start, rows, n - start, true);
+    t.each(0, n - start, [&](int j) { DIAGONAL[j] = S[j * lm + j]; });
+    return t.sum(0, n - start, [&](int j) { return DIAGONAL[j]; });
+  }
   OSIK_FN void cholesky(int count, double ridge, bool lower) {
     Algebra::cholesky(t, S, DIAGONAL, INVERSE, lm, count, ridge, lower);
   }
@@ -574,19 +579,22 @@ template <class Team> struct Hierarchy {
         goal[a] = IN_COST[a] ? miss : 0.0;
       });
       rows_in_basis(first_active);
-      const double trace = gram(rows, first_active, false);
+      const int free = n - first_active, count = rows < free ? rows : free;
+      if (count < rows) {
+        Algebra::combine(t, R + first_active, goal, SLACK, ld, rows, 0, free, false);
+        goal = SLACK;
+      }
+      const double trace = count < rows ? gram_of_columns(first_active) : gram(rows, first_active, false);
       for (int again = 0; again < DAMPING_ITERATIONS && ratio != before && unmet * ratio > least; ++again) {
-        before = ratio;  // the damped step d = R' (R R' + damping I)^-1 goal, clipped into the box
+        // the damped step d = R' (R R' + damping I)^-1 goal = (R'R + damping I)^-1 R' goal, clipped into the box
+        before = ratio;
         const double ridge = constant + unmet * ratio + DAMPING_RIDGE * trace;
-        cholesky(rows, ridge > 0.0 ? ridge : 1.0, false);
-        copy(goal, RIGHT, rows);
-        t.forward(S, lm, INVERSE, RIGHT, rows);
-        t.backward(S, lm, INVERSE, RIGHT, rows);
-        t.columns(first_active, n, [&](auto c) {
-          auto sum = typename decltype(c)::P(0.0);
-          for (int a = 0; a < rows; ++a) sum.fma(RIGHT[a], c.load(R + a * ld));
-          c.store(WORK, sum);
-        });
+        cholesky(count, ridge > 0.0 ? ridge : 1.0, false);
+        copy(goal, RIGHT, count);
+        t.forward(S, lm, INVERSE, RIGHT, count);
+        t.backward(S, lm, INVERSE, RIGHT, count);
+        if (count < rows) copy(RIGHT, WORK + first_active, free);
+        else Algebra::combine(t, R + first_active, RIGHT, WORK + first_active, ld, rows, 0, free, false);
         stay_inside(base);
         from_basis(first_active, n, end);
         t.each(0, n, [&](int i) { end[i] = clip(base[i] + end[i], HARD_LOWER[i], HARD_UPPER[i]); });
