@@ -579,12 +579,14 @@ template <class Team> struct Hierarchy {
         goal[a] = IN_COST[a] ? miss : 0.0;
       });
       rows_in_basis(first_active);
-      const int free = n - first_active, count = rows < free ? rows : free;
-      if (count < rows) {
+      const int free = n - first_active, in_cost = t.count(0, rows, [&](int a) { return IN_COST[a] != 0; });
+      const bool by_columns = free < in_cost;  // rows that are not in the cost are 0, and R'R may be singular beside them
+      const int count = by_columns ? free : rows;
+      if (by_columns) {
         Algebra::combine(t, R + first_active, goal, SLACK, ld, rows, 0, free, false);
         goal = SLACK;
       }
-      const double trace = count < rows ? gram_of_columns(first_active) : gram(rows, first_active, false);
+      const double trace = by_columns ? gram_of_columns(first_active) : gram(rows, first_active, false);
       for (int again = 0; again < DAMPING_ITERATIONS && ratio != before && unmet * ratio > least; ++again) {
         // the damped step d = R' (R R' + damping I)^-1 goal = (R'R + damping I)^-1 R' goal, clipped into the box
         before = ratio;
@@ -593,7 +595,7 @@ template <class Team> struct Hierarchy {
         copy(goal, RIGHT, count);
         t.forward(S, lm, INVERSE, RIGHT, count);
         t.backward(S, lm, INVERSE, RIGHT, count);
-        if (count < rows) copy(RIGHT, WORK + first_active, free);
+        if (by_columns) copy(RIGHT, WORK + first_active, free);
         else Algebra::combine(t, R + first_active, RIGHT, WORK + first_active, ld, rows, 0, free, false);
         stay_inside(base);
         from_basis(first_active, n, end);

@@ -103,7 +103,7 @@ template <class Team> struct NullSpace {
   // columns of B from m on, until the level is solved in its row space
   Matrix<InPlaceAt<4>> F;
   Matrix<InPlaceAt<5>> M;
-  double *V;  // [max(m, n), ld] reflections; before these, rows in the cost in the free coordinates
+  double *V;  // [max(m, n), ld] reflections; before these, on a CPU, rows in the cost in the free coordinates
   double *S;  // [min(m, n), ls] a Gram matrix
   // vectors, as long as the longer of m and n
   Numbers<0> X;
@@ -195,7 +195,7 @@ OSIK_UNROLL_4
   }
 
   // ---- the smaller of the two Gram matrices
-  // S = B'B of the rows in the cost, or B B' of their part in the free coordinates, which is then in V. Returns the trace.
+  // S = B'B of the rows in the cost, or B B' of their part in the free coordinates. Returns the trace.
   OSIK_METHOD double gram(const Int* in_cost) {
     by_rows = rows < free();
     if (by_rows) {
@@ -233,6 +233,8 @@ OSIK_UNROLL_4
   }
   // out = B v for the free coordinates; v: [rows], 0 for rows that are not in the cost
   OSIK_FN void rows_along(const double* v, double* out) {
+    if constexpr (!Team::SPARES_SPACE)
+      if (!by_rows) return Algebra::combine(t, V, v, out, ld, rows, 0, free(), false);
     t.each(0, free(), [&](int j) { out[j] = t.own_dot(free_rows() + j * lb, v, 0, rows); });
   }
   OSIK_FN void solve_factored(double* y) { Algebra::apply_inverse(t, M, INVERSE, y, SCALE, lf, by_rows ? rows : free()); }
