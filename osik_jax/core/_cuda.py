@@ -48,6 +48,15 @@ def shared_bytes() -> int:
     return _attribute(_SHARED_BYTES) or 227 * 1024
 
 
+def blocks_beside(shared: int) -> int:
+    """Return how many blocks that take so many bytes of shared memory fit on a multiprocessor.
+
+    A kernel's launch bounds name this number: without it the compiler keeps fewer registers than there are.
+    """
+    of_system = 1024  # bytes that CUDA takes of each block
+    return max(1, min((shared_bytes() + of_system) // (shared + of_system), 32))
+
+
 @cache
 def _attribute(which: int) -> int | None:
     """Return an attribute of the first device, by CUDA's driver; None if that does not say."""

@@ -15,7 +15,7 @@
 #define __noinline__
 #define __shared__
 #define __align__(bytes)
-#define __launch_bounds__(threads)
+#define __launch_bounds__(threads, blocks)
 #define __isShared(p) is_in_shared_memory(p)
 #define __isGlobal(p) (!is_in_shared_memory(p))
 #define __builtin_assume(fact) ((fact) ? void() : stop_at(#fact))

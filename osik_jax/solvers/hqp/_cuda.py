@@ -17,7 +17,7 @@ _MAX_ROWS = 64  # the triangular solves of a warp hold two entries a thread
 _KERNEL = """
 using namespace osik;
 using Method = Hierarchy<Warp<double, N, M, H>>;
-extern "C" __global__ void __launch_bounds__(32) osik_kernel(
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
     const double* matrix, const double* lower, const double* upper, const double* hard, const double* hard_lower,
     const double* hard_upper, const double* damping, const double* bends, const double* tolerances,
     const int* equality, const int* pinned, const int* guess_hard, const int* guess_own,
@@ -49,7 +49,7 @@ def fits(layout: Layout) -> bool:
 def _source(layout: Layout, max_iterations: int) -> str:
     n, h = layout.variables, len(layout.level_of_hard)
     numbers = dict(N=n, M=layout.rows, H=h, L=layout.levels, ROWS=sum(layout.row_counts))
-    numbers |= dict(MAX_ITERATIONS=max_iterations)
+    numbers |= dict(MAX_ITERATIONS=max_iterations, BLOCKS=_cuda.blocks_beside(_bytes(layout)))
     lists = dict(ROW_COUNTS=layout.row_counts, LEVEL_OF_HARD=layout.level_of_hard, ROW_OF_HARD=layout.row_of_hard)
     return _cuda.text_of("hierarchy.hpp") + _cuda.constants(**numbers, **lists) + _KERNEL
 

@@ -15,7 +15,7 @@ _MAX_RANK = 64  # the triangular solves of a warp hold two entries a thread
 _KERNEL = """
 using namespace osik;
 using Method = ClassicalProjection<Warp<double, N, M, 0>>;
-extern "C" __global__ void __launch_bounds__(32) osik_kernel(
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
     const double* secondary, const double* constant, const double* unmet, const double* demand, const double* bends,
     const double* rank_tol, LEVELS, double* x, double* projector, double* outside, int problems) {
   const double* const matrices[] = {MATRIX};
@@ -61,7 +61,9 @@ def _source(n: int, rows: tuple[int, ...], per_block: int) -> str:
     text = _KERNEL.replace("LEVELS", ", ".join(f"const {'int' if 'equal' in a else 'double'}* {a}" for a in levels))
     for key, own in columns.items():
         text = text.replace(key, ", ".join(own))
-    sizes = _cuda.constants(N=n, M=max(rows), L=len(rows), ROWS=rows, PER_BLOCK=per_block)
+    m = max(rows)
+    blocks = _cuda.blocks_beside(_cuda.space_of("null_space", n, m))
+    sizes = _cuda.constants(N=n, M=m, L=len(rows), ROWS=rows, PER_BLOCK=per_block, BLOCKS=blocks)
     return _cuda.text_of("null_space.hpp") + sizes + _cuda.rolled(text)
 
 

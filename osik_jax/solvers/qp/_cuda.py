@@ -18,7 +18,7 @@ CERTIFIED = 2
 _KERNEL = """
 using namespace osik;
 using Method = WeightedQP<Warp<Real, N, M, P>>;
-extern "C" __global__ void __launch_bounds__(32) osik_kernel(
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
     const Real* matrix, const Real* target, const Real* weight, const Real* damping, const Real* center,
     const Real* rows, const Real* compliance, const Real* lower, const Real* upper, const int* guess,
     const Real* tolerance, Real* x, Real* multipliers, int* active, int* report, Real* residual, Real* outside,
@@ -55,7 +55,8 @@ def _bytes(m: int, n: int, p: int, single: bool) -> int:
 
 @cache
 def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: int) -> str:
-    sizes = _cuda.constants(M=m, N=n, P=p, MAX_CHANGES=max_changes, PER_BLOCK=per_block)
+    blocks = _cuda.blocks_beside(_bytes(m, n, p, single))
+    sizes = _cuda.constants(M=m, N=n, P=p, MAX_CHANGES=max_changes, PER_BLOCK=per_block, BLOCKS=blocks)
     tolerance = KKT_TOLERANCE[jnp.dtype("float32" if single else "float64")]
     kind = f"using Real = {'float' if single else 'double'};\nconstexpr Real KKT_TOLERANCE = {tolerance};\n"
     return _cuda.text_of("qp_certificate.hpp") + sizes + kind + _KERNEL
