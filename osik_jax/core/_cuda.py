@@ -49,12 +49,13 @@ def shared_bytes() -> int:
 
 
 def blocks_beside(shared: int) -> int:
-    """Return how many blocks that take so many bytes of shared memory fit on a multiprocessor.
+    """Return how many blocks that take so many bytes of shared memory fit on a multiprocessor, up to 16.
 
-    A kernel's launch bounds name this number: without it the compiler keeps fewer registers than there are.
+    A kernel's launch bounds name this number: without it the compiler keeps fewer registers than there are. With 16
+    blocks of a warp each thread may have 128.
     """
     of_system = 1024  # bytes that CUDA takes of each block
-    return max(1, min((shared_bytes() + of_system) // (shared + of_system), 32))
+    return max(1, min((shared_bytes() + of_system) // (shared + of_system), 16))
 
 
 @cache

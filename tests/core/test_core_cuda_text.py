@@ -85,7 +85,7 @@ def test_what_does_not_fit_a_device_is_left_to_plain_jax(shared, capability, fit
 @pytest.mark.parametrize("shared, blocks", [(227, 9), (99, 4), (20, 1)])
 def test_blocks_are_as_many_as_have_room_in_the_shared_memory_of_a_multiprocessor(shared, blocks, monkeypatch):
     monkeypatch.setattr(_cuda, "_attribute", {_cuda._SHARED_BYTES: shared * 1024}.get)
-    assert _cuda.blocks_beside(24 * 1024) == blocks and _cuda.blocks_beside(0) <= 32
+    assert _cuda.blocks_beside(24 * 1024) == blocks and _cuda.blocks_beside(0) == 16
 
 
 def test_a_device_that_is_not_known_is_asked_for_nothing():
