@@ -22,6 +22,7 @@ class Description:
         amplitude: of its curve [m].
         feet: links that stay, and carry the robot.
         foot_centre: of a foot's contact area, ahead of its link [m].
+        sole: corners of a foot's contact area in its frame [m]; empty if the file has them.
         arms: parts of the names of the joints that differ from lane to lane in ``benchmarks.throughput``.
         urdf: end of the file's path in example-robot-data; empty for an embedded robot.
         posture: joints of the start that are not 0 [rad]; an embedded robot has a keyframe.
@@ -35,6 +36,7 @@ class Description:
     amplitude: tuple[float, float, float]
     feet: tuple[str, ...] = ()
     foot_centre: float = 0.0
+    sole: tuple[tuple[float, float, float], ...] = ()
     arms: tuple[str, ...] = ()
     urdf: str = ""
     posture: Mapping[str, float] = field(default_factory=dict)
@@ -49,6 +51,7 @@ ROBOTS = {
         amplitude=(0.10, 0.12, 0.10),
         feet=("left_ankle_roll_link", "right_ankle_roll_link"),
         foot_centre=0.035,
+        sole=tuple((x, y, 0.0) for x in (-0.05, 0.11) for y in (-0.03, 0.03)),
         arms=("shoulder", "elbow"),
         urdf="g1_description/urdf/g1_29dof_rev_1_0.urdf",
         posture={f"{side}_{joint}_joint": angle for side in ("left", "right") for joint, angle in _LEG.items()}

@@ -79,7 +79,8 @@ def setting(name: str, tasks_of: str = "equality") -> Setting:
     feet, hand = ROBOTS[name].feet, ROBOTS[name].hand
     tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
     if feet:
-        polygon = None if tasks_of == "equality" else osik.support_polygon(robot, robot.q0, feet)
+        stands = tasks_of != "equality"
+        polygon = osik.support_polygon(robot, robot.q0, feet, corners=soles(name)) if stands else None
         tasks["com"] = osik.ComTask(robot, polygon=polygon, weight=10.0, priority=2)
     if tasks_of == "limits":
         slow = osik.VelocityLimit(robot, velocity=0.5 * robot.velocity_limit)
@@ -94,6 +95,12 @@ def setting(name: str, tasks_of: str = "equality") -> Setting:
     starts, ends = (jnp.asarray(q) for q in arm_angles(robot, ROBOTS[name].arms))
     poses = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_pose(robot, hand)[0]))
     return Setting(robot, tasks, (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot)), starts, poses(ends))
+
+
+def soles(name: str) -> dict[str, tuple[tuple[float, float, float], ...]] | None:
+    """The corners of the feet's contact areas; None where the robot's file has them."""
+    robot = ROBOTS[name]
+    return dict.fromkeys(robot.feet, robot.sole) if robot.sole else None
 
 
 def loaded(name: str) -> osik.Robot:

@@ -28,11 +28,9 @@ from osik_jax.runtime import configure_cpu
 
 from ..descriptions import ROBOTS
 from ..machine import processor
-from ..throughput import loaded
+from ..throughput import loaded, soles
 
 HANDS = {"g1": ("left_wrist_yaw_link", "right_wrist_yaw_link"), "nao": ("l_gripper", "r_gripper")}
-SOLES = {"g1": [[x, y, 0.0] for x in (-0.05, 0.11) for y in (-0.03, 0.03)], "nao": None}
-"""Corners of a foot's contact area, where the model has none [m]."""
 POSITION, ORIENTATION = 1e-3, 1e-2
 _SHARE = 0.9
 """Of the way from home to a random configuration that a pose may be made at."""
@@ -40,9 +38,8 @@ _SHARE = 0.9
 
 def standing_tasks(name: str, robot: osik.Robot) -> tuple[dict[str, osik.Task], osik.SupportPolygon]:
     """Feet where they are, centre of mass over them."""
-    feet, soles = ROBOTS[name].feet, SOLES[name]
-    corners = None if soles is None else {foot: np.array(soles) for foot in feet}
-    polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.005, corners=corners)
+    feet = ROBOTS[name].feet
+    polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.005, corners=soles(name))
     tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=10.0) for foot in feet}
     return {**tasks, "balance": osik.ComTask(robot, polygon=polygon, weight=10.0)}, polygon
 

@@ -55,6 +55,17 @@ def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
 
 
 @pytest.mark.release
+@pytest.mark.parametrize("robot", ["g1", "nao"])
+def test_humanoids_stand_on_both_feet(robot):
+    given = throughput.setting(robot, "polygon")
+    kinematics = osik.forward_kinematics(given.robot, given.robot.q0)
+    feet = np.array([kinematics.frame_pose(given.robot, name)[0][:2] for name in throughput.ROBOTS[robot].feet])
+    polygon = given.tasks["com"].polygon
+    outside = np.asarray(feet @ polygon.normals.T - polygon.offsets)
+    assert (outside < 0.0).all() and outside.min() < -0.1  # each foot is far from an edge of the other one
+
+
+@pytest.mark.release
 def test_steps_of_a_call_are_those_of_several():
     step, given, state = throughput.batch_of(throughput.setting("arm7"), osik.WeightedQP(), 3)
     at_once = jax.jit(throughput.repeated(step, 4))(*given, state)
