@@ -60,7 +60,9 @@ def test_humanoids_stand_on_both_feet(robot):
     given = throughput.setting(robot, "polygon")
     kinematics = osik.forward_kinematics(given.robot, given.robot.q0)
     feet = np.array([kinematics.frame_pose(given.robot, name)[0][:2] for name in throughput.ROBOTS[robot].feet])
-    polygon = given.tasks["com"].polygon
+    com = given.tasks["com"]
+    assert isinstance(com, osik.ComTask) and com.polygon is not None
+    polygon = com.polygon
     outside = np.asarray(feet @ polygon.normals.T - polygon.offsets)
     assert (outside < 0.0).all() and outside.min() < -0.1  # each foot is far from an edge of the other one
 
