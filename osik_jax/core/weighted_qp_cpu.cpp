@@ -59,10 +59,13 @@ void judge_weighted_qps(const xla::Call& call) {
 extern "C" {
 void* osik_weighted_qp(xla::CallFrame* frame) { return xla::handle<solve_weighted_qps>(frame); }
 
-// Bytes of shared memory that a warp needs for one problem, a multiple of 16.
+// Bytes of shared memory that a warp needs for one problem, a multiple of 16, and numbers beside it.
 int osik_weighted_qp_bytes(int m, int n, int p, int single) {
   const QPSizes s{m, n, p, 0};
   return single ? WeightedQP<WarpSizes<float>>::bytes(s) : WeightedQP<WarpSizes<double>>::bytes(s);
+}
+int osik_weighted_qp_outside(int n, int p, int single) {
+  return single ? DualActiveSet<WarpSizes<float>>::doubles(n, p) : DualActiveSet<WarpSizes<double>>::doubles(n, p);
 }
 void* osik_weighted_qp_certificate(xla::CallFrame* frame) { return xla::handle<judge_weighted_qps>(frame); }
 }

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from osik_jax.core import _cuda as core_cuda
 from osik_jax.solvers.qp import _cuda
 
 SHARED = 1 << 18
@@ -122,7 +123,8 @@ def solve(folder: Path, problems: tuple[np.ndarray, ...], guess: np.ndarray, tol
     numbers, labels = ((n,), (p,)), ((n + p,), (3,))
     x, y = (np.zeros((count, *shape), kind) for shape in numbers)
     active, report = (np.zeros((count, *shape), np.int32) for shape in labels)
-    residual, outside = np.zeros(count, kind), np.zeros((count, (2 * (n + p) + 6) * (n + p + 7)), kind)
+    numbers_outside = core_cuda.space_outside("weighted_qp", n, p, int(kind == np.float32))
+    residual, outside = np.zeros(count, kind), np.zeros((count, numbers_outside), kind)
     arrays = [*given, x, y, active, report, residual, outside]
     pointers = (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))
     library(folder, m, n, p, kind == np.float32).run(pointers, count)

@@ -71,7 +71,8 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     sizes = m, n, p, kind == jnp.float32
     numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.rows, qp.compliance)
     per_block, most = _cuda.problems_of_a_block(batch), n + p
-    outside = -(-batch // per_block), (2 * most + 6) * (most + 7)  # of the dual method, which few problems need
+    # of the dual method, which few problems need
+    outside = -(-batch // per_block), _cuda.space_outside("weighted_qp", n, p, int(kind == jnp.float32))
     x, y, active, report, residual, _ = _cuda.call(
         _source(*sizes, max_iterations, per_block),
         [*_library.shapes_of(batch, ((n,), (p,)), ((most,), (3,)), kind), ((batch,), kind), (outside, kind)],
