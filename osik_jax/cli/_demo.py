@@ -72,7 +72,7 @@ class Demo:
         with writing(out), progress(console) as announce:
             _, shown, _ = run_demo(motion, out, announce=announce, **settings)
         console.print(shown)
-        console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
+        console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)
         return 0
 
 

@@ -31,6 +31,7 @@ class Info:
     def run(self) -> int:
         """Run the command; return the exit code."""
         from rich.console import Console
+        from rich.markup import escape
 
         console = Console()
         if self.system:
@@ -43,11 +44,11 @@ class Info:
         base = "floating base" if robot.floating_base else "bolted down"
         own = robot.body_mass[robot.tree.is_own] if len(robot.tree.robots) <= 1 else robot.body_mass
         size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {float(own.sum()):.3f} kg"
-        console.print(f"[bold]{self.robot}[/bold]: {size}")
+        console.print(f"[bold]{escape(self.robot)}[/bold]: {size}")
         console.print(_joint_table(robot))
         for follower, (leader, multiplier) in robot.mimic_joints.items():
-            console.print(f"{follower} follows {leader}, times {multiplier:g}")
-        console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {', '.join(robot.frame_names)}")
+            console.print(f"{follower} follows {leader}, times {multiplier:g}", markup=False)
+        console.print(f"[bold]{len(robot.frame_names)} frames[/bold]: {escape(', '.join(robot.frame_names))}")
         _print_report(console, robot)
         return 0
 
@@ -88,6 +89,7 @@ def _print_report(console: Console, robot: Robot) -> None:
 
 
 def _joint_table(robot: Robot) -> Table:
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table("joint")
@@ -97,5 +99,5 @@ def _joint_table(robot: Robot) -> Table:
         dof = robot.joint_dof_index(name)
         limits = (robot.position_lower[dof], robot.position_upper[dof], robot.velocity_limit[dof])
         numbers = (f"{float(value):.4f}".rstrip("0").rstrip(".") for value in limits)
-        table.add_row(name, str(robot.joint_qpos_index(name)), str(dof), *numbers)
+        table.add_row(escape(name), str(robot.joint_qpos_index(name)), str(dof), *numbers)
     return table

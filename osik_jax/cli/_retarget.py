@@ -305,7 +305,7 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
         f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )
-    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}")
+    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}", markup=False)
     for note in notes(figures, command.balance):
         _say(console, f"note: {note}")
 

@@ -37,7 +37,7 @@ constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-
 constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, SMALL_TURN_SQUARED = 1e-6, PARALLEL = 1e-6;
 
 // null space
-constexpr double INDEPENDENT_ROWS = 1e-7;
+constexpr double INDEPENDENT_ROWS = 1e-7, NARROW_RANGE = 1e4;
 
 // saturation
 constexpr int STRAIGHT = 1, PART = 2, WHOLE = 3;

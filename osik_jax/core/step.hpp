@@ -249,15 +249,19 @@ class Step : StepRows {
     const double potential_gain = *of_step(StepLayout::POTENTIAL_GAIN), margin = *of_step(StepLayout::MARGIN);
     double *from = center.data(), *to = from + s.nv;
     int count = 0;
+    auto has_potential = [&](int j) {  // two finite limits, and a range
+      const double narrow = NARROW_RANGE * EPSILON * larger(fabs(from[j]), fabs(to[j]));
+      return from[j] > -INFINITE && to[j] < INFINITE && to[j] - from[j] > narrow;
+    };
     for (int j = 0; j < s.nv; ++j) {
       from[j] = -INFINITE, to[j] = INFINITE;
       for (const int* limit = layout.limits; limit < layout.limits + 5 * s.limits && layout.scalar[j] >= 0; limit += 5)
         if (limit[0] == RANGE) from[j] = larger(from[j], leaf(limit[1])[j]), to[j] = least(to[j], leaf(limit[2])[j]);
-      count += from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j];
+      count += has_potential(j);
     }
     for (int j = 0; j < s.nv; ++j) {
       double gradient = 0;
-      if (from[j] > -INFINITE && to[j] < INFINITE && to[j] > from[j]) {
+      if (has_potential(j)) {
         const double span = to[j] - from[j], angle = of_step(StepLayout::Q)[layout.scalar[j]];
         const double at = nearest(angle, from[j] + margin * span, to[j] - margin * span);
         gradient = span * (2 * at - to[j] - from[j]) / (2 * count * square(to[j] - at) * square(at - from[j]));

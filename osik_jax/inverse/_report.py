@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
 from rich.table import Column, Table
 
 from ..robot import Robot
@@ -38,5 +39,5 @@ def configuration_table(robot: Robot, q: Any) -> Table:
     for name in robot.joint_names:
         dof, index = robot.joint_dof_index(name), robot.joint_qpos_index(name)
         numbers = (q[index], robot.position_lower[dof], robot.position_upper[dof])
-        table.add_row(name, str(index), *(f"{float(value):.5f}" for value in numbers))
+        table.add_row(escape(name), str(index), *(f"{float(value):.5f}" for value in numbers))
     return table

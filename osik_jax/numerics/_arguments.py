@@ -124,6 +124,12 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
         raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
 
 
+def as_floats(value: Any) -> Array:
+    """Return the value as an array of its own precision; integers get JAX's default."""
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+
+
 def concrete(value: Any) -> np.ndarray | None:
     """Return the value as a NumPy array, or None if it is traced."""
     return None if isinstance(value, Tracer) else np.asarray(value)

@@ -54,6 +54,9 @@ MIN_RADIUS = 1e-6
 NEGLIGIBLE_CURVATURE = 1e-6
 """Curvature cost of a variable relative to the largest one, below which it may be roundoff and restricts nothing."""
 
+NARROW_RANGE = 1e4
+"""Range of a joint in units of the machine epsilon of its limits, up to which it has no potential: it can not move."""
+
 # ---- saturation, shared with kernels
 
 NEGLIGIBLE_STEP = 1e-11

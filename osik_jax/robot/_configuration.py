@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Num
 
 from .._errors import OsikValueError
 from ._model import RobotModel
-from ._tree import BALL, FREE, QPOS_WIDTH
+from ._tree import BALL, FREE, QPOS_WIDTH, check_shape
 
 _LEAST_QUATERNION = 1e-8
 """A quaternion that is not longer has no direction, so it counts as zero."""
@@ -35,12 +35,8 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
 
 def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"], name: str) -> None:
     """Raise an error for an invalid q, see ``Robot.check_configuration``."""
-    tree, shape = robot.tree, np.shape(q)
-    if shape != (tree.nq,):
-        raise OsikValueError(
-            f"{name} has shape {shape}, this robot's configurations have shape ({tree.nq},): {tree.dof_owners}. "
-            "Batch with jax.vmap."
-        )
+    tree = robot.tree
+    check_shape(tree, q, name)
     if isinstance(q, Tracer):
         return
     values = np.asarray(q)

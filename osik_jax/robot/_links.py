@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
@@ -37,6 +38,9 @@ def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str
 def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) -> Float[Array, " nbody"]:
     """Return one factor for each body; the world keeps 1."""
     factors = jnp.ones(len(tree.body_names), dtype)
+    for factor in given.values() if isinstance(given, Mapping) else (given,):
+        if not isinstance(factor, Tracer) and not (np.asarray(factor) > 0.0).all():
+            raise OsikValueError(f"{what} is {given!r}; factors are positive")
     if not isinstance(given, Mapping):
         return factors.at[1:].set(given)
     seen: dict[int, str] = {}

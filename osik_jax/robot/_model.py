@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
 from ._load_report import LoadReport
-from ._tree import FREE, KinematicTree, ModelHolder
+from ._tree import FREE, KinematicTree, ModelHolder, check_shape
 
 
 class RobotModel(eqx.Module):
@@ -114,6 +114,11 @@ class RobotModel(eqx.Module):
         return self.tree.dof_address[self.tree.owner(name)]
 
     def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
-        """Return the configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,)."""
+        """Return the configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,).
+
+        Raises:
+            ValueError: q has another shape than this robot's configurations.
+        """
+        check_shape(self.tree, q, "q")
         index, coefficient = self.tree.qpos_source
         return jnp.asarray(q)[index] * coefficient + self.qpos_offset

@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar, cast
 import jax
 import mujoco
 import numpy as np
+from jaxtyping import ArrayLike, Num
 
 from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
@@ -375,3 +376,12 @@ class KinematicTree:
     @cached_property
     def _joint_index(self) -> dict[str, int]:
         return {name: i for i, name in enumerate(self.joint_names)}
+
+
+def check_shape(tree: KinematicTree, q: Num[ArrayLike, " nq"], name: str) -> None:
+    """Raise ValueError unless q has the shape of one configuration."""
+    if np.shape(q) != (tree.nq,):
+        raise OsikValueError(
+            f"{name} has shape {np.shape(q)}, this robot's configurations have shape ({tree.nq},): {tree.dof_owners}. "
+            "Batch with jax.vmap."
+        )

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..execution._backends import Backend, check_backend
+from ..numerics._constants import NARROW_RANGE
 from ..numerics._guarded import clipped
 from ..solvers import Level, solve_nullspace
 from ..solvers.null_space import NullSpaceSolution
@@ -117,13 +118,14 @@ def limit_potential_gradient(
     upper: Float[Array, " nv"],
     margin: Float[Array, ""] | float = 0.01,
 ) -> Float[Array, " nv"]:
-    """Return df/dq of the joint-limit potential (eq. 8), 0 for joints without two finite limits.
+    """Return df/dq of the joint-limit potential (eq. 8), 0 for joints without two finite limits or a range.
 
     r_i (2 q_i - u_i - l_i) / (2 n (u_i - q_i)^2 (q_i - l_i)^2): negative near the lower limit, positive near the upper,
     so that descending it leads away from both. q is clamped ``margin`` of the range inside the limits, where the
     potential is finite. (nv,)
     """
-    limited = jnp.isfinite(lower) & jnp.isfinite(upper) & (upper > lower)
+    narrow = NARROW_RANGE * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(upper))
+    limited = jnp.isfinite(lower) & jnp.isfinite(upper) & (upper - lower > narrow)
     low, high = jnp.where(limited, lower, -1.0), jnp.where(limited, upper, 1.0)
     span = high - low
     q = jnp.clip(position, low + margin * span, high - margin * span)

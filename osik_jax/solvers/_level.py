@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..numerics._arguments import as_floats
 from ..numerics._dense import apply
 from ._box import ordered_bounds
 
@@ -44,7 +45,7 @@ class Level(eqx.Module):
         weight: ArrayLike | Array | None = None,
         equalities: Sequence[bool] | None = None,
     ):
-        self.matrix = jnp.asarray(matrix)
+        self.matrix = as_floats(matrix)
         self.lower = jnp.asarray(lower, self.matrix.dtype)
         count = self.matrix.shape[-2]
         self.equalities = (upper is None,) * count if equalities is None else tuple(map(bool, equalities))

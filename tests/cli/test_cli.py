@@ -13,6 +13,7 @@ import pytest
 from model_files import MJCF
 from mujoco_states import mujoco_at
 from small_files import files_of_at_most
+from urdfs import joint, tree
 
 import osik_jax as osik
 from osik_jax import cli
@@ -210,3 +211,13 @@ def test_ik_finds_a_configuration_or_says_what_stops_it(arm, capsys):
     assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "4", "0", "0", "--seeds", "2"]) == 1
     assert "out of reach" in capsys.readouterr().out
     assert "no frame 'hnd'" in refused(capsys, "ik", "arm7", "--frame", "hnd", "--position", "0", "0", "0")
+
+
+def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):
+    path = tmp_path / "u[b].urdf"
+    path.write_text(tree(joint("j[left]", "a", "[/x]")))
+    assert cli.main(["info", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "j[left]" in said and "[/x]" in said and "u[b].urdf" in said.replace("\n", "")
+    assert cli.main(["ik", str(path), "--frame", "[/x]", "--position", "0", "0", "0"]) in (0, 1)
+    assert "j[left]" in capsys.readouterr().out

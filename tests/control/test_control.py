@@ -339,3 +339,20 @@ class TestMistakes:
         refuses(ValueError, r"damping is 0.0; a WeightedQP needs it positive", osik.WeightedQP, damping=0.0)
         refuses(ValueError, "potential_gain is nan", osik.NullSpace, potential_gain=np.nan)
         refuses(ValueError, r"margin has shape \(2,\), expected a scalar", osik.NullSpace, margin=np.zeros(2))
+
+
+def test_a_list_of_targets_is_an_error_that_says_so():
+    arm = osik.load_robot("arm7")
+    tasks = {"hand": osik.FrameTask(arm, "hand", rows="position")}
+    places = [[0.4, 0.0, 0.5], [0.4, 0.1, 0.5], [0.4, 0.2, 0.5]]
+    for target in (places, (places,)):
+        refuses(
+            TypeError,
+            r"targets\['hand'\] is or holds a list",
+            osik.rollout,
+            arm,
+            arm.q0,
+            tasks,
+            steps=3,
+            targets={"hand": target},
+        )

@@ -500,3 +500,42 @@ def test_robots_of_one_tree_stack_and_vmap():
 
 def normalised(q: jax.Array) -> jax.Array:
     return q.at[3:7].divide(jnp.linalg.norm(q[3:7]))
+
+
+@pytest.mark.parametrize(
+    "read", [lambda **how: Robot.from_urdf(ARM, **how), lambda **how: osik.load_robot("nao", **how)]
+)
+@pytest.mark.parametrize("value", ["fixed", "no", 0, 1.0])
+def test_a_floating_base_is_true_false_or_none(read, value):
+    refuses(TypeError, f"floating_base is {value!r}; it is True, False, or None", read, floating_base=value)
+
+
+@pytest.mark.parametrize(
+    "options, error, message",
+    [
+        (dict(velocity_limits={"a": "fast"}), TypeError, "velocity limit of joint 'a' is 'fast'; it is a number"),
+        (dict(velocity_limits={"a": None}), TypeError, "velocity limit of joint 'a' is None; it is a number"),
+        (dict(velocity_limits=[1.0, 2.0]), TypeError, "velocity_limits is .*it maps joint names"),
+        (dict(position_limits={"a": (np.inf, np.inf)}), ValueError, "no position is between"),
+        (dict(position_limits={"a": (-np.inf, -np.inf)}), ValueError, "no position is between"),
+        (dict(locked_joints={"a": "x"}), TypeError, "joint 'a' is locked is 'x'; it is a number"),
+        (dict(locked_joints=3), TypeError, "locked_joints is 3; it is a sequence of names"),
+    ],
+)
+def test_options_that_are_no_numbers_are_named(options, error, message):
+    refuses(error, message, Robot.from_urdf, ARM, floating_base=False, **options)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("what", ["length", "mass"])
+def test_links_are_scaled_by_positive_factors(what, factor):
+    robot = Robot.from_urdf(ARM, floating_base=False)
+    refuses(ValueError, f"{what} is .*; factors are positive", robot.scaled, **{what: factor})
+    refuses(ValueError, f"{what} is .*; factors are positive", robot.scaled, **{what: {"*": factor}})
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4, 2), (9,)])
+def test_a_configuration_of_another_shape_has_no_qpos(shape):
+    robot = Robot.from_urdf(ARM, floating_base=False)
+    assert robot.nq == 2
+    refuses(ValueError, r"q has shape .*configurations have shape", robot.mujoco_qpos, np.zeros(shape))

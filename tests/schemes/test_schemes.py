@@ -15,6 +15,7 @@ from hierarchy_families import Hierarchies, Rows
 from lexicographic import certificate
 from mujoco_states import mujoco_at
 from task_checks import kinematics_at, moved_by
+from urdfs import joint, tree
 
 import osik_jax as osik
 from osik_jax.schemes._null_space import limit_potential_gradient
@@ -434,3 +435,21 @@ def test_the_centre_of_mass_is_kept_over_the_feet_while_the_waist_pulls(nao):
     assert outside[0.0][-1] > 2e-3
     assert outside[1.0].max() < 1e-5
     assert outside[1.0][-1] > -1e-4  # it got as far as it may
+
+
+HELD = tree(
+    joint("held", "a", "b", '<limit lower="0.3" upper="0.3" velocity="2" effort="1"/>'),
+    joint("turn", "b", "c", axis="0 1 0"),
+    joint("bend", "c", "d"),
+)
+
+
+@pytest.mark.parametrize("method", ["classical", "reverse", "saturated"])
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_a_joint_that_its_limits_hold_leaves_the_null_space_to_the_others(method, backend):
+    with pytest.warns(osik.OsikWarning, match="these joints cannot move"):
+        robot = osik.Robot.from_urdf(HELD, floating_base=False)
+    tasks = {"posture": osik.PostureTask(robot, target=robot.q0 + jnp.array([0.0, 0.1, 0.1]), gain=10.0)}
+    solution = osik.solve(robot, robot.q0, tasks, scheme=osik.NullSpace(method=method, backend=backend))
+    assert solution.status == osik.Status.SOLVED
+    np.testing.assert_allclose(solution.velocity[1:], 1.0, atol=0.01)  # up to the potential

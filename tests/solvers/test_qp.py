@@ -146,3 +146,12 @@ def test_numbers_are_looked_at_alike_together_and_apart(monkeypatch, name, value
     if fine:
         jax.tree.map(np.testing.assert_array_equal, apart, qp)
     assert all(np.isfinite(a).all() for a in (*jax.tree.leaves(apart.cost), apart.rows, apart.compliance))
+
+
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+def test_integers_are_floats(backend):
+    box = np.array([-1, -1]), np.array([1, 0.25])
+    direct = solve_qp(np.eye(2, dtype=int), np.array([-1, -1]), *box)
+    squares = solve_least_squares_qp([[1, 0], [0, 1]], [1, 1], [1, 1], *box, backend=backend)
+    for solution in (direct, squares):
+        np.testing.assert_allclose(solution.x, [1.0, 0.25], atol=1e-8)

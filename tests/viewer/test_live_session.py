@@ -19,6 +19,7 @@ from osik_jax.viewer.live._default import default_session, find_hands
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._session import Session
 from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._step import Controller, compile_step
 
 ROBOT = osik.load_robot("nao")
 
@@ -172,3 +173,10 @@ def test_a_source_may_be_a_name(tmp_path):
     )
     one.save(tmp_path / "session.json")
     assert load_session(tmp_path / "session.json").source == RobotSource("arm7")
+
+
+def test_the_page_of_a_robot_does_not_complain_of_its_own_scheme(recwarn: pytest.WarningsRecorder) -> None:
+    made = default_session(osik.load_robot("arm7"))
+    compile_step(made.robot, Controller(made.tasks, made.scheme, made.limits), made.dt)
+    assert len({task.priority for task in made.tasks.values()}) > 1 and isinstance(made.scheme, osik.WeightedQP)
+    assert not [w for w in recwarn if issubclass(w.category, osik.OsikWarning)]

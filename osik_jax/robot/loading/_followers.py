@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -37,7 +37,17 @@ def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float |
     """Return the names or globs of joints to lock, with their values or None."""
     if isinstance(locked, str):
         raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
+    if not isinstance(locked, Iterable):
+        raise OsikTypeError(f"locked_joints is {locked!r}; it is a sequence of names or a mapping from names to values")
     return dict(locked) if isinstance(locked, Mapping) else dict.fromkeys(locked)
+
+
+def number(value: Any, what: str) -> float:
+    """Return the value as a number; raise TypeError if it is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise OsikTypeError(f"{what} is {value!r}; it is a number") from None
 
 
 def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
@@ -62,10 +72,10 @@ def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[st
                 raise OsikValueError(
                     f"joint {names[joint]!r} is free or ball: it can only be locked where the model has it"
                 )
-            elif not math.isfinite(value):
+            elif not math.isfinite(at := number(value, f"the value at which joint {names[joint]!r} is locked")):
                 raise OsikValueError(f"joint {names[joint]!r} cannot be locked at {value}")
             else:
-                out[joint] = Lock(np.array([float(value)]), given=True)
+                out[joint] = Lock(np.array([at]), given=True)
     return out
 
 

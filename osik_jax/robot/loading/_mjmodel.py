@@ -22,6 +22,7 @@ from ._followers import (
     asked_locks,
     equality_followers,
     match_joints,
+    number,
     qpos_offset,
     resolve_followers,
 )
@@ -286,8 +287,8 @@ def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
 def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
     """Return the names of the collision meshes; one without a name is called by its number, as in ``element_names``."""
     out: list[str] = []
-    for number, placed in enumerate(meshes, len(taken)):
-        out.append(free_name(placed.name or f"geom{number}", (*taken, *out)))
+    for index, placed in enumerate(meshes, len(taken)):
+        out.append(free_name(placed.name or f"geom{index}", (*taken, *out)))
     return out
 
 
@@ -312,11 +313,14 @@ def _rates(
     numerics = [model.numeric(n) for n in range(model.nnumeric)]
     own = {one.name.removeprefix(prefix): float(one.data[0]) for one in numerics if one.name.startswith(prefix)}
     out = np.full(len(names), np.inf)
+    if not isinstance(given, Mapping):
+        raise OsikTypeError(f"{what}_limits is {given!r}; it maps joint names or globs to numbers")
     for pattern, value in (*own.items(), *given.items()):
         for joint in match_joints(pattern, names):
-            if not float(value) > 0.0:
+            limit = number(value, f"the {what} limit of joint {names[joint]!r}")
+            if not limit > 0.0:
                 raise OsikValueError(f"the {what} limit of joint {names[joint]!r} is {value}; it has to be positive")
-            out[joint] = float(value)
+            out[joint] = limit
     return out
 
 
@@ -359,6 +363,8 @@ def _range(limits: tuple[float, float], pattern: str) -> tuple[float, float]:
         raise OsikTypeError(f"position_limits[{pattern!r}] is {limits!r}; it is a pair (lower, upper)") from None
     if not lower <= upper:
         raise OsikValueError(f"position_limits[{pattern!r}] is {limits!r}; lower has to be less than upper")
+    if lower == np.inf or upper == -np.inf:
+        raise OsikValueError(f"position_limits[{pattern!r}] is {limits!r}: no position is between these")
     return lower, upper
 
 

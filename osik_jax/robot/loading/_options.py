@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
+
+from ..._errors import OsikTypeError
 
 LockedJoints: TypeAlias = Iterable[str] | Mapping[str, float]
 PositionLimits: TypeAlias = Mapping[str, tuple[float, float]]
+
+
+def check_floating_base(value: Any) -> None:
+    """Raise TypeError unless the value is True, False or None."""
+    if value is not None and not isinstance(value, bool):
+        raise OsikTypeError(f"floating_base is {value!r}; it is True, False, or None: what the file says")
 
 
 class LoadOptions(NamedTuple):

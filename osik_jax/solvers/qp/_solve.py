@@ -14,6 +14,7 @@ from ..._errors import OsikValueError
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend
 from ...execution._platform import cpu_is_default
+from ...numerics._arguments import as_floats
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
@@ -64,7 +65,7 @@ def solve_qp(
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
     """
-    hessian, gradient = jnp.asarray(hessian), jnp.asarray(gradient)
+    hessian, gradient = as_floats(hessian), as_floats(gradient)
     n = gradient.shape[0]
     if hessian.shape != (n, n):
         raise OsikValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
@@ -118,7 +119,7 @@ def solve_least_squares_qp(
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
             the platform, "jax" for none, "core" for that or an error. It changes the time, not the answer.
     """
-    matrix, target, weight = jnp.asarray(matrix), jnp.asarray(target), jnp.asarray(weight)
+    matrix, target, weight = as_floats(matrix), as_floats(target), as_floats(weight)
     n = matrix.shape[1]
     diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *diagonal)

@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._errors import OsikValueError
-from ...control import solve
+from ...control._checks import checked_limits
 from ...control._rollout import remembering
+from ...control._step import in_type_of
+from ...control._step import step as one_step
 from ...kinematics import integrate
 from ...limits import Limit
 from ...robot import Robot
@@ -95,7 +97,8 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
         tasks, scheme, limits = jax.tree.unflatten(tree, numbers)
         q, velocity, warm_start = state
         tasks, limits = remembering((tasks, limits), velocity, True)
-        answer = solve(robot, q, tasks, scheme=scheme, limits=limits, dt=dt, warm_start=warm_start)
+        # not `solve`, which warns of a weighted scheme's ignored priorities: the page has a menu of schemes
+        answer = one_step(robot, q, tasks, scheme, checked_limits(robot, limits), in_type_of(dt, q), warm_start)
         moved = integrate(robot, q, answer.velocity + push, dt)
         return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
 
