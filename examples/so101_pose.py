@@ -33,7 +33,8 @@ above = osik.inverse_kinematics(arm, straight)
 print("\nposition and approach axis:", above.explain())
 
 # 4. half a metre away: out of reach, with the proof
-far = osik.inverse_kinematics(arm, {tip: np.array([0.6, 0.0, 0.2])})
+away = np.array([0.6, 0.0, 0.2])
+far = osik.inverse_kinematics(arm, {tip: away})
 print("\nfar away:", far.explain())
 
 viewer.hero_picture(
@@ -41,7 +42,7 @@ viewer.hero_picture(
     arm,
     [whole.q, place.q, above.q, far.q],
     look="so101",
-    shapes=[osik.CollisionShape.sphere(0.01, position)],
+    targets=[position[None]] * 3 + [away[None]],
     labels=["whole pose", "position", "position and axis", "out of reach"],
     azimuth=50.0,
     spacing=0.42,

@@ -160,11 +160,15 @@ def explored(
 
 
 def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
-    """Return the targets with 0 in place of non-finite ones (traced ones may be), and which are valid."""
+    """Return the targets with 0 in place of non-finite ones (traced ones may be), and which are valid.
+
+    So is one whose square is not finite: it is further away than can be computed.
+    """
     numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
     valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
     for leaf in jax.tree.leaves(numbers):
-        valid &= jnp.isfinite(leaf).reshape(len(leaf), -1).all(1)
+        largest = 1e-3 * jnp.sqrt(jnp.finfo(leaf.dtype).max)
+        valid &= (jnp.abs(leaf) <= largest).reshape(len(leaf), -1).all(1)
 
     def kept(a: Array) -> Array:
         return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)

@@ -146,3 +146,13 @@ def test_explain_counts_rows_and_names_those_to_leave_out(arm):
     both = osik.inverse_kinematics(arm, {"hand": pose, "link6": pose}, seeds=4, restarts=0).explain()
     assert "12 rows of 7 joints" in both
     assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
+
+
+@pytest.mark.parametrize("kind, far", [(jnp.float64, 1e200), (jnp.float32, 1e30)])
+def test_a_target_whose_square_is_not_finite_has_a_finite_answer(kind, far):
+    arm = osik.load_robot("arm7").astype(kind)
+    find = jax.jit(lambda place: osik.inverse_kinematics(arm, {"hand": place}))
+    found = find(jnp.array([0.3, far, 0.6], kind))
+    assert not found.converged
+    for leaf in jax.tree.leaves(found):
+        assert jnp.isfinite(leaf).all()
