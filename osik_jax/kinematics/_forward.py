@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError
+from .._errors import OsikTypeError, OsikValueError
 from ..core import _cuda
 from ..execution._backends import Backend, takes
 from ..execution._computed import by_kernel
@@ -78,6 +79,19 @@ class Kinematics(eqx.Module):
         return positions, compose(rotations, robot.frame_rotation[ids])
 
 
+def check_kinematics(robot: Robot, kinematics: Any) -> None:
+    """Raise TypeError unless it is a ``Kinematics``, ValueError if it is that of a robot with other bodies."""
+    if not isinstance(kinematics, Kinematics):
+        raise OsikTypeError(
+            f"kinematics is a {type(kinematics).__name__}; it is what forward_kinematics(robot, q) returns"
+        )
+    bodies = len(robot.tree.body_names)
+    if jnp.shape(kinematics.body_position)[:1] != (bodies,):
+        raise OsikValueError(
+            f"kinematics has {len(kinematics.body_position)} bodies, this robot {bodies}: it is that of another robot"
+        )
+
+
 def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
     """Return the poses of all bodies and motion axes of all dofs at configuration q, compiled on first use.
 
@@ -129,7 +143,10 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[st
 
     Raises:
         KeyError: no such frame.
+        TypeError: ``kinematics`` is something else, such as a configuration.
+        ValueError: it is that of another robot.
     """
+    check_kinematics(robot, kinematics)
     if isinstance(name, str):
         return frame_jacobian(robot, kinematics, (name,))[0]
     return _frame_jacobians(robot, kinematics, tuple(robot.tree.frame(one) for one in name))
@@ -170,6 +187,7 @@ def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = N
         KeyError: no such body.
         ValueError: the subtree has no mass, or the scene has several trees that may be the robot.
     """
+    check_kinematics(robot, kinematics)
     mass, moment = _body_moments(robot, kinematics, body_masses(robot, subtree))
     return jnp.sum(moment, 0) / jnp.sum(mass)
 
@@ -180,6 +198,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
     Raises:
         KeyError, ValueError: as in ``center_of_mass``.
     """
+    check_kinematics(robot, kinematics)
     return _center_and_jacobian(_with_masses(robot, subtree), kinematics)[1]
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..robot import Robot
-from ._forward import Kinematics, body_masses, center_of_mass, independent_columns
+from ._forward import Kinematics, body_masses, center_of_mass, check_kinematics, independent_columns
 from ._rigid import compose, cross, rotate
 
 
@@ -37,6 +37,7 @@ def mass_matrix(robot: Robot, kinematics: Kinematics) -> Float[Array, "nv nv"]:
 
     Method: composite bodies (R. Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 6.2), all dofs at once.
     """
+    check_kinematics(robot, kinematics)
     momenta = _momenta(robot, kinematics)
     axis = kinematics.dof_angular
     velocity = kinematics.dof_linear + cross(axis, momenta.center[:, None] - kinematics.dof_anchor)
@@ -54,6 +55,7 @@ def centroidal_momentum_matrix(robot: Robot, kinematics: Kinematics) -> Float[Ar
     Raises:
         ValueError: the scene has several trees that may be the robot.
     """
+    check_kinematics(robot, kinematics)
     robot = _without_scene(robot)
     momenta = _momenta(robot, kinematics)
     angular = momenta.angular + cross(momenta.center - center_of_mass(robot, kinematics), momenta.linear)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -14,7 +16,10 @@ from ..robot._tree import BALL, FREE
 
 
 def integrate(
-    robot: Robot, q: Num[ArrayLike, " nq"], v: Num[ArrayLike, " nv"], dt: Float[Array, ""] | float = 1.0
+    robot: Robot,
+    q: Num[ArrayLike, " nq"] | Sequence[float],
+    v: Num[ArrayLike, " nv"] | Sequence[float],
+    dt: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " nq"]:
     """Return the configuration after moving from q at a constant velocity v for dt.
 
@@ -34,10 +39,11 @@ def integrate(
         ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.
     """
     check_robot(robot, "integrate(robot, q, v)")
+    q, v = jnp.asarray(q), jnp.asarray(v)
     robot.check_configuration(q)
     if jnp.shape(v) != (robot.nv,):
         raise OsikValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
-    step = jnp.asarray(v) * dt
+    step = v * dt
     q = jnp.asarray(q, jnp.result_type(q, step))
     scalar_q, scalar_v, quaternions = layout(robot)
     moves = np.zeros(robot.nq, int)
@@ -50,7 +56,9 @@ def integrate(
     return jnp.concatenate([*parts, added[end:]])
 
 
-def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"]) -> Float[Array, " nv"]:
+def difference(
+    robot: Robot, qa: Num[ArrayLike, " nq"] | Sequence[float], qb: Num[ArrayLike, " nq"] | Sequence[float]
+) -> Float[Array, " nv"]:
     """Return the velocity (nv,) that moves qa to qb in unit time; ``integrate`` is the inverse.
 
     Rotations go the short way round: no angle is greater than pi.
@@ -59,10 +67,11 @@ def difference(robot: Robot, qa: Num[ArrayLike, " nq"], qb: Num[ArrayLike, " nq"
         ValueError: as in ``integrate``.
     """
     check_robot(robot, "difference(robot, qa, qb)")
+    qa, qb = jnp.asarray(qa), jnp.asarray(qb)
     robot.check_configuration(qa)
     robot.check_configuration(qb)
     dtype = jnp.result_type(qa, qb, float)
-    qa, qb = jnp.asarray(qa, dtype), jnp.asarray(qb, dtype)
+    qa, qb = qa.astype(dtype), qb.astype(dtype)
     scalar_q, scalar_v, quaternions = layout(robot)
     out = jnp.zeros(robot.nv, dtype).at[scalar_v].set((qb - qa)[scalar_q])
     for at, dof in quaternions:

@@ -312,3 +312,21 @@ def test_the_way_of_gpus_composes_as_that_of_cpus_does(robots, name):
     program = jax.jit(lambda q: osik.forward_kinematics(robots[name], q)).trace(robots[name].q0)
     has_loop = {on: "stablehlo.while" in program.lower(lowering_platforms=(on,)).as_text() for on in ("cpu", "cuda")}
     assert has_loop == {"cpu": True, "cuda": False}
+
+
+FUNCTIONS = {
+    "frame_jacobian": lambda robot, kinematics: osik.frame_jacobian(robot, kinematics, "hand"),
+    "center_of_mass": osik.center_of_mass,
+    "com_jacobian": osik.com_jacobian,
+    "mass_matrix": osik.mass_matrix,
+    "centroidal_momentum_matrix": osik.centroidal_momentum_matrix,
+}
+
+
+@pytest.mark.parametrize("function", FUNCTIONS.values(), ids=FUNCTIONS)
+def test_a_configuration_or_another_robots_kinematics_is_an_error(function):
+    arm, other = osik.load_robot("arm7"), osik.load_robot("nao")
+    message = r"kinematics is a .*; it is what forward_kinematics\(robot, q\) returns"
+    refuses(TypeError, message, function, arm, arm.q0)
+    refuses(TypeError, message, jax.jit(lambda q: function(arm, q)), arm.q0)
+    refuses(ValueError, "that of another robot", function, arm, osik.forward_kinematics(other, other.q0))

@@ -196,3 +196,11 @@ def test_wrong_input_is_named(robot):
     q = robot.q0
     refuses(ValueError, r"q has shape \(14,\)", osik.difference, robot, q, jnp.append(q, 0.0))
     refuses(ValueError, "the quaternion of joint 'shoulder', is zero", osik.difference, robot, q.at[7:11].set(0.0), q)
+
+
+def test_lists_are_configurations():
+    arm = osik.load_robot("arm7")
+    q, v = np.linspace(0.0, 0.3, arm.nq), np.linspace(0.1, 0.7, arm.nv)
+    moved = osik.integrate(arm, q.tolist(), v.tolist(), 0.5)
+    np.testing.assert_allclose(moved, q + 0.5 * v, rtol=1e-15)
+    np.testing.assert_allclose(osik.difference(arm, q.tolist(), list(moved)), 0.5 * v, rtol=1e-12)
