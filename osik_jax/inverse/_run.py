@@ -162,7 +162,7 @@ def explored(
 def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
     """Return the targets with 0 in place of non-finite ones (traced ones may be), and which are valid.
 
-    So is one whose square is not finite: it is further away than can be computed.
+    One so large that the square of a distance may not be finite is not valid.
     """
     numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
     valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)

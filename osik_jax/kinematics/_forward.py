@@ -80,15 +80,21 @@ class Kinematics(eqx.Module):
 
 
 def check_kinematics(robot: Robot, kinematics: Any) -> None:
-    """Raise TypeError unless it is a ``Kinematics``, ValueError if it is that of a robot with other bodies."""
+    """Raise TypeError unless it is a ``Kinematics``, ValueError for a batch, or other numbers of bodies or dofs."""
     if not isinstance(kinematics, Kinematics):
         raise OsikTypeError(
             f"kinematics is a {type(kinematics).__name__}; it is what forward_kinematics(robot, q) returns"
         )
-    bodies = len(robot.tree.body_names)
-    if jnp.shape(kinematics.body_position)[:1] != (bodies,):
+    sizes = [jnp.shape(a) for a in (kinematics.body_position, kinematics.dof_linear)]
+    own = [(len(robot.tree.body_names), 3), (len(robot.tree.dof_body), 3)]
+    if [len(size) for size in sizes] != [2, 2]:
         raise OsikValueError(
-            f"kinematics has {len(kinematics.body_position)} bodies, this robot {bodies}: it is that of another robot"
+            f"kinematics has body_position of shape {sizes[0]}, this robot's {own[0]}. Batch with jax.vmap."
+        )
+    if sizes != own:
+        raise OsikValueError(
+            f"kinematics has {sizes[0][0]} bodies and {sizes[1][0]} dofs, this robot {own[0][0]} and {own[1][0]}: "
+            "it is that of another robot"
         )
 
 
@@ -144,7 +150,7 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[st
     Raises:
         KeyError: no such frame.
         TypeError: ``kinematics`` is something else, such as a configuration.
-        ValueError: it is that of another robot.
+        ValueError: it is a batch, or has other numbers of bodies or dofs than the robot.
     """
     check_kinematics(robot, kinematics)
     if isinstance(name, str):

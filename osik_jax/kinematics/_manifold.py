@@ -39,11 +39,10 @@ def integrate(
         ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.
     """
     check_robot(robot, "integrate(robot, q, v)")
-    q, v = jnp.asarray(q), jnp.asarray(v)
     robot.check_configuration(q)
-    if jnp.shape(v) != (robot.nv,):
-        raise OsikValueError(f"v has shape {jnp.shape(v)}, this robot's velocities have shape ({robot.nv},)")
-    step = v * dt
+    if np.shape(v) != (robot.nv,):
+        raise OsikValueError(f"v has shape {np.shape(v)}, this robot's velocities have shape ({robot.nv},)")
+    q, step = jnp.asarray(q), jnp.asarray(v) * dt
     q = jnp.asarray(q, jnp.result_type(q, step))
     scalar_q, scalar_v, quaternions = layout(robot)
     moves = np.zeros(robot.nq, int)
@@ -67,9 +66,9 @@ def difference(
         ValueError: as in ``integrate``.
     """
     check_robot(robot, "difference(robot, qa, qb)")
-    qa, qb = jnp.asarray(qa), jnp.asarray(qb)
     robot.check_configuration(qa)
     robot.check_configuration(qb)
+    qa, qb = jnp.asarray(qa), jnp.asarray(qb)
     dtype = jnp.result_type(qa, qb, float)
     qa, qb = qa.astype(dtype), qb.astype(dtype)
     scalar_q, scalar_v, quaternions = layout(robot)

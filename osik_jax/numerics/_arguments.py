@@ -124,10 +124,19 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
         raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
 
 
-def as_floats(value: Any) -> Array:
-    """Return the value as an array of its own precision; integers get JAX's default."""
+def as_floats(value: Any, *beside: Any) -> Array:
+    """Return the value as an array of its own precision; integers get that of the floats beside it, or JAX's default.
+
+    Raises:
+        TypeError: the value is complex.
+    """
     array = jnp.asarray(value)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(jnp.result_type(float))
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise OsikTypeError(f"numbers are real; got an array of {array.dtype}")
+    kind = jnp.result_type(array, *(jnp.asarray(other) for other in beside if other is not None))
+    return array.astype(kind if jnp.issubdtype(kind, jnp.floating) else jnp.result_type(float))
 
 
 def concrete(value: Any) -> np.ndarray | None:

@@ -55,7 +55,7 @@ NEGLIGIBLE_CURVATURE = 1e-6
 """Curvature cost of a variable relative to the largest one, below which it may be roundoff and restricts nothing."""
 
 NARROW_RANGE = 1e4
-"""Range of a joint in units of the machine epsilon of its limits, up to which it has no potential: it can not move."""
+"""Range of a joint relative to its limits, in units of ``EPSILON``, up to which it has no potential."""
 
 # ---- saturation, shared with kernels
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +33,7 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
     return q
 
 
-def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"], name: str) -> None:
+def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"] | Sequence[float], name: str) -> None:
     """Raise an error for an invalid q, see ``Robot.check_configuration``."""
     tree = robot.tree
     check_shape(tree, q, name)

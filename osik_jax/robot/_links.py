@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
+from ..numerics._arguments import as_array, check_not_negative, concrete
 from ._model import RobotModel
 from ._tree import KinematicTree
 
@@ -38,11 +39,8 @@ def scaled_leaves(robot: RobotModel, length: Factors, mass: Factors) -> dict[str
 def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) -> Float[Array, " nbody"]:
     """Return one factor for each body; the world keeps 1."""
     factors = jnp.ones(len(tree.body_names), dtype)
-    for factor in given.values() if isinstance(given, Mapping) else (given,):
-        if not isinstance(factor, Tracer) and not (np.asarray(factor) > 0.0).all():
-            raise OsikValueError(f"{what} is {given!r}; factors are positive")
     if not isinstance(given, Mapping):
-        return factors.at[1:].set(given)
+        return factors.at[1:].set(_factor(given, what, dtype))
     seen: dict[int, str] = {}
     for pattern, factor in given.items():
         for body in _bodies(tree, pattern):
@@ -51,8 +49,18 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
                     f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"
                 )
             seen[body] = pattern
-            factors = factors.at[body].set(factor)
+            factors = factors.at[body].set(_factor(factor, f"{what}[{pattern!r}]", dtype))
     return factors
+
+
+def _factor(value: Any, what: str, dtype: np.dtype) -> Array:
+    """Return a factor; raise ValueError unless it is finite and, for a length, positive, for a mass, not negative."""
+    factor = as_array(value, what, dtype)
+    check_not_negative(factor, what)
+    seen = concrete(factor)
+    if what.startswith("length") and seen is not None and not seen.all():
+        raise OsikValueError(f"{what} is {value}; a length is scaled by a positive factor")
+    return factor
 
 
 def _bodies(tree: KinematicTree, pattern: str) -> list[int]:

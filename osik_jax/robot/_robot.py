@@ -293,7 +293,7 @@ class Robot(RobotModel):
 
         Raises:
             KeyError: no such body; the message lists those that exist.
-            ValueError: a body is given twice.
+            ValueError: a body is given twice; a factor is not finite, or negative; a length's is 0.
         """
         changed = scaled_leaves(self, length, mass)
         return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
@@ -325,7 +325,7 @@ class Robot(RobotModel):
             Path(path).write_text(text, encoding="utf-8")
         return text
 
-    def check_configuration(self, q: Num[ArrayLike, " nq"], name: str = "q") -> None:
+    def check_configuration(self, q: Num[ArrayLike, " nq"] | Sequence[float], name: str = "q") -> None:
         """Raise ValueError if q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
 
         Args:

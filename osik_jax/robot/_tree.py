@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, Generic, TypeVar, cast
 
@@ -378,7 +378,7 @@ class KinematicTree:
         return {name: i for i, name in enumerate(self.joint_names)}
 
 
-def check_shape(tree: KinematicTree, q: Num[ArrayLike, " nq"], name: str) -> None:
+def check_shape(tree: KinematicTree, q: Num[ArrayLike, " nq"] | Sequence[float], name: str) -> None:
     """Raise ValueError unless q has the shape of one configuration."""
     if np.shape(q) != (tree.nq,):
         raise OsikValueError(

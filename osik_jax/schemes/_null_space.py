@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..execution._backends import Backend, check_backend
-from ..numerics._constants import NARROW_RANGE
+from ..numerics._constants import EPSILON, NARROW_RANGE
 from ..numerics._guarded import clipped
 from ..solvers import Level, solve_nullspace
 from ..solvers.null_space import NullSpaceSolution
@@ -124,11 +124,12 @@ def limit_potential_gradient(
     so that descending it leads away from both. q is clamped ``margin`` of the range inside the limits, where the
     potential is finite. (nv,)
     """
-    narrow = NARROW_RANGE * jnp.finfo(lower.dtype).eps * jnp.maximum(jnp.abs(lower), jnp.abs(upper))
+    narrow = NARROW_RANGE * EPSILON * jnp.maximum(jnp.abs(lower), jnp.abs(upper))
     limited = jnp.isfinite(lower) & jnp.isfinite(upper) & (upper - lower > narrow)
     low, high = jnp.where(limited, lower, -1.0), jnp.where(limited, upper, 1.0)
     span = high - low
     q = jnp.clip(position, low + margin * span, high - margin * span)
     count = jnp.maximum(jnp.sum(limited), 1)
-    gradient = span * (2.0 * q - high - low) / (2.0 * count * (high - q) ** 2 * (q - low) ** 2)
-    return jnp.where(limited, gradient, 0.0)
+    inside = limited & (low < q) & (q < high)  # in single precision a margin of a narrow range may be rounded away
+    square = jnp.where(inside, (high - q) ** 2 * (q - low) ** 2, 1.0)
+    return jnp.where(inside, span * (2.0 * q - high - low) / (2.0 * count * square), 0.0)

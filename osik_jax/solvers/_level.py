@@ -45,7 +45,7 @@ class Level(eqx.Module):
         weight: ArrayLike | Array | None = None,
         equalities: Sequence[bool] | None = None,
     ):
-        self.matrix = as_floats(matrix)
+        self.matrix = as_floats(matrix, lower, upper, weight)
         self.lower = jnp.asarray(lower, self.matrix.dtype)
         count = self.matrix.shape[-2]
         self.equalities = (upper is None,) * count if equalities is None else tuple(map(bool, equalities))

@@ -348,7 +348,7 @@ def test_a_list_of_targets_is_an_error_that_says_so():
     for target in (places, (places,)):
         refuses(
             TypeError,
-            r"targets\['hand'\] is or holds a list",
+            r"targets\['hand'\] is or holds a list of numbers",
             osik.rollout,
             arm,
             arm.q0,
@@ -356,3 +356,5 @@ def test_a_list_of_targets_is_an_error_that_says_so():
             steps=3,
             targets={"hand": target},
         )
+    pair = [jnp.array(places), jnp.tile(jnp.eye(3), (3, 1, 1))]
+    assert osik.rollout(arm, arm.q0, tasks, steps=3, targets={"hand": pair}).q.shape == (4, arm.nq)

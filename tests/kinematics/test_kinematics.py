@@ -330,3 +330,5 @@ def test_a_configuration_or_another_robots_kinematics_is_an_error(function):
     refuses(TypeError, message, function, arm, arm.q0)
     refuses(TypeError, message, jax.jit(lambda q: function(arm, q)), arm.q0)
     refuses(ValueError, "that of another robot", function, arm, osik.forward_kinematics(other, other.q0))
+    many = jax.vmap(lambda q: osik.forward_kinematics(arm, q))(jnp.tile(arm.q0, (3, 1)))
+    refuses(ValueError, "Batch with jax.vmap", function, arm, many)

@@ -204,3 +204,5 @@ def test_lists_are_configurations():
     moved = osik.integrate(arm, q.tolist(), v.tolist(), 0.5)
     np.testing.assert_allclose(moved, q + 0.5 * v, rtol=1e-15)
     np.testing.assert_allclose(osik.difference(arm, q.tolist(), list(moved)), 0.5 * v, rtol=1e-12)
+    refuses(ValueError, "not finite at indices", jax.jit(lambda v: osik.integrate(arm, np.full(7, np.nan), v)), v)
+    refuses(ValueError, r"q has shape \(\)", osik.integrate, arm, None, v)

@@ -508,6 +508,7 @@ def normalised(q: jax.Array) -> jax.Array:
 @pytest.mark.parametrize("value", ["fixed", "no", 0, 1.0])
 def test_a_floating_base_is_true_false_or_none(read, value):
     refuses(TypeError, f"floating_base is {value!r}; it is True, False, or None", read, floating_base=value)
+    assert read(floating_base=np.True_).floating_base
 
 
 @pytest.mark.parametrize(
@@ -526,12 +527,15 @@ def test_options_that_are_no_numbers_are_named(options, error, message):
     refuses(error, message, Robot.from_urdf, ARM, floating_base=False, **options)
 
 
-@pytest.mark.parametrize("factor", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("factor", [-1.0, np.nan, np.inf])
 @pytest.mark.parametrize("what", ["length", "mass"])
-def test_links_are_scaled_by_positive_factors(what, factor):
+def test_links_are_scaled_by_finite_factors(what, factor):
     robot = Robot.from_urdf(ARM, floating_base=False)
-    refuses(ValueError, f"{what} is .*; factors are positive", robot.scaled, **{what: factor})
-    refuses(ValueError, f"{what} is .*; factors are positive", robot.scaled, **{what: {"*": factor}})
+    for given in (factor, {"*": factor}):
+        refuses(ValueError, f"{what}.* is .*finite and not negative", robot.scaled, **{what: given})
+    refuses(TypeError, f"{what} is 'a'; it is a number", robot.scaled, **{what: "a"})
+    refuses(ValueError, "length is 0.0; a length is scaled by a positive factor", robot.scaled, length=0.0)
+    assert float(robot.scaled(mass={"lower": 0.0}).body_mass[-1]) == 0.0
 
 
 @pytest.mark.parametrize("shape", [(), (1,), (4, 2), (9,)])

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded import QP_DAMPING, recorded_qps
+from refusals import refuses
 
-from osik_jax.solvers import Status, solve_least_squares_qp, solve_qp
+from osik_jax.solvers import Level, Status, solve_least_squares_qp, solve_qp
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP
 from osik_jax.solvers.qp._solve import _with_placeholder
@@ -155,3 +156,12 @@ def test_integers_are_floats(backend):
     squares = solve_least_squares_qp([[1, 0], [0, 1]], [1, 1], [1, 1], *box, backend=backend)
     for solution in (direct, squares):
         np.testing.assert_allclose(solution.x, [1.0, 0.25], atol=1e-8)
+
+
+def test_integers_beside_floats_have_their_precision_and_complex_numbers_are_refused():
+    single = np.array([-1.0, -1.0], np.float32)
+    assert solve_qp(np.eye(2, dtype=int), single, single, -single).x.dtype == np.float32
+    assert solve_least_squares_qp(np.eye(2, dtype=int), single, -single, single, -single).x.dtype == np.float32
+    assert Level([[1, 1]], single[:1]).matrix.dtype == np.float32
+    refuses(TypeError, "numbers are real; got an array of complex", Level, np.array([[1j, 1.0]]), [0.5])
+    refuses(TypeError, "numbers are real", solve_qp, np.eye(2) * 1j, single, single, -single)

@@ -13,7 +13,7 @@ from ..._errors import OsikValueError
 from .._load_report import LoadNote
 from .._model import RobotModel
 from ._mjmodel import LEAST_INERTIA, element_names, from_mjmodel
-from ._options import LoadOptions, check_floating_base
+from ._options import LoadOptions
 from ._source import Source, check_root, parse_xml, read_source
 
 FLOATING_BASE = "floating_base"
@@ -21,7 +21,7 @@ FLOATING_BASE = "floating_base"
 
 def from_mjcf(mjcf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     """Return names and numbers of a robot from an MJCF file or text; see ``Robot.from_mjcf``."""
-    check_floating_base(options.floating_base)
+    options = options.checked()
     source = read_source(mjcf, "MJCF")
     check_root(parse_xml(source), "mujoco", source)
     try:

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
 
 from ..._errors import OsikTypeError
 
 LockedJoints: TypeAlias = Iterable[str] | Mapping[str, float]
 PositionLimits: TypeAlias = Mapping[str, tuple[float, float]]
-
-
-def check_floating_base(value: Any) -> None:
-    """Raise TypeError unless the value is True, False or None."""
-    if value is not None and not isinstance(value, bool):
-        raise OsikTypeError(f"floating_base is {value!r}; it is True, False, or None: what the file says")
 
 
 class LoadOptions(NamedTuple):
@@ -32,3 +28,10 @@ class LoadOptions(NamedTuple):
     collision_meshes: bool = False
     package_dirs: Iterable[str | os.PathLike[str]] = ()
     root: str | Sequence[str] | None = None
+
+    def checked(self) -> LoadOptions:
+        """Return these options; raise TypeError unless ``floating_base`` is True, False or None."""
+        value = self.floating_base
+        if value is not None and not isinstance(value, bool | np.bool_):
+            raise OsikTypeError(f"floating_base is {value!r}; it is True, False, or None: what the file says")
+        return self._replace(floating_base=None if value is None else bool(value))

@@ -26,7 +26,7 @@ from ._mjmodel import (
     from_mjmodel,
     quaternion,
 )
-from ._options import LoadOptions, check_floating_base
+from ._options import LoadOptions
 from ._packages import Packages, is_uri
 from ._source import check_root, parse_xml, read_source
 from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
@@ -48,7 +48,7 @@ _Compiled = tuple[mujoco.MjModel, list[LoadNote]]
 
 def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     """Return names and numbers of a robot from a URDF file or text; see ``Robot.from_urdf``."""
-    check_floating_base(options.floating_base)
+    options = options.checked()
     packages = Packages(options.package_dirs)
     source = read_source(packages.path(urdf) if is_uri(urdf) else urdf, "URDF")
     root = parse_xml(source)

@@ -65,7 +65,7 @@ def solve_qp(
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
     """
-    hessian, gradient = as_floats(hessian), as_floats(gradient)
+    hessian, gradient = as_floats(hessian, gradient), as_floats(gradient, hessian)
     n = gradient.shape[0]
     if hessian.shape != (n, n):
         raise OsikValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
@@ -119,7 +119,8 @@ def solve_least_squares_qp(
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for
             the platform, "jax" for none, "core" for that or an error. It changes the time, not the answer.
     """
-    matrix, target, weight = as_floats(matrix), as_floats(target), as_floats(weight)
+    matrix = as_floats(matrix, target, weight)
+    target, weight = as_floats(target, matrix), as_floats(weight, matrix)
     n = matrix.shape[1]
     diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *diagonal)
