@@ -224,7 +224,10 @@ def check_targets(
     check_target_names(tasks, targets, _BY_STEP)
     for name, target in (targets or {}).items():
         parts = jax.tree.leaves(target, is_leaf=lambda part: isinstance(part, list))
-        if any(isinstance(part, list) and not all(map(jnp.ndim, jax.tree.leaves(part))) for part in parts):
+        if any(
+            isinstance(part, list) and any(isinstance(leaf, int | float) for leaf in jax.tree.leaves(part))
+            for part in parts
+        ):
             raise OsikTypeError(f"targets[{name!r}] is or holds a list of numbers; make it an array: jnp.asarray(list)")
         for leaf in jax.tree.leaves(target):
             if not eqx.is_array_like(leaf):

@@ -130,6 +130,7 @@ def limit_potential_gradient(
     span = high - low
     q = jnp.clip(position, low + margin * span, high - margin * span)
     count = jnp.maximum(jnp.sum(limited), 1)
-    inside = limited & (low < q) & (q < high)  # in single precision a margin of a narrow range may be rounded away
-    square = jnp.where(inside, (high - q) ** 2 * (q - low) ** 2, 1.0)
-    return jnp.where(inside, span * (2.0 * q - high - low) / (2.0 * count * square), 0.0)
+    # in single precision the margin of a narrow range may be rounded away
+    held = (margin > 0.0) & ((low + margin * span == low) | (high - margin * span == high))
+    square = jnp.where(held, 1.0, (high - q) ** 2 * (q - low) ** 2)
+    return jnp.where(limited & ~held, span * (2.0 * q - high - low) / (2.0 * count * square), 0.0)
