@@ -203,6 +203,6 @@ def test_lists_are_configurations():
     q, v = np.linspace(0.0, 0.3, arm.nq), np.linspace(0.1, 0.7, arm.nv)
     moved = osik.integrate(arm, q.tolist(), v.tolist(), 0.5)
     np.testing.assert_allclose(moved, q + 0.5 * v, rtol=1e-15)
-    np.testing.assert_allclose(osik.difference(arm, q.tolist(), list(moved)), 0.5 * v, rtol=1e-12)
+    np.testing.assert_allclose(osik.difference(arm, q.tolist(), [float(angle) for angle in moved]), 0.5 * v, rtol=1e-12)
     refuses(ValueError, "not finite at indices", jax.jit(lambda v: osik.integrate(arm, np.full(7, np.nan), v)), v)
     refuses(ValueError, r"q has shape \(\)", osik.integrate, arm, None, v)

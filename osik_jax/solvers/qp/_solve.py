@@ -8,7 +8,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from ..._errors import OsikValueError
 from ...execution import _rules
@@ -28,8 +28,8 @@ from ._search import SearchResult
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))
 def solve_qp(
-    hessian: Float[ArrayLike, "n n"],
-    gradient: Float[ArrayLike, " n"],
+    hessian: Num[ArrayLike, "n n"],
+    gradient: Num[ArrayLike, " n"],
     lower: Float[ArrayLike, " n"],
     upper: Float[ArrayLike, " n"],
     rows: Float[ArrayLike, "p n"] | None = None,
@@ -75,9 +75,9 @@ def solve_qp(
 
 @partial(jax.jit, static_argnames=("max_iterations", "rows_equalities", "backend"))
 def solve_least_squares_qp(
-    matrix: Float[ArrayLike, "m n"],
-    target: Float[ArrayLike, " m"],
-    weight: Float[ArrayLike, " m"],
+    matrix: Num[ArrayLike, "m n"],
+    target: Num[ArrayLike, " m"],
+    weight: Num[ArrayLike, " m"],
     lower: Float[ArrayLike, " n"],
     upper: Float[ArrayLike, " n"],
     rows: Float[ArrayLike, "p n"] | None = None,
