@@ -118,7 +118,7 @@ def test_shapes_that_do_not_fit_are_named():
 
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_integers_are_floats(backend):
-    whole, box = [Level([[1, 1]], [0.5]), Level([[1, -1]], [0], [0], [2])], (np.full(2, -1), np.full(2, 1))
+    whole, box = [Level([[1, 1]], [0.5]), Level([[1, -1]], [0], [0], [2])], (np.full(2, -1.0), np.full(2, 1.0))
     assert whole[0].lower[0] == 0.5
     for solution in (solve_hqp(whole, *box, backend=backend), solve_nullspace(whole, backend=backend)):
         np.testing.assert_allclose(solution.x, [0.25, 0.25], atol=1e-9)

@@ -33,7 +33,7 @@ class Lock(NamedTuple):
     given: bool
 
 
-def as_mapping(locked: Iterable[str] | Mapping[str, float]) -> dict[str, float | None]:
+def as_mapping(locked: Any) -> dict[str, Any]:
     """Return the names or globs of joints to lock, with their values or None."""
     if isinstance(locked, str):
         raise OsikTypeError(f"locked_joints is a sequence of names or a mapping, not one string: use ({locked!r},)")
@@ -60,7 +60,7 @@ def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
     return found
 
 
-def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, float | None]) -> dict[int, Lock]:
+def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, Any]) -> dict[int, Lock]:
     """Return the requested value of each locked joint, by joint index; the default is its value in qpos0."""
     out: dict[int, Lock] = {}
     for pattern, value in asked.items():
