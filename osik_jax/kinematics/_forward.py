@@ -152,9 +152,9 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[st
         TypeError: ``kinematics`` is something else, such as a configuration.
         ValueError: it is a batch, or has other numbers of bodies or dofs than the robot.
     """
-    check_kinematics(robot, kinematics)
     if isinstance(name, str):
         return frame_jacobian(robot, kinematics, (name,))[0]
+    check_kinematics(robot, kinematics)
     return _frame_jacobians(robot, kinematics, tuple(robot.tree.frame(one) for one in name))
 
 

@@ -219,5 +219,5 @@ def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):
     assert cli.main(["info", str(path)]) == 0
     said = capsys.readouterr().out
     assert "j[left]" in said and "[/x]" in said and "u[b].urdf" in said.replace("\n", "")
-    assert cli.main(["ik", str(path), "--frame", "[/x]", "--position", "0", "0", "0"]) in (0, 1)
+    assert cli.main(["ik", str(path), "--frame", "[/x]", "--position", "0", "0", "0"]) == 1
     assert "j[left]" in capsys.readouterr().out

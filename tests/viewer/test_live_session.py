@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
+from osik_jax.control import _checks
 from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._default import default_session, find_hands
@@ -175,7 +176,10 @@ def test_a_source_may_be_a_name(tmp_path):
     assert load_session(tmp_path / "session.json").source == RobotSource("arm7")
 
 
-def test_the_page_of_a_robot_does_not_complain_of_its_own_scheme(recwarn: pytest.WarningsRecorder) -> None:
+def test_the_page_of_a_robot_does_not_complain_of_its_own_scheme(
+    recwarn: pytest.WarningsRecorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_checks, "_said_ignored", set())  # each set of tasks is warned of once
     made = default_session(osik.load_robot("arm7"))
     compile_step(made.robot, Controller(made.tasks, made.scheme, made.limits), made.dt)
     assert len({task.priority for task in made.tasks.values()}) > 1 and isinstance(made.scheme, osik.WeightedQP)
