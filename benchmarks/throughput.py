@@ -45,8 +45,12 @@ TASKS = {
     "limits": "polygon, and the velocity limits at half speed as a task",
     "cone": "polygon, and the hand's first axis within 30 degrees of a point ahead",
     "collision": "polygon, and the collision rows of the hand's arm as a task",
+    "equality-far": "equality, with weights far apart",
+    "polygon-far": "polygon, with weights far apart",
 }
-"""Task sets: what is added to feet, hand and posture. All but the first have inequality rows."""
+"""Task sets: what is added to feet, hand and posture. Sets with the polygon have inequality rows."""
+WEIGHTS = {"near": (1e2, 10.0), "far": (1e4, 1e3)}
+"""Weights of a foot and of the centre of mass; the hand has 1, the posture 1e-3."""
 SCHEMES = {"weighted": osik.WeightedQP, "null-space": osik.NullSpace, "hierarchical": osik.HierarchicalQP}
 PRECISIONS = ("float64", "float32")
 BATCHES = (1, 16, 64, 256, 1024, 4096, 16384, 65536)
@@ -77,11 +81,13 @@ def setting(name: str, tasks_of: str = "equality") -> Setting:
     """Both feet, centre of mass, one hand's position, posture, and what ``TASKS`` adds; in JAX's default precision."""
     robot = loaded(name)
     feet, hand = ROBOTS[name].feet, ROBOTS[name].hand
-    tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=100.0, priority=1) for foot in feet}
+    tasks_of, _, apart = tasks_of.partition("-")
+    of_foot, of_center = WEIGHTS[apart or "near"]
+    tasks: dict[str, osik.Task] = {foot: osik.FrameTask(robot, foot, weight=of_foot, priority=1) for foot in feet}
     if feet:
         stands = tasks_of != "equality"
         polygon = osik.support_polygon(robot, robot.q0, feet, corners=soles(name)) if stands else None
-        tasks["com"] = osik.ComTask(robot, polygon=polygon, weight=10.0, priority=2)
+        tasks["com"] = osik.ComTask(robot, polygon=polygon, weight=of_center, priority=2)
     if tasks_of == "limits":
         slow = osik.VelocityLimit(robot, velocity=0.5 * robot.velocity_limit)
         tasks["limits"] = osik.LimitTask(robot, slow, priority=2)
@@ -309,7 +315,9 @@ def main() -> None:
     parser.add_argument("--batches", type=listed(int), default=list(BATCHES))
     parser.add_argument("--schemes", type=listed(str, SCHEMES), default=list(SCHEMES))
     parser.add_argument("--precisions", type=listed(str, PRECISIONS), default=list(PRECISIONS))
-    parser.add_argument("--tasks", type=listed(str, TASKS), default=["equality", "polygon"], help=", ".join(TASKS))
+    parser.add_argument(
+        "--tasks", type=listed(str, TASKS), default=["equality", "polygon", "polygon-far"], help=", ".join(TASKS)
+    )
     parser.add_argument("--steps", type=int, default=1, help="of a call, one after another on the device")
     given = parser.parse_args()
     if given.steps < 1:

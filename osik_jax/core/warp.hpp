@@ -384,17 +384,18 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   }
   // The inverse of the Cholesky factor of A = B'B + D, whose diagonal is made 1 + ridge times as large. Variables that are
   // not free have a row and a column of the identity. A stays in registers: thread i has column i, and of column i + 32 the
-  // rows from 32 on; its other rows are in other threads, by symmetry.
-  // B: [M, ld] the rows; free: [ld] ones and zeros; inverse: [N, ld_inverse] with zeros in the padding; work: [2, ld].
-  // Returns whether every pivot is above `smallest` of the diagonal.
+  // rows from 32 on; its other rows are in other threads, by symmetry. A is factored in units in which its diagonal is
+  // 1: a pivot above 1 would multiply the roundoff of its column of the inverse.
+  // B: [M, ld] the rows; unit: [ld] 1 / sqrt(A_jj) of free variables, else 0; inverse: [N, ld_inverse] with zeros in the
+  // padding; work: [2, ld]. Returns whether every pivot is above `smallest` of the diagonal.
   static constexpr bool HOLDS_COLUMNS = sizeof(R) == 4 && N <= 64;
-  OSIK_FN bool inverse_factor_of_gram(const R* B, const R* damping, const R* free, R ridge, R smallest, R* inverse, R* work,
+  OSIK_FN bool inverse_factor_of_gram(const R* B, const R* damping, const R* unit, R ridge, R smallest, R* inverse, R* work,
                                       int ld, int ld_inverse) const {
     constexpr int FIRST = N < 32 ? N : 32, REST = N - FIRST, SOME = 8, END = Warp::padded(N);
     R A[FIRST], low[REST + 1], other[REST + 1];  // the rows of the first column before 32 and from 32 on; of the second one
     const int own = me() < N ? me() : N - 1, second = me() < REST ? me() + 32 : N - 1;
-    R diagonal = damping[own], second_diagonal = damping[second];
-    are_shared(B, damping, free, inverse, work);
+    const R own_unit = unit[own], second_unit = unit[second];
+    are_shared(B, damping, unit, inverse, work);
     auto fours = [&](const R* row, int first, int end, auto f) {  // f(k, row[k]) for first <= k < end; first: a multiple of 4
 #pragma unroll
       for (int g = first / 4; g < (end + 3) / 4; ++g) {
@@ -412,21 +413,19 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     for (int k = 0; k < REST; ++k) low[k] = other[k] = 0;
 #pragma unroll 2
     for (int r = 0; r < M; ++r) {
-      const R *row = B + r * ld, a = row[own], b = row[second];
-      diagonal += a * a, second_diagonal += b * b;
+      const R *row = B + r * ld, a = row[own] * own_unit, b = row[second] * second_unit;
       fours(row, 0, FIRST, [&](int k, R entry) { A[k] += a * entry; });
       fours(row, 32, N, [&](int k, R entry) { low[k - 32] += a * entry, other[k - 32] += b * entry; });
     }
-    const R is_free = free[own], second_is_free = free[second];
-    fours(free, 0, FIRST, [&](int k, R factor) { A[k] *= is_free * factor; });
-    fours(free, 32, N, [&](int k, R factor) { low[k - 32] *= is_free * factor, other[k - 32] *= second_is_free * factor; });
+    fours(unit, 0, FIRST, [&](int k, R factor) { A[k] *= factor; });
+    fours(unit, 32, N, [&](int k, R factor) { low[k - 32] *= factor, other[k - 32] *= factor; });
     // what a pivot gets when its turn comes: nothing before depends on it
-    const R added = is_free > 0 ? damping[own] + ridge * diagonal : R(1);
-    const R second_added = second_is_free > 0 ? damping[second] + ridge * second_diagonal : R(1);
+    const R added = own_unit > 0 ? damping[own] * own_unit * own_unit + ridge : R(1);
+    const R second_added = second_unit > 0 ? damping[second] * second_unit * second_unit + ridge : R(1);
+    const R scale = own_unit > 0 ? own_unit : R(1), second_scale = second_unit > 0 ? second_unit : R(1);
     // Before step j thread i >= j has column i of the Schur complement that is left of A, thread i < j column i of the
     // identity as far as the factor has been solved for. A[0] is row j: after each step the rows move up.
     bool regular = true;
-    auto is_regular = [&](R pivot, R is_free, R diagonal) { return pivot > smallest * (is_free > 0 ? diagonal : R(1)); };
     auto steps = [&](auto first) {  // from a row of the first columns on, SOME steps; the number of the rows left is a constant
       constexpr int FROM = decltype(first)::value, TO = FROM + SOME < FIRST ? FROM + SOME : FIRST;
       for (int j = FROM; j < TO; ++j) {
@@ -434,12 +433,12 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
         A[0] += is_pivot ? added : R(0);
         const R pivot = __shfl_sync(ALL, A[0], j), by = rsqrt(pivot), c = A[0] * by;
         R* column = work + j % 2 * ld;
-        regular = regular && (!is_pivot || is_regular(pivot, is_free, diagonal));
+        regular = regular && (!is_pivot || pivot > smallest);
         if (me() > j && me() < FIRST) column[me() - j - 1] = c;
         if (is_pivot)
 #pragma unroll
           for (int k = 0; k < REST; ++k) column[32 + k] = low[k] * by;
-        if (me() < END) inverse[j * ld_inverse + me()] = is_pivot ? by : me() < j ? c : R(0);
+        if (me() < END) inverse[j * ld_inverse + me()] = is_pivot ? by * scale : me() < j ? c * scale : R(0);
         if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = 0;
         __syncwarp();
         // thread j: its column of the factor, and the first step of its column of the identity
@@ -457,10 +456,10 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
       other[0] += is_pivot ? second_added : R(0);
       const R pivot = __shfl_sync(ALL, other[0], j - 32), by = rsqrt(pivot), b = low[0] * by, c = other[0] * by;
       R* column = work + j % 2 * ld;
-      regular = regular && (!is_pivot || is_regular(pivot, second_is_free, second_diagonal));
+      regular = regular && (!is_pivot || pivot > smallest);
       if (me() + 32 > j && me() < REST) column[me() + 31 - j] = c;
-      inverse[j * ld_inverse + me()] = b;
-      if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = is_pivot ? by : me() + 32 < j ? c : R(0);
+      inverse[j * ld_inverse + me()] = b * scale;
+      if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = is_pivot ? by * second_scale : me() + 32 < j ? c * second_scale : R(0);
       __syncwarp();
       const R times = is_pivot ? c + by : c;
       fours(column, 0, REST - 1, [&](int k, R entry) {

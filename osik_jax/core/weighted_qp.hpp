@@ -283,7 +283,7 @@ OSIK_UNROLL_4
   OSIK_CALL bool factor_hessian() { return invert_hessian() && invert_complement(); }
   OSIK_FN bool invert_hessian() {
     if constexpr (Team::HOLDS_COLUMNS) {
-      t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? 1 : 0, PIVOT[j] = 1; });
+      t.each(0, n, [&](int j) { STEP[j] = LABEL[j] == INACTIVE ? INVERSE_ROOT[j] : Real(0), PIVOT[j] = 1; });
       return t.inverse_factor_of_gram(B, DAMPING, STEP, RIDGE, EPS, M, TERMS, ld, lq);
     }
     if constexpr (Team::SPARES_SPACE)

@@ -12,7 +12,8 @@ from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, recorded_qps
 from weighted_families import soft_problems
 
-from osik_jax.solvers import solve_least_squares_qp
+from osik_jax.numerics._constants import INACTIVE, SINGLE_DAMPING
+from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp._cuda import CERTIFIED
 
 pytestmark = needs_core
@@ -82,6 +83,36 @@ def test_recorded_problems_in_single_precision(robot, tmp_path):
         assert off(given, found.x, p.solution).max() < 1e-5
     np.testing.assert_array_equal(found.active, answer)
     assert (found.report[:, 1:] == (0, 1)).all()
+
+
+@pytest.mark.parametrize("robot", ["g1", "nao"])
+def test_weights_far_apart_stay_in_the_kernel(robot, tmp_path, rng):
+    """Recorded tasks with weights from 1e-4 to 1e5, three rows each, and speed limits that stop some joints."""
+    p = recorded_qps(robot)
+    count, n = p.lower.shape
+    m = p.A.shape[1] - (n - 6)
+    A, b = p.A[:, :m], p.b[:, :m]
+    weight = np.repeat(10.0 ** rng.uniform(-4, 5, (count, -(-m // 3))), 3, axis=1)[:, :m]
+    damping = np.full((count, n), QP_DAMPING)
+    damping[:, 6:] = 10.0 ** rng.uniform(-4, 5, (count, 1))
+    damping = np.maximum(damping, least_damping(A, weight))
+    center = np.pad(p.b[:, m:] / 0.05, ((0, 0), (6, 0)))
+    bound = np.pad(10.0 ** rng.uniform(-2, 1, (count, n - 6)), ((0, 0), (6, 0)), constant_values=np.inf)
+    none = np.zeros((count, 0, n))
+    given = A, b, weight, damping, center, none, none[..., 0], -bound, bound
+    found = one_warp.solve(tmp_path, given, np.zeros((count, n), int), 1e-7, np.float32)
+    expected = answers(A, b, weight, -bound, bound, none, *3 * [none[..., 0]], damping, center)
+    assert (expected.status == Status.SOLVED).all() and (np.asarray(expected.active) != INACTIVE).any(1).mean() > 0.5
+    assert (found.report[:, 0] == CERTIFIED).mean() >= 0.99
+    root = np.sqrt(np.einsum("bm,bmn->bn", weight, A**2) + damping)  # in which a variable's error costs alike
+    miss = np.abs(root * (found.x - expected.x)).max(1) / np.abs(root * expected.x).max(1)
+    assert miss[found.report[:, 0] == CERTIFIED].max() < 1e-5
+
+
+def least_damping(A, weight):
+    """The least damping that a WeightedQP leaves to a kernel in single precision."""
+    largest = (weight * (A**2).sum(2)).max(1, keepdims=True)
+    return SINGLE_DAMPING * np.finfo(np.float32).eps * largest
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
