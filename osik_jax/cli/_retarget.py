@@ -300,8 +300,13 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
 
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
     soles = {name: "-" if value is None else f"{value:.2f}" for name, value in feet.items()}
+    trunk = "".join(
+        f"{part} {tracking['trunk_angle_deg'][part]:.1f}, "
+        for part in ("pelvis", "chest")
+        if tracking["trunk_angle_deg"][part] is not None
+    )
     console.print(
-        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
+        f"{trunk}segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
         f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )

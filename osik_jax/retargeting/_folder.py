@@ -24,7 +24,7 @@ from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
 from ._profile_file import find_profile, profile_text, save_profile
-from ._report import report
+from ._report import picked, report
 from ._retarget import Retargeter, Source
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ FIGURES = {
     "penetration_mm_max": ("shapes", "penetration_mm_max"),
     "limb_error_mm_mean": ("tracking", "limb_error_mm_mean"),
     "segment_angle_deg_mean": ("tracking", "segment_angle_deg_mean"),
+    "pelvis_angle_deg_mean": ("tracking", "trunk_angle_deg", "pelvis"),
+    "chest_angle_deg_mean": ("tracking", "trunk_angle_deg", "chest"),
 }
 """Columns of the summary, and the path of each in a clip's report."""
 _JOB = "job.json"
@@ -290,10 +292,4 @@ def _index(summary: dict[str, Any]) -> list[list[Any]]:
 
 def _picked(figures: Any) -> dict[str, float | None]:
     """Return the figures of a report that the summary shows."""
-    out = {}
-    for name, path in FIGURES.items():
-        value = figures
-        for key in path:
-            value = value[key]
-        out[name] = value
-    return out
+    return {name: picked(figures, path) for name, path in FIGURES.items()}

@@ -11,18 +11,18 @@ from urllib.parse import quote
 import numpy as np
 
 from ._contact import stretches
-from ._report import AT_SPEED, joint_tracks
+from ._report import AT_SPEED, at_ends, joint_tracks, picked
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
-_AT_END, _OFF, _MOST_JOINTS = 0.01, 1e-3, 8
-"""Share of a joint's range within which it counts as at its end, distance from the plan that counts [rad or m], and
-joints that the panel lists.
-"""
+_OFF, _MOST_JOINTS = 1e-3, 8
+"""Distance from the plan that counts [rad or m], and number of joints that the panel lists."""
 _FIGURES = {
     "segments off, mean [deg]": ("tracking", "segment_angle_deg_mean"),
+    "pelvis off, mean [deg]": ("tracking", "trunk_angle_deg", "pelvis"),
+    "chest off, mean [deg]": ("tracking", "trunk_angle_deg", "chest"),
     "feet slip [mm]": ("feet", "slip_mm_max"),
     "feet above the floor [mm]": ("feet", "float_mm_max"),
     "soles below the floor [mm]": ("feet", "below_floor_mm_max"),
@@ -104,23 +104,21 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts.append("<h2>Contact</h2>")
     rows = {name.replace("_", " "): result.contact[:, k] for k, name in enumerate(names)}
     parts.append(_lines(rows, "#2a9d62") if names else "<p>the robot has no feet</p>")
-    q, low, high, fastest = joint_tracks(result)
-    room = np.where(np.isfinite(high - low), _AT_END * (high - low), 0.0)
-    ends = (q <= low + room) | (q >= high - room)
+    q, _, _, fastest = joint_tracks(result)
     speed = np.abs(np.diff(q, axis=0, prepend=q[:1])) * fps
     parts.append("<h2>Limits</h2>")
     strips = {
-        "a joint at an end of its range": ends.any(1),
+        "a joint at an end of its range": at_ends(result).any(1),
         "a joint at its speed limit": (speed > AT_SPEED * fastest).any(1),
         "limits keep it from the plan": np.asarray(result.off_plan > _OFF),
     }
     parts.append(_lines(strips, "#d97b1f"))
-    share = {name: ends[:, k].mean() for k, name in enumerate(result.robot.joint_names) if ends[:, k].any()}
+    share: Mapping[str, float] = figures["joints"]["at_end_share"]
     longest = sorted(share, key=lambda name: -share[name])[:_MOST_JOINTS]
     parts.append("<h2>Joints at an end of their range</h2>")
     parts.append(_table({name: f"{100.0 * share[name]:.0f} %" for name in longest}) if share else "<p>none</p>")
     parts.append("<h2>Largest values</h2>")
-    parts.append(_table({text: _number(figures[group][name]) for text, (group, name) in _FIGURES.items()}))
+    parts.append(_table({text: _number(picked(figures, path)) for text, path in _FIGURES.items()}))
     return "".join(parts) + "</aside>"
 
 
