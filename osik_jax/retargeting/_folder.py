@@ -24,29 +24,12 @@ from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
 from ._profile_file import find_profile, profile_text, save_profile
-from ._report import picked, report
+from ._report import FIGURES, picked, report
 from ._retarget import Retargeter, Source
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
-FIGURES = {
-    "off_plan_rad": ("off_plan_rad",),
-    "beyond_range_max": ("joints", "beyond_range_max"),
-    "speed_over_limit_max": ("joints", "speed_over_limit_max"),
-    "acceleration_max": ("joints", "acceleration_max"),
-    "acceleration_rms": ("joints", "acceleration_rms"),
-    "jerk_rms": ("joints", "jerk_rms"),
-    "slip_mm_max": ("feet", "slip_mm_max"),
-    "float_mm_max": ("feet", "float_mm_max"),
-    "below_floor_mm_max": ("feet", "below_floor_mm_max"),
-    "penetration_mm_max": ("shapes", "penetration_mm_max"),
-    "limb_error_mm_mean": ("tracking", "limb_error_mm_mean"),
-    "segment_angle_deg_mean": ("tracking", "segment_angle_deg_mean"),
-    "pelvis_angle_deg_mean": ("tracking", "trunk_angle_deg", "pelvis"),
-    "chest_angle_deg_mean": ("tracking", "trunk_angle_deg", "chest"),
-}
-"""Columns of the summary, and the path of each in a clip's report."""
 _JOB = "job.json"
 _COMPILING = 30_000
 """Frames that a CPU plans in the time of one compilation."""
@@ -111,11 +94,10 @@ def retarget_folder(
                 advance(done)
         summary = _summary(work.found, work.failed, [*files])
         write_json(summary, out / "report.json")
-        rows = _index(summary)
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
+            csv.writer(file).writerows(_index(summary))
         if page:
-            write_index(rows, out / "index.html")
+            write_index(summary, out / "index.html")
     return summary
 
 
@@ -243,7 +225,7 @@ def _finished(folder: Path, source: dict[str, str], page: bool) -> dict[str, Any
     """Return the report of a finished clip, or None if there is none for this file and job, or lacks its ``page``."""
     figures = _read(folder / "report.json") or {}
     try:
-        _picked(figures)
+        picked(figures)
     except (KeyError, TypeError):
         return None
     whole = source.items() <= figures.items() and ((folder / "report.html").exists() or not page)
@@ -268,7 +250,7 @@ def _reason(error: Exception) -> str:
 def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], order: Sequence[str]) -> dict[str, Any]:
     """Return the summary of ``retarget_folder``, clips in the given order."""
     figures = {name: found[name] for name in order if name in found}
-    rows = {name: {"frames": own["frames"], "fps": own["fps"], **_picked(own)} for name, own in figures.items()}
+    rows = {name: {"frames": own["frames"], "fps": own["fps"], **picked(own)} for name, own in figures.items()}
     seen = {key: [row[key] for row in rows.values() if row[key] is not None] for key in FIGURES}
     return {
         "clips": len(rows),
@@ -288,8 +270,3 @@ def _index(summary: dict[str, Any]) -> list[list[Any]]:
     for name in sorted(summary["figures"], key=lambda name: name not in notes):
         rows.append([name, "; ".join(notes.get(name, ())), *summary["figures"][name].values()])
     return rows
-
-
-def _picked(figures: Any) -> dict[str, float | None]:
-    """Return the figures of a report that the summary shows."""
-    return {name: picked(figures, path) for name, path in FIGURES.items()}

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikValueError, unknown_name
-from ._roles import FINGERS, HAND, NEEDED, OPTIONAL, SIDES
+from ._roles import CHAINS, FINGERS, HAND, NEEDED, OPTIONAL, SIDES
 
 ROLES = (*NEEDED, *OPTIONAL, *HAND)
 """All roles: a person's joints and points in retargeting."""
@@ -81,7 +81,7 @@ def find_roles(
     roles = _by_name(joint_names, needed, places) if mapping is None else _checked(joint_names, mapping, needed)
     sided = [role for role in roles if role in needed or role.startswith(SIDES)]
     for a, b in itertools.combinations(sided, 2):
-        if _is_at(places, roles[a], roles[b]):
+        if _spans(a, b) and _is_at(places, roles[a], roles[b]):
             raise OsikValueError(
                 f"{a} ({roles[a]}) and {b} ({roles[b]}) are at one point in all frames; say which joint is which with "
                 "mapping={role: joint}"
@@ -93,6 +93,13 @@ def _places(joint_names: tuple[str, ...], positions: Float[np.ndarray, "F J 3"])
     """Return the positions of each joint by name, over the clip's largest distance from the mean joint. (F, 3) each."""
     beside = positions - positions.mean(1, keepdims=True)
     return dict(zip(joint_names, np.moveaxis(beside / max(np.abs(beside).max(), 1e-12), 1, 0), strict=True))
+
+
+def _spans(a: str, b: str) -> bool:
+    """Return whether two landmarks give a direction: joints of one limb, left and right joints, or a hand's."""
+    (side, _, part), (other, _, second) = a.partition("_"), b.partition("_")
+    arms = [joint in CHAINS["arm"] for joint in (part, second)]
+    return side not in SIDES or part == second or (side == other and arms[0] == arms[1])
 
 
 def _is_at(places: Mapping[str, np.ndarray], a: str, b: str) -> bool:
