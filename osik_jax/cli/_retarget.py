@@ -193,6 +193,7 @@ def _retarget_folder(command: Retarget) -> int:
     from rich.console import Console
 
     from ..retargeting._folder import retarget_folder
+    from ..retargeting._load import shortened
 
     with told():
         summary = retarget_folder(
@@ -214,6 +215,8 @@ def _retarget_folder(command: Retarget) -> int:
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
         f"{command.out / 'report.json'}",
     )
+    if summary["no_clips"]:
+        _say(console, f"no clips, and not read: {shortened(summary['no_clips'])}")
     for note in noted[:_MOST_NOTES]:
         _say(console, f"note: {note}")
     if len(noted) > _MOST_NOTES:

@@ -69,14 +69,16 @@ def retarget_folder(
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
-        (error by clip), ``notes`` (those of ``report``, by clip) and ``figures`` (by clip).
+        (error by clip), ``notes`` (those of ``report``, by clip), ``figures`` (by clip) and ``no_clips`` (names of
+        files with other endings, and of folders).
 
     Raises:
         ValueError: no clips in the folder, or ``out`` has another job in it; the message says what differs.
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    files, reader = clips_in(folder), Reader() if reader is None else reader
+    (files, others), reader = clips_in(folder), Reader() if reader is None else reader
+    others = [name for name in others if folder / name != out]
     if reader.source is not None:
         retargeter = retargeter._led_by(reader.profile or find_profile(reader.source))
     job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
@@ -92,7 +94,7 @@ def retarget_folder(
                 advance(work.add(name, partial(reader.in_folder, files[name]), mapping, fps))
             for done in work.rest():
                 advance(done)
-        summary = _summary(work.found, work.failed, [*files])
+        summary = {**_summary(work.found, work.failed, [*files]), "no_clips": others}
         write_json(summary, out / "report.json")
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(_index(summary))

@@ -87,6 +87,7 @@ def write_index(summary: Mapping[str, Any], out: Path) -> None:
         "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
         f"<title>Retargeted clips</title>{_INDEX_STYLE}<h1>Retargeted clips</h1>",
         f"<p>{summary['clips']} clips, {summary['frames']:,} frames; {len(notes)} with notes, {len(failed)} failed",
+        f"<p>No clips: {_text(', '.join(summary['no_clips']))}" if summary["no_clips"] else "",
         f"<table><thead><tr><th>clip{''.join(f'<th>{_text(title)}' for title in titles)}</thead>",
     ]
     parts += [

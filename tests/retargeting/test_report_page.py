@@ -89,6 +89,9 @@ def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, ca
     write_bvh(clips / "dance <1>.bvh", dancer(FRAMES), 0.01)
     write_bvh(clips / "dance 2.bvh", dancer(FRAMES), 0.01)
     (clips / "broken.csv").write_text("time,Hips.x\n0,1\n1,2\n")
+    for other in ("walk <2>.txt", "07.asf", ".hidden"):
+        (clips / other).write_text("")
+    (clips / "more").mkdir()
 
     def run() -> int:
         return Retarget(clip=str(clips), robot="nao", out=out, report=True).run()
@@ -109,6 +112,9 @@ def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, ca
     ):
         assert f"<th>{title}" in rows[0] and not set(table[0][4:]) & set(re.findall("<th>([^<]*)", rows[0]))
         assert f'<td title="{title}">{float(table[2][table[0].index(name)]):.2f}' in rows[2]
+    # what is no clip is told
+    assert "no clips, and not read: more/, walk <2>.txt\n" in capsys.readouterr().out
+    assert "<p>No clips: more/, walk &lt;2&gt;.txt" in index
     # notes stand below the figures of their clip
     noted = json.loads((out / "report.json").read_text(encoding="utf-8"))
     noted["notes"] = {"dance <1>": ["feet slip by <1> mm"]}
