@@ -94,7 +94,8 @@ class Retarget:
     iterations: int = 20
     """Largest number of iterations per frame with --live."""
     budget: float | None = None
-    """Computing time per frame with --live [s]. Default: 60 % of the time between frames, 4 ms at most."""
+    """Computing time per frame with --live [s]; five iterations run in any case. Default: 60 % of the time between
+    frames, 4 ms at most."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""

@@ -198,7 +198,8 @@ def read_person(
     # a drift counts from the first frame of the measured clip, which another clip does not share
     floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
-    points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
+    leveled = floor.leveled(np.stack([*points.values()], 1), motion.fps)
+    points = dict(zip(points, np.moveaxis(leveled, 1, 0), strict=True))
     contact = None if standing != CONTACT_POINTS and "left_toe" in roles else motion.contact
     if contact is None and standing and set(standing) <= set(points):
         soles = np.stack([points[name] for name in standing], 1)
