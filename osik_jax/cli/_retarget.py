@@ -94,7 +94,8 @@ class Retarget:
     iterations: int = 20
     """Largest number of iterations per frame with --live."""
     budget: float | None = None
-    """Computing time per frame with --live [s]. Default: 60 % of the time between frames, 4 ms at most."""
+    """Computing time per frame with --live [s]; five iterations run in any case. Default: 60 % of the time between
+    frames, 4 ms at most."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -193,6 +194,7 @@ def _retarget_folder(command: Retarget) -> int:
     from rich.console import Console
 
     from ..retargeting._folder import retarget_folder
+    from ..retargeting._load import shortened
 
     with told():
         summary = retarget_folder(
@@ -214,6 +216,8 @@ def _retarget_folder(command: Retarget) -> int:
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
         f"{command.out / 'report.json'}",
     )
+    if summary["no_clips"]:
+        _say(console, f"no clips, and not read: {shortened(summary['no_clips'])}")
     for note in noted[:_MOST_NOTES]:
         _say(console, f"note: {note}")
     if len(noted) > _MOST_NOTES:
@@ -300,8 +304,13 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
 
     joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
     soles = {name: "-" if value is None else f"{value:.2f}" for name, value in feet.items()}
+    trunk = "".join(
+        f"{part} {tracking['trunk_angle_deg'][part]:.1f}, "
+        for part in ("pelvis", "chest")
+        if tracking["trunk_angle_deg"][part] is not None
+    )
     console.print(
-        f"segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
+        f"{trunk}segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
         f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
         f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
     )

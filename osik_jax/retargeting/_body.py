@@ -221,8 +221,11 @@ class Build:
             return profile.scale
         return profile.stretch * self.size / sum(person.lengths[limb] for limb in measured(profile))
 
-    def goals(self, person: Person) -> Goals:
-        """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot."""
+    def goals(self, person: Person, firm: bool = True) -> Goals:
+        """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot.
+
+        ``firm``: whether long contacts get a larger weight (``_firmness``).
+        """
         profile, root = self.profile, person.root
         if profile.walks and self.free is not None:
             scale = self.scale(person)
@@ -242,7 +245,7 @@ class Build:
             )
             if reached or touches
             else np.zeros((len(root), 0)),
-            "contact": _firmness(person.contact) if dtype == np.float64 else person.contact,
+            "contact": _firmness(person.contact) if firm and dtype == np.float64 else person.contact,
             "root": root,
             "present": np.ones(len(root)),
         }

@@ -46,7 +46,7 @@ def fit_to_file(
         ImportError, ValueError, KeyError: as of ``fit`` and ``load_motion``; the latter's start with the clip's name.
     """
     motions = []
-    for name, path in clips_in(folder).items():
+    for name, path in clips_in(folder)[0].items():
         try:
             motions.append(reader.in_folder(path))
         except (ValueError, KeyError) as error:

@@ -24,27 +24,12 @@ from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
 from ._profile_file import find_profile, profile_text, save_profile
-from ._report import report
+from ._report import FIGURES, picked, report
 from ._retarget import Retargeter, Source
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
-FIGURES = {
-    "off_plan_rad": ("off_plan_rad",),
-    "beyond_range_max": ("joints", "beyond_range_max"),
-    "speed_over_limit_max": ("joints", "speed_over_limit_max"),
-    "acceleration_max": ("joints", "acceleration_max"),
-    "acceleration_rms": ("joints", "acceleration_rms"),
-    "jerk_rms": ("joints", "jerk_rms"),
-    "slip_mm_max": ("feet", "slip_mm_max"),
-    "float_mm_max": ("feet", "float_mm_max"),
-    "below_floor_mm_max": ("feet", "below_floor_mm_max"),
-    "penetration_mm_max": ("shapes", "penetration_mm_max"),
-    "limb_error_mm_mean": ("tracking", "limb_error_mm_mean"),
-    "segment_angle_deg_mean": ("tracking", "segment_angle_deg_mean"),
-}
-"""Columns of the summary, and the path of each in a clip's report."""
 _JOB = "job.json"
 _COMPILING = 30_000
 """Frames that a CPU plans in the time of one compilation."""
@@ -84,14 +69,16 @@ def retarget_folder(
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
-        (error by clip), ``notes`` (those of ``report``, by clip) and ``figures`` (by clip).
+        (error by clip), ``notes`` (those of ``report``, by clip), ``figures`` (by clip) and ``no_clips`` (names of
+        files with other endings, and of folders).
 
     Raises:
         ValueError: no clips in the folder, or ``out`` has another job in it; the message says what differs.
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    files, reader = clips_in(folder), Reader() if reader is None else reader
+    (files, others), reader = clips_in(folder), Reader() if reader is None else reader
+    others = [name for name in others if folder / name != out]
     if reader.source is not None:
         retargeter = retargeter._led_by(reader.profile or find_profile(reader.source))
     job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
@@ -107,13 +94,12 @@ def retarget_folder(
                 advance(work.add(name, partial(reader.in_folder, files[name]), mapping, fps))
             for done in work.rest():
                 advance(done)
-        summary = _summary(work.found, work.failed, [*files])
+        summary = {**_summary(work.found, work.failed, [*files]), "no_clips": others}
         write_json(summary, out / "report.json")
-        rows = _index(summary)
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
-            csv.writer(file).writerows(rows)
+            csv.writer(file).writerows(_index(summary))
         if page:
-            write_index(rows, out / "index.html")
+            write_index(summary, out / "index.html")
     return summary
 
 
@@ -241,7 +227,7 @@ def _finished(folder: Path, source: dict[str, str], page: bool) -> dict[str, Any
     """Return the report of a finished clip, or None if there is none for this file and job, or lacks its ``page``."""
     figures = _read(folder / "report.json") or {}
     try:
-        _picked(figures)
+        picked(figures)
     except (KeyError, TypeError):
         return None
     whole = source.items() <= figures.items() and ((folder / "report.html").exists() or not page)
@@ -266,7 +252,7 @@ def _reason(error: Exception) -> str:
 def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], order: Sequence[str]) -> dict[str, Any]:
     """Return the summary of ``retarget_folder``, clips in the given order."""
     figures = {name: found[name] for name in order if name in found}
-    rows = {name: {"frames": own["frames"], "fps": own["fps"], **_picked(own)} for name, own in figures.items()}
+    rows = {name: {"frames": own["frames"], "fps": own["fps"], **picked(own)} for name, own in figures.items()}
     seen = {key: [row[key] for row in rows.values() if row[key] is not None] for key in FIGURES}
     return {
         "clips": len(rows),
@@ -286,14 +272,3 @@ def _index(summary: dict[str, Any]) -> list[list[Any]]:
     for name in sorted(summary["figures"], key=lambda name: name not in notes):
         rows.append([name, "; ".join(notes.get(name, ())), *summary["figures"][name].values()])
     return rows
-
-
-def _picked(figures: Any) -> dict[str, float | None]:
-    """Return the figures of a report that the summary shows."""
-    out = {}
-    for name, path in FIGURES.items():
-        value = figures
-        for key in path:
-            value = value[key]
-        out[name] = value
-    return out

@@ -109,14 +109,15 @@ def _from_csv(path: Path) -> tuple[HumanMotion, Up]:
         raise FileNotFoundError(f"no such file: {path}")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if row]
+            # a spreadsheet writes an empty line as commas
+            rows = [(number, row) for number, row in enumerate(csv.reader(file), 1) if any(map(str.strip, row))]
     except (UnicodeDecodeError, csv.Error) as error:
         raise OsikValueError(f"{path} is no table in UTF-8: {error}") from None
     if len(rows) < 3:
         raise OsikValueError(f"{path} has {len(rows)} lines; it needs one of headings and two of numbers at least")
     if is_optitrack(rows):
         return read_optitrack(path, rows), "y"
-    headings = [name.strip() for name in rows[0][1]]
+    headings = _without_empty_end([name.strip() for name in rows[0][1]])
     names = _joints(path, headings)
     values = np.array([_row(path, number, row, headings) for number, row in rows[1:]])
     column = {name: i for i, name in enumerate(headings)}
@@ -152,7 +153,15 @@ def _joints(path: Path, headings: list[str]) -> tuple[str, ...]:
     return names
 
 
+def _without_empty_end(cells: list[str], least: int = 0) -> list[str]:
+    """Return cells without the empty ones at the end of their line; ``least`` cells are kept."""
+    while len(cells) > least and not cells[-1].strip():
+        cells = cells[:-1]
+    return cells
+
+
 def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[float]:
+    row = _without_empty_end(row, len(headings))
     if len(row) != len(headings):
         raise OsikValueError(f"{path}, line {number}: {len(row)} values, but there are {len(headings)} headings")
     out = []

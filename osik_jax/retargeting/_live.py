@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import time
 from collections.abc import Mapping, Sequence
@@ -116,7 +115,8 @@ class LiveRetargeter(OnRobot):
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
         budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five
-            and those of a plan that violates a bound. None: 60 % of the time between frames, 4 ms at most.
+            and those of a plan that violates a bound, so a frame can take longer. None: 60 % of the time between
+            frames, 4 ms at most.
 
     Raises:
         ValueError: no limbs are found, nothing holds a free base, joints are missing, or a number is out of range.
@@ -244,11 +244,11 @@ class LiveRetargeter(OnRobot):
         )
         own = read_person(motion, self.roles, self._measures, self.profile.standing)
         person, now = self._build.seen(own), self._history
-        goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person))
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
-        goals = dataclasses.replace(goals, contact=np.minimum(goals.contact, 1.0))
+        goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person, firm=False))
         self._plan = plan = self._advanced(goals, person.contact[now], began)
-        off, feet_off, q = float(plan.off), float(plan.feet_off), np.asarray(plan.q[_PAST])
+        # slicing the array of JAX would be a program of its own
+        off, feet_off, q = float(plan.off), float(plan.feet_off), np.asarray(plan.q)[_PAST]
         status = LiveStatus.HELD_BACK if off > _OFF else LiveStatus.FOLLOWED
         status = LiveStatus.FEET_OFF if feet_off > _FEET_OFF else status
         if gone[now].any():

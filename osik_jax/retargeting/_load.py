@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -97,13 +98,22 @@ class Reader:
         return {"source": source, "source_fps": self.fps}
 
 
-def clips_in(folder: Path) -> dict[str, Path]:
-    """Return the motion files of a folder by clip name: the file's name, without its ending unless two would clash."""
-    inside = sorted(folder.iterdir())
+def clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """Return the motion files of a folder by clip name, and the names of what else is in it.
+
+    A clip's name is the file's, without its ending unless two would clash. Skeletons (.asf) and hidden files are not
+    named.
+    """
+    inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
     files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
+    others = [path.name + "/" * path.is_dir() for path in inside if path not in files and path.suffix.lower() != ".asf"]
     if not files:
-        others = [path.name for path in inside]
-        seen = ", ".join(others[:8]) + (f" and {len(others) - 8} more" if len(others) > 8 else "")
-        raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen or 'nothing'}")
+        seen = shortened([path.name for path in inside]) or "nothing"
+        raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen}")
     stems = [path.stem for path in files]
-    return {path.stem if stems.count(path.stem) == 1 else path.name: path for path in files}
+    return {path.stem if stems.count(path.stem) == 1 else path.name: path for path in files}, others
+
+
+def shortened(names: Sequence[str], most: int = 8) -> str:
+    """Return names joined by commas, ``most`` of them and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

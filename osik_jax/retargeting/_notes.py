@@ -1,4 +1,4 @@
-"""Notes of a report: violated bounds, clips that are too fast for the joints, and clips with almost no contacts."""
+"""Notes of a report: violated bounds, clips too fast for the joints, trunks that lean, and clips with few contacts."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ _LEAST_STANDING = 0.2
 _OFTEN, _OFF = 0.5, 4.0
 """Share of frames with a joint at its speed limit, and mean angle between segments [deg], above both of which a clip is
 too fast.
+"""
+_LEANS, _RESTS, _MOST_JOINTS = 10.0, 0.5, 4
+"""Angle between the trunks of person and robot [deg], and share of frames with a joint at an end of its range, above
+which each is told; and largest number of joints that a note names.
 """
 
 
@@ -43,10 +47,33 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
     margin = figures["balance"]["com_margin_mm_min"]
     if balance is not None and margin is not None and margin < 0.0:
         out.append(f"a bound gave way: the centre of mass is {-margin:.1f} mm outside the feet")
+    out += _posture(figures)
     share = figures["feet"]["contact_share"]
     if share is not None and share < _LEAST_STANDING:
         out.append(
             f"feet stand in {100.0 * share:.0f} % of the frames, and nothing holds them elsewhere; where the person "
             "walks or stands, check the unit, the up axis and the contact labels of the clip"
         )
+    return out
+
+
+def _posture(figures: Mapping[str, Any]) -> list[str]:
+    """Return notes on a left hand for a right one, on a trunk that leans, and on joints that rest at an end."""
+    out, leans = [], figures["tracking"]["trunk_angle_deg"]["hips-shoulders"]
+    if leans is not None and leans > _LEANS:
+        out.append(
+            f"the trunk leans {leans:.0f} deg away from the person's: check which joint of the clip is the chest, and "
+            "the range of the waist"
+        )
+    if figures["tracking"]["other_hand"]:
+        out.append(
+            "the clip has a left hand and the robot is a right one, or the other way round: take the other robot, or "
+            "mirror the clip by changing the sign of one coordinate"
+        )
+    share: Mapping[str, float] = figures["joints"]["at_end_share"]
+    rests = sorted((name for name in share if share[name] > _RESTS), key=lambda name: -share[name])
+    if rests:
+        named = ", ".join(f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests[:_MOST_JOINTS])
+        more = f" and {len(rests) - _MOST_JOINTS} more" if len(rests) > _MOST_JOINTS else ""
+        out.append(f"joints rest at an end of their range: {named}{more}")
     return out

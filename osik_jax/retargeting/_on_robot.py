@@ -81,7 +81,7 @@ class OnRobot:
         limbs = [chain(limb) if self.profile.is_hand else limb for limb in self.profile.followed]
         needed = tuple(dict.fromkeys(role for limb in limbs for role in limb))
         if isinstance(motion, HumanMotion):
-            return find_roles(motion.joint_names, mapping, needed)
+            return find_roles(motion.joint_names, mapping, needed, motion.positions)
         if mapping is not None:
             raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
         missing = self._lacks(motion.seen)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -11,27 +11,16 @@ from urllib.parse import quote
 import numpy as np
 
 from ._contact import stretches
-from ._report import AT_SPEED, joint_tracks
+from ._report import AT_SPEED, FIGURES, at_ends, joint_tracks, picked
 from ._retargeted import Retargeted
 
 if TYPE_CHECKING:
     from ..viewer._look import Look
 
-_AT_END, _OFF, _MOST_JOINTS = 0.01, 1e-3, 8
-"""Share of a joint's range within which it counts as at its end, distance from the plan that counts [rad or m], and
-joints that the panel lists.
-"""
-_FIGURES = {
-    "segments off, mean [deg]": ("tracking", "segment_angle_deg_mean"),
-    "feet slip [mm]": ("feet", "slip_mm_max"),
-    "feet above the floor [mm]": ("feet", "float_mm_max"),
-    "soles below the floor [mm]": ("feet", "below_floor_mm_max"),
-    "shapes overlap [mm]": ("shapes", "penetration_mm_max"),
-    "beyond joint ranges [rad]": ("joints", "beyond_range_max"),
-    "speed over its limit": ("joints", "speed_over_limit_max"),
-    "acceleration [rad/s²]": ("joints", "acceleration_max"),
-    "frames with a jump": ("joints", "jump_frames"),
-}
+_OFF, _MOST_JOINTS = 1e-3, 8
+"""Distance from the plan that counts [rad or m], and number of joints that the panel lists."""
+# on a narrow screen the scene keeps the width to height of 3:2 that its camera is placed for; 36 px are its controls
+# On a narrow screen the scene keeps the ratio of 3:2 that its camera is placed for; its controls take 36 px.
 _STYLE = """<style>
 #root{position:fixed;left:0;top:0;bottom:0;width:calc(100% - 340px)}
 #osik{position:fixed;right:0;top:0;bottom:0;width:340px;box-sizing:border-box;padding:14px 16px;overflow:auto;
@@ -40,11 +29,20 @@ font:13px/1.4 system-ui,sans-serif;color:#1f2933;background:#fff;border-left:1px
 #osik ul{padding-left:18px}#osik table{border-collapse:collapse;width:100%}#osik td{padding:1px 0}
 #osik td+td{text-align:right;font-variant-numeric:tabular-nums}#osik .gave{color:#b3261e}
 #osik svg{display:block;width:100%;height:12px;background:#eef1f5;margin-bottom:4px}
+@media (max-width:800px){#root{width:100%;height:min(67vw + 36px,60%)}
+#osik{width:100%;top:min(67vw + 36px,60%);border-left:0;border-top:1px solid #d9dfe7}}
 #osik .lines{position:relative}#osik .now{position:absolute;top:0;bottom:0;width:1px;background:#1c6fb8}
 </style>"""
 _INDEX_STYLE = """<style>
-body{font:13px/1.4 system-ui,sans-serif;color:#1f2933}table{border-collapse:collapse}
-td,th{padding:2px 8px;text-align:right;border-bottom:1px solid #d9dfe7}td:nth-child(-n+2){text-align:left}
+body{font:14px/1.45 system-ui,sans-serif;color:#1f2933;margin:20px;max-width:1400px}h1{font-size:20px;margin:0}
+table{border-collapse:collapse;width:100%;margin-top:14px}tbody{border-top:1px solid #d9dfe7}
+th,td{padding:4px 6px;text-align:right;vertical-align:top;font-variant-numeric:tabular-nums}
+th{font-size:12px;font-weight:600;vertical-align:bottom}th:first-child,td:first-child{text-align:left;min-width:8em}
+ul{margin:0;padding-left:18px}ul,.failed{color:#b3261e;text-align:left!important;max-width:110ch;overflow-wrap:anywhere}
+@media (max-width:800px){body{margin:12px}thead{display:none}table,tbody,td{display:block}tbody{padding:8px 0}
+tr{display:grid;grid-template-columns:1fr 1fr;column-gap:20px}td{padding:1px 0}td:first-child,.failed{grid-column:1/-1}
+td[title]{display:flex;justify-content:space-between;gap:6px}td[title]::before{content:attr(title);color:#52606d;
+text-align:left}a{font-weight:600}}
 </style>"""
 _SCRIPT = """<script>
 setInterval(()=>{const s=document.querySelector('#root [role=slider]');if(!s)return;
@@ -76,20 +74,36 @@ def write_report(
     write_page(result.robot, read_motion(motion, result.robot), out, look=look, title=title, beside=panel)
 
 
-def write_index(rows: Sequence[Sequence[Any]], out: Path) -> None:
-    """Write a table as HTML; a clip's name, in the first column, is a link to its page.
+def write_index(summary: Mapping[str, Any], out: Path) -> None:
+    """Write the summary of a folder as HTML: a clip's name is a link to its page, and its notes are below its figures.
 
     Args:
-        rows: of headings, then of each clip.
+        summary: summary of ``retarget_folder``; clips that failed come first, then those with notes.
         out: the HTML file, in the folder of the clips' folders.
     """
-    lines = [f"<!doctype html><meta charset=utf-8><title>Retargeted clips</title>{_INDEX_STYLE}<table>"]
-    for tag, row in zip(["th", *["td"] * len(rows)], rows, strict=False):
-        name, *cells = (_text(f"{cell:.4g}" if isinstance(cell, float) else cell) for cell in row)
-        if (out.parent / str(row[0]) / "report.html").exists():
-            name = f'<a href="{quote(str(row[0]))}/report.html">{name}</a>'
-        lines.append("<tr>" + "".join(f"<{tag}>{cell}" for cell in (name, *cells)))
-    out.write_text("\n".join([*lines, "</table>"]), encoding="utf-8")
+    failed, notes, rows = summary["failed"], summary["notes"], summary["figures"]
+    titles = ["frames", "frames a second", *(title for title, _ in FIGURES.values())]
+    parts = [
+        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
+        f"<title>Retargeted clips</title>{_INDEX_STYLE}<h1>Retargeted clips</h1>",
+        f"<p>{summary['clips']} clips, {summary['frames']:,} frames; {len(notes)} with notes, {len(failed)} failed",
+        f"<p>No clips: {_text(', '.join(summary['no_clips']))}" if summary["no_clips"] else "",
+        f"<table><thead><tr><th>clip{''.join(f'<th>{_text(title)}' for title in titles)}</thead>",
+    ]
+    parts += [
+        f"<tbody><tr><td>{_text(name)}<td class=failed colspan={len(titles)}>{_text(reason)}"
+        for name, reason in failed.items()
+    ]
+    for name in sorted(rows, key=lambda name: name not in notes):
+        linked = _text(name)
+        if (out.parent / name / "report.html").exists():
+            linked = f'<a href="{quote(name)}/report.html">{linked}</a>'
+        cells = zip(titles, rows[name].values(), strict=True)
+        figures = "".join(f'<td title="{_text(title)}">{_number(value)}' for title, value in cells)
+        parts.append(f"<tbody><tr><td>{linked}{figures}")
+        items = "".join(f"<li>{_text(note)}" for note in notes.get(name, ()))
+        parts += [f"<tr class=notes><td colspan={len(titles) + 1}><ul>{items}</ul>"] if items else []
+    out.write_text("\n".join([*parts, "</table>"]), encoding="utf-8")
 
 
 def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
@@ -104,24 +118,28 @@ def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:
     parts.append("<h2>Contact</h2>")
     rows = {name.replace("_", " "): result.contact[:, k] for k, name in enumerate(names)}
     parts.append(_lines(rows, "#2a9d62") if names else "<p>the robot has no feet</p>")
-    q, low, high, fastest = joint_tracks(result)
-    room = np.where(np.isfinite(high - low), _AT_END * (high - low), 0.0)
-    ends = (q <= low + room) | (q >= high - room)
+    q, _, _, fastest = joint_tracks(result)
     speed = np.abs(np.diff(q, axis=0, prepend=q[:1])) * fps
     parts.append("<h2>Limits</h2>")
     strips = {
-        "a joint at an end of its range": ends.any(1),
+        "a joint at an end of its range": at_ends(result).any(1),
         "a joint at its speed limit": (speed > AT_SPEED * fastest).any(1),
         "limits keep it from the plan": np.asarray(result.off_plan > _OFF),
     }
     parts.append(_lines(strips, "#d97b1f"))
-    share = {name: ends[:, k].mean() for k, name in enumerate(result.robot.joint_names) if ends[:, k].any()}
+    share: Mapping[str, float] = figures["joints"]["at_end_share"]
     longest = sorted(share, key=lambda name: -share[name])[:_MOST_JOINTS]
     parts.append("<h2>Joints at an end of their range</h2>")
     parts.append(_table({name: f"{100.0 * share[name]:.0f} %" for name in longest}) if share else "<p>none</p>")
-    parts.append("<h2>Largest values</h2>")
-    parts.append(_table({text: _number(figures[group][name]) for text, (group, name) in _FIGURES.items()}))
+    parts.append("<h2>Figures</h2>")
+    parts.append(_table(_largest(figures)))
     return "".join(parts) + "</aside>"
+
+
+def _largest(figures: Mapping[str, Any]) -> dict[str, str]:
+    """Return the figures of a report by what a page calls them."""
+    values = {FIGURES[name][0]: _number(value) for name, value in picked(figures).items()}
+    return {**values, "frames with a jump": _number(figures["joints"]["jump_frames"])}
 
 
 def _lines(rows: Mapping[str, Any], color: str) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_noise
@@ -24,6 +25,8 @@ _SPINE = 1e-3
 _TOE, _SOLE, _HEEL = 0.35, 0.12, 0.3
 # Share of frames among which a flat foot is searched.
 _FLAT = 0.05
+# Upright frames are those in which the neck is at most 5 % lower above the feet than in the tallest frames.
+_TALL = 0.05
 # Lengths of a leg [m] outside which the file's unit must be wrong.
 _LEGS = (0.1, 3.0)
 
@@ -102,7 +105,8 @@ class Measures:
         floor: the floor under the clip.
         noise: standard deviation of each coordinate of the standing points [m].
         flat: per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
-        straight: axes of pelvis and chest in the rest pose; None if unknown. (1, 3, 3) each
+        straight: axes of pelvis and chest when the person is upright, by the rest pose or by the clip's upright
+            frames; None for a hand. (1, 3, 3) each
     """
 
     lengths: Mapping[Limb, float]
@@ -142,6 +146,8 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES} if legs else {}
         straight = _turns(rest)
+    elif "wrist" not in roles:
+        straight = _upright(points)
     known = [limb for limb in LIMBS if set(limb) <= set(points)]
     lengths = {(a, b): float(np.linalg.norm(points[b] - points[a], axis=-1).mean()) for a, b in known}
     reaches = [limb for limb in (*REACHES, *FINGER_REACHES) if set(limb) <= set(points)]
@@ -192,7 +198,8 @@ def read_person(
     # a drift counts from the first frame of the measured clip, which another clip does not share
     floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
-    points = {role: floor.leveled(track, motion.fps) for role, track in points.items()}
+    leveled = floor.leveled(np.stack([*points.values()], 1), motion.fps)
+    points = dict(zip(points, np.moveaxis(leveled, 1, 0), strict=True))
     contact = None if standing != CONTACT_POINTS and "left_toe" in roles else motion.contact
     if contact is None and standing and set(standing) <= set(points):
         soles = np.stack([points[name] for name in standing], 1)
@@ -275,9 +282,31 @@ def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         left = next((across[part] for part in parts if part in across), np.broadcast_to(np.eye(3)[1], up.shape))
         return axes_from(left, up)
 
-    spine = chest - low
-    up = np.where(np.linalg.norm(spine, axis=-1, keepdims=True) > _SPINE, spine, high - low)
-    return axes(("hip", "shoulder"), up), axes(("shoulder", "hip"), high - chest)
+    lower, upper = (
+        np.where(np.linalg.norm(part, axis=-1, keepdims=True) > _SPINE, part, high - low)
+        for part in (chest - low, high - chest)
+    )
+    return axes(("hip", "shoulder"), lower), axes(("shoulder", "hip"), upper)
+
+
+def _upright(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the axes of pelvis and chest of a person who is upright and faces x, from a clip. (1, 3, 3) each.
+
+    The line through hips and chest joint slants in some skeletons, by 33 degrees in LAFAN1's. Its pitch relative to the
+    line from hips to neck is therefore measured: the median over the frames in which the person is tallest.
+    """
+    trunk = _turns({role: track for role, track in points.items() if role != "chest"})
+    top = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
+    ankles = [points[f"{side}_ankle"][:, 2] for side in SIDES if f"{side}_ankle" in points]
+    height = top[:, 2] - np.min(ankles or [_middle(points, "hip", "shoulder")[:, 2]], 0)
+    tallest = np.percentile(height, 95)
+    tall = height >= tallest - _TALL * abs(tallest)
+    found = []
+    for upright, axes in zip(trunk, _turns(points), strict=True):
+        pitched = np.swapaxes(upright, -1, -2) @ axes
+        pitch = np.median(np.arctan2(pitched[:, 0, 2], pitched[:, 2, 2])[tall])
+        found.append(Rotation.from_rotvec([[0.0, pitch, 0.0]]).as_matrix())
+    return found[0], found[1]
 
 
 def _from_rest(axes: np.ndarray, rest: np.ndarray) -> np.ndarray:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import operator
 from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from ..physics._world import frame_pose
 from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
 from ._contact import stretches
+from ._facing import facing_at_home
+from ._hand import is_other_hand
 from ._notes import notes
 from ._places import Places, find_places
 from ._profile import Profile
@@ -20,24 +25,50 @@ from ._retargeted import Retargeted
 from ._robot_motion import in_model
 from ._roles import CHAINS, SIDES
 
-JUMP, AT_SPEED = 15.0, 0.97
-"""A change of joint speed from one frame to the next that counts as a jump [rad/s], and the share of its speed limit at
-which a joint counts as at the limit: a plan stays below 98 %.
+JUMP, AT_SPEED, AT_END = 15.0, 0.97, 0.01
+"""A change of joint speed from one frame to the next that counts as a jump [rad/s], the share of its speed limit at
+which a joint counts as at the limit (a plan stays below 98 %), and the share of its range within which it counts as at
+an end.
 """
+
+FIGURES = {
+    "off_plan_rad": ("off the plan [rad]", ("off_plan_rad",)),
+    "beyond_range_max": ("beyond joint ranges [rad]", ("joints", "beyond_range_max")),
+    "speed_over_limit_max": ("speed over its limit", ("joints", "speed_over_limit_max")),
+    "acceleration_max": ("acceleration [rad/s²]", ("joints", "acceleration_max")),
+    "acceleration_rms": ("acceleration, rms [rad/s²]", ("joints", "acceleration_rms")),
+    "jerk_rms": ("jerk, rms [rad/s³]", ("joints", "jerk_rms")),
+    "slip_mm_max": ("feet slip [mm]", ("feet", "slip_mm_max")),
+    "float_mm_max": ("feet above floor [mm]", ("feet", "float_mm_max")),
+    "below_floor_mm_max": ("soles below floor [mm]", ("feet", "below_floor_mm_max")),
+    "penetration_mm_max": ("shapes overlap [mm]", ("shapes", "penetration_mm_max")),
+    "limb_error_mm_mean": ("limb error, mean [mm]", ("tracking", "limb_error_mm_mean")),
+    "segment_angle_deg_mean": ("segments off, mean [deg]", ("tracking", "segment_angle_deg_mean")),
+    "pelvis_angle_deg_mean": ("pelvis off, mean [deg]", ("tracking", "trunk_angle_deg", "pelvis")),
+    "chest_angle_deg_mean": ("chest off, mean [deg]", ("tracking", "trunk_angle_deg", "chest")),
+}
+"""Figures of summaries and pages by name: what a page calls each, and its keys in a report."""
 
 
 def report(result: Retargeted) -> dict[str, Any]:
-    """Return the figures of a motion, recomputed by MuJoCo: lengths in mm, angles in rad except ``segment_angle_deg``.
+    """Return the figures of a motion, recomputed by MuJoCo: lengths in mm, angles in rad unless the name ends in deg.
 
-    ``joints``: largest excess beyond ranges and speed limits, share of frames with a joint at its speed limit,
-    accelerations and jerks (``rms``: root mean square over joints and frames), and frames with a speed jump over 15
-    rad/s. ``feet``: distance of contact points from their landing place (``slip``), their height (``float``), and depth
-    of soles below the floor. ``balance``: in double support, the share of frames with the centre of mass over the
-    support polygon, and its least distance inside the edge (negative outside). ``shapes``: depth of overlaps between
-    the profile's capsules. ``tracking``: keypoint errors per limb, at the scale that fits each limb best, and the angle
-    between the person's segments and the robot's. ``touches``: distance of joints from their place on what they hold.
-    ``notes``: sentences on violated bounds, on clips that are too fast for the joints, and on clips whose feet stand in
-    less than 20 % of the frames.
+    - ``joints``: largest excess beyond ranges and speed limits, share of frames with a joint at its speed limit, share
+      of frames in which each joint is within 1 % of an end of its range, accelerations and jerks (``rms``: root mean
+      square over joints and frames), and frames with a speed jump over 15 rad/s.
+    - ``feet``: distance of contact points from their landing place (``slip``), their height (``float``), and depth of
+      soles below the floor.
+    - ``balance``: in double support, the share of frames with the centre of mass over the support polygon, and its
+      least distance inside the edge (negative outside).
+    - ``shapes``: depth of overlaps between the profile's capsules.
+    - ``tracking``: keypoint errors per limb, at the scale that fits each limb best; mean angles between the person's
+      segments and the robot's; ``trunk_angle_deg``: those of the orientations of pelvis and chest, and of the line from
+      hips to shoulders (None without these); ``other_hand``: whether a left hand follows a right one or the other way
+      round.
+    - ``touches``: distance of joints from their place on what they hold.
+    - ``notes``: sentences on violated bounds, on clips that are too fast for the joints, on a trunk that leans over 10
+      degrees away from the person's, on joints at an end of their range in most frames, on a left hand that follows a
+      right one, and on clips whose feet stand in less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, in_model(result.robot, result.q))
     figures = {
@@ -49,10 +80,15 @@ def report(result: Retargeted) -> dict[str, Any]:
         "feet": _feet(places, result),
         "balance": _balance(places.soles, places.center, result.contact),
         "shapes": {"penetration_mm_max": _penetration(result, places.capsules)},
-        "tracking": _tracking(result, places.keypoints),
+        "tracking": _tracking(result, places),
         "touches": {"off_mm_max": _off_touch(result, places.keypoints)},
     }
     return {**figures, "notes": notes(figures)}
+
+
+def picked(figures: Any) -> dict[str, float | None]:
+    """Return the figures of a report that ``FIGURES`` names."""
+    return {name: functools.reduce(operator.getitem, path, figures) for name, (_, path) in FIGURES.items()}
 
 
 def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -61,6 +97,13 @@ def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray
     dofs = [robot.joint_dof_index(name) for name in names]
     low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
     return result.q[:, [robot.joint_qpos_index(name) for name in names]], low, high, fast
+
+
+def at_ends(result: Retargeted) -> Bool[np.ndarray, "F joints"]:
+    """Return whether each named joint is at an end of its range. (F, joints)."""
+    q, low, high, _ = joint_tracks(result)
+    room = np.where(np.isfinite(high - low), AT_END * (high - low), 0.0)
+    return ((q <= low + room) | (q >= high - room)) & (high > low)
 
 
 def _joints(result: Retargeted) -> dict[str, Any]:
@@ -73,6 +116,7 @@ def _joints(result: Retargeted) -> dict[str, Any]:
         "beyond_range_max": float(max(0.0, (low - q).max(), (q - high).max())),
         "speed_over_limit_max": float((np.abs(speed) / fast).max()),
         "at_speed_limit_share": float((np.abs(speed) > AT_SPEED * fast).any(1).mean()),
+        "at_end_share": {name: float(own) for name, own in zip(names, at_ends(result).mean(0), strict=True) if own},
         "acceleration_max": float(change.max() * fps),
         "acceleration_max_joint": names[worst],
         "acceleration_rms": _rms(change) * fps,
@@ -176,7 +220,8 @@ def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "
     mujoco.mj_kinematics(model, data)
 
 
-def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, Any]:
+def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:
+    robot = places.keypoints
     person = {name: result.human[:, k] for k, name in enumerate(result.human_names)}
     errors = {}
     chains = {
@@ -197,7 +242,28 @@ def _tracking(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) ->
         "limb_error_mm_mean": float(np.mean(list(errors.values()))),
         "segment_angle_deg": angles,
         "segment_angle_deg_mean": float(np.mean(list(angles.values()))),
+        "trunk_angle_deg": _trunk(result, places, person),
+        "other_hand": result.profile.is_hand and is_other_hand(result.robot, result.profile, person),
     }
+
+
+def _trunk(result: Retargeted, places: Places, person: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, float | None]:
+    """Return mean angles [deg] between person and robot: of pelvis, chest and line from hips to shoulders."""
+    robot, profile = result.robot, result.profile
+    if profile.is_hand:
+        return dict.fromkeys(("pelvis", "chest", "hips-shoulders"))
+    home = find_places(robot, profile, np.asarray(robot.mujoco_qpos(robot.q0))[None]).turns[0, :2]
+    turns = places.turns[:, :2] @ np.swapaxes(home, -1, -2) @ facing_at_home(robot, profile.across)
+    off = Rotation.from_matrix((np.swapaxes(turns, -1, -2) @ result.turns).reshape(-1, 3, 3)).magnitude()
+    pelvis, chest = np.degrees(off.reshape(-1, 2).mean(0))
+    ends = [f"{side}_{role}" for role in ("hip", "shoulder") for side in SIDES]
+    lines = [
+        points[ends[2]] + points[ends[3]] - points[ends[0]] - points[ends[1]]
+        for points in (person, places.keypoints)
+        if set(ends) <= set(points)
+    ]
+    line = _angle(*lines) if len(lines) == 2 else None
+    return {"pelvis": float(pelvis), "chest": float(chest), "hips-shoulders": line}
 
 
 def _off_touch(result: Retargeted, robot: dict[str, Float[np.ndarray, "F 3"]]) -> float | None:

@@ -30,6 +30,7 @@ class Retargeted:
         q: configurations of ``robot``. (F, nq)
         human: positions of the person's joints, floor at height 0 [m]. (F, J, 3)
         human_names: roles of these joints, and ``root``, the midpoint of the hips.
+        turns: forward, left and up axes of the person's pelvis and chest as columns. (F, 2, 3, 3)
         contact: whether left heel, left toe, right heel and right toe stand, or the points of ``Profile.standing`` of a
             robot of another shape. (F, 4)
         iterations: iterations of the plan; 0 for a live stream.
@@ -45,6 +46,7 @@ class Retargeted:
     q: Float[np.ndarray, "F nq"]
     human: Float[np.ndarray, "F J 3"]
     human_names: tuple[str, ...]
+    turns: Float[np.ndarray, "F 2 3 3"]
     contact: Bool[np.ndarray, "F 4"]
     iterations: int
     cost: tuple[float, float]
@@ -89,6 +91,7 @@ def as_retargeted(
         q=q,
         human=np.stack([*person.points.values(), person.root], 1),
         human_names=(*person.points, "root"),
+        turns=np.stack([person.pelvis, person.torso], 1),
         contact=person.contact,
         iterations=0,
         cost=(0.0, 0.0),

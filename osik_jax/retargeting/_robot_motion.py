@@ -87,8 +87,9 @@ class RobotMotion:
             raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
         if not source.is_file():
             raise FileNotFoundError(f"no such file: {source}")
-        lines = enumerate(source.read_text().splitlines(), 1)
-        rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line]
+        lines = enumerate(source.read_text(encoding="utf-8-sig").splitlines(), 1)
+        # a spreadsheet writes an empty line as commas
+        rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line.strip(" ,")]
         joints = len(joint_names)
         fixed = bool(rows) and len(rows[0]) == joints
         ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+import numpy as np
+from jaxtyping import Float
+
 from .._errors import OsikValueError, unknown_name
-from ._roles import FINGERS, HAND, NEEDED, OPTIONAL, SIDES
+from ._roles import CHAINS, FINGERS, HAND, NEEDED, OPTIONAL, SIDES
 
 ROLES = (*NEEDED, *OPTIONAL, *HAND)
 """All roles: a person's joints and points in retargeting."""
@@ -39,50 +43,98 @@ _SUFFIX = re.compile(r"(joint|jnt|bone)$")
 _FIRST = re.compile(r"0*1(?=(left|l|左|right|r|右)?$)")
 """Number 1 of the first of several bones in a row, as in MakeHuman's ``upperleg01.L``."""
 _LONGEST_LIST = 400
+_SAME = 1e-3
+"""Two joints closer to each other than this share of the clip's largest distance from the mean joint are at one point.
+"""
 
 Part = tuple[str, str]
 """Side ("" for the trunk) and word of the tables."""
 
 
 def find_roles(
-    joint_names: tuple[str, ...], mapping: Mapping[str, str] | None = None, needed: Sequence[str] = NEEDED
+    joint_names: tuple[str, ...],
+    mapping: Mapping[str, str] | None = None,
+    needed: Sequence[str] = NEEDED,
+    positions: Float[np.ndarray, "F J 3"] | None = None,
 ) -> dict[str, str]:
     """Return the clip's joint for each of a person's roles.
 
     Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after. A
-    prefix common to all used names (``mixamorig:``, ``Character1_``, ``Bip01``) is ignored.
+    prefix common to all used names (``mixamorig:``, ``Character1_``, ``Bip01``) is ignored, and so is a word for joint
+    at the end. A name without such a word goes first (CMU has ``LHipJoint`` in the pelvis, and ``LeftHip``), and a
+    joint at one point with another limb joint goes last.
 
     Args:
         joint_names: joint names of the clip.
         mapping: role (``ROLES``) to joint name of the clip; None: inferred from the names.
         needed: roles that have to be found.
+        positions: positions of the joints; None: names alone count.
 
     Returns:
         role to joint name of the clip.
 
     Raises:
         KeyError: the mapping has a role or a joint that does not exist.
-        ValueError: joints that retargeting needs are not found; the message says which are, and which are not.
+        ValueError: joints that retargeting needs are not found, or two are at one point; the message says which.
     """
-    if mapping is not None:
-        return _checked(joint_names, mapping, needed)
+    places = {} if positions is None else _places(joint_names, positions)
+    roles = _by_name(joint_names, needed, places) if mapping is None else _checked(joint_names, mapping, needed)
+    sided = [role for role in roles if role in needed or role.startswith(SIDES)]
+    for a, b in itertools.combinations(sided, 2):
+        if _spans(a, b) and _is_at(places, roles[a], roles[b]):
+            raise OsikValueError(
+                f"{a} ({roles[a]}) and {b} ({roles[b]}) are at one point in all frames; say which joint is which with "
+                "mapping={role: joint}"
+            )
+    return roles
+
+
+def _places(joint_names: tuple[str, ...], positions: Float[np.ndarray, "F J 3"]) -> dict[str, np.ndarray]:
+    """Return the positions of each joint by name, over the clip's largest distance from the mean joint. (F, 3) each."""
+    beside = positions - positions.mean(1, keepdims=True)
+    return dict(zip(joint_names, np.moveaxis(beside / max(np.abs(beside).max(), 1e-12), 1, 0), strict=True))
+
+
+def _spans(a: str, b: str) -> bool:
+    """Return whether two landmarks give a direction: joints of one limb, left and right joints, or a hand's."""
+    (side, _, part), (other, _, second) = a.partition("_"), b.partition("_")
+    arms = [joint in CHAINS["arm"] for joint in (part, second)]
+    return side not in SIDES or part == second or (side == other and arms[0] == arms[1])
+
+
+def _is_at(places: Mapping[str, np.ndarray], a: str, b: str) -> bool:
+    """Return whether two joints are at one point in all frames; False if their places are unknown."""
+    return a in places and float(np.abs(places[a] - places[b]).max()) < _SAME
+
+
+def _by_name(joint_names: tuple[str, ...], needed: Sequence[str], places: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Return the clip's joint for each role that its names tell, with the bone lengths that ``places`` show."""
     if "wrist" in needed:
         fingers = {role: name for name in joint_names for role, word in _hand_words() if _plain(name).endswith(word)}
         _check_complete(joint_names, fingers, needed)
         return fingers
-    groups: dict[str, dict[Part, str]] = {}
-    for name in joint_names:
+    groups: dict[str, dict[Part, list[str]]] = {}
+    for name in sorted(joint_names, key=lambda name: _plain(name) != _letters(name)):
         for prefix, part in _readings(_plain(name)):
-            groups.setdefault(prefix, {}).setdefault(part, name)
-    found = [_assigned(groups[prefix]) for prefix in sorted(groups, key=len)]
-    best = max(found, key=lambda roles: (sum(role in roles for role in needed), len(roles)), default={})
+            groups.setdefault(prefix, {}).setdefault(part, []).append(name)
+    best: dict[str, str] = {}
+    for own in (places, {}):  # names alone come last: the caller then tells two joints at one point
+        found = [_assigned(groups[prefix], own) for prefix in sorted(groups, key=len)]
+        best = max(found, key=lambda roles: (sum(role in roles for role in needed), len(roles)), default={})
+        if set(needed) <= set(best):
+            return best
     _check_complete(joint_names, best, needed)
     return best
 
 
+def _letters(name: str) -> str:
+    """Return a name in lower case, without separators."""
+    return "".join(c for c in unicodedata.normalize("NFKC", name).lower() if c.isalnum())
+
+
 def _plain(name: str) -> str:
     """Return a name in lower case, without separators and without a trailing word for joint."""
-    return _SUFFIX.sub("", "".join(c for c in unicodedata.normalize("NFKC", name).lower() if c.isalnum()))
+    return _SUFFIX.sub("", _letters(name))
 
 
 @functools.cache
@@ -132,17 +184,20 @@ def _readings(plain: str) -> Iterator[tuple[str, Part]]:
                 yield first[len(own) : start], (side, first[start:])
 
 
-def _assigned(parts: Mapping[Part, str]) -> dict[str, str]:
-    """Assign to each role the first of its words that occurs and is not taken by an earlier role."""
-    roles = {}
+def _assigned(parts: Mapping[Part, Sequence[str]], places: Mapping[str, np.ndarray]) -> dict[str, str]:
+    """Assign to each role the first of its words that is not taken and has a joint apart from the other limb joints."""
+    roles: dict[str, str] = {}
     for side in SIDES:
-        taken: set[str] = set()
+        other = [name for (own, _), names in parts.items() if own not in ("", side) for name in names]
+        taken: dict[str, str] = {}
         for role, words in _LIMB_WORDS.items():
-            word = next((w for w in words.split() if (side, w) in parts and w not in taken), None)
-            if word is not None:
-                taken.add(word)
-                roles[f"{side}_{role}"] = parts[side, word]
-    return roles | _trunk({word: name for (side, word), name in parts.items() if not side})
+            for word in (word for word in words.split() if word not in taken):
+                apart = [*other, *taken.values()]
+                free = [n for n in parts.get((side, word), ()) if not any(_is_at(places, n, o) for o in apart)]
+                if free:
+                    roles[f"{side}_{role}"] = taken[word] = free[0]
+                    break
+    return roles | _trunk({word: names[0] for (side, word), names in parts.items() if not side})
 
 
 def _trunk(parts: Mapping[str, str]) -> dict[str, str]:

@@ -116,7 +116,7 @@ def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.nd
     without these.
     """
     try:
-        roles = find_roles(motion.joint_names) if roles is None else roles
+        roles = find_roles(motion.joint_names, positions=motion.positions) if roles is None else roles
     except OsikValueError:
         heads, feet = named(motion.joint_names, "head"), named(motion.joint_names, "foot", "ankle", "toe")
         if not heads or not feet:

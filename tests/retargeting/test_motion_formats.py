@@ -5,7 +5,7 @@ import pytest
 from motion_files import dancer
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import load_motion
+from osik_jax.retargeting import RobotMotion, load_motion
 from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._smpl import _TREE
 
@@ -141,6 +141,38 @@ def test_tables_of_motive(tmp_path, unit, scale, turns):
         turned = Rotation.from_quat(motion.rotations.reshape(-1, 4), scalar_first=True)
         expected = z_up @ matrices.reshape(-1, 3, 3) @ z_up.T
         np.testing.assert_allclose(turned.as_matrix(), expected, atol=1e-9)
+
+
+def as_saved_by_a_spreadsheet(lines):
+    """All lines with as many cells as the longest: empty lines are commas, also after the last."""
+    width = max(line.count(",") for line in lines)
+    return [line + "," * (width - line.count(",")) for line in [*lines, ""]]
+
+
+def test_tables_that_a_spreadsheet_saved(tmp_path):
+    file, figure = tmp_path / "take.csv", dancer(6)
+    for lines in (motive_table(figure), keypoint_table(figure)):
+        file.write_text("\n".join(lines) + "\n")
+        motion = load_motion(file)
+        saved = as_saved_by_a_spreadsheet([*lines, ",,"])
+        assert any(line and not line.strip(",") for line in saved)
+        file.write_text("\r\n".join(saved) + "\r\n", encoding="utf-8-sig")
+        again = load_motion(file)
+        assert again.joint_names == motion.joint_names and again.fps == motion.fps
+        np.testing.assert_array_equal(again.positions, motion.positions)
+    robot = ["0,0,1,0,0,0,1,0.5", "0,0,1,0,0,0,1,0.6"]
+    file.write_text("\r\n".join([*robot, ",,,,,,,"]) + "\r\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(RobotMotion.load(file, joint_names=("knee",), fps=30.0).qpos[:, 7], [0.5, 0.6])
+
+
+def keypoint_table(figure):
+    """The lines of a table of keypoints."""
+    positions, _ = figure.forward()
+    headings = ["time", *(f"{name}.{axis}" for name, _, _ in figure.joints for axis in "xyz"), "", ""]
+    rows = np.column_stack(
+        [np.arange(len(positions)) / figure.fps, positions[..., [2, 0, 1]].reshape(len(positions), -1)]
+    )
+    return [",".join(headings), *(",".join(map(repr, row.tolist())) for row in rows)]
 
 
 def test_gaps_and_wrong_headings_of_motive_are_told(tmp_path):

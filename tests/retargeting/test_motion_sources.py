@@ -11,6 +11,7 @@ from motion_files import (
     seen,
     turned_dancer,
     turned_up,
+    with_between,
     with_rest,
     write_bvh,
 )
@@ -63,7 +64,19 @@ RIGIFY = dict(zip(NAMES, (
 UNREAL = dict(zip(NAMES, (
     "pelvis", "spine_01", "neck_01", "head", "upperarm_l", "lowerarm_l", "hand_l", "upperarm_r", "lowerarm_r", "hand_r",
     "thigh_l", "calf_l", "foot_l", "ball_l", "thigh_r", "calf_r", "foot_r", "ball_r"), strict=True))  # fmt: skip
+FRIENDLY = dict(Arm="Shoulder", ForeArm="Elbow", Hand="Wrist", UpLeg="Hip", Leg="Knee", Foot="Ankle", ToeBase="Toe")
+
+
+def with_hip_joints(own):
+    """CMU's skeleton as 3ds Max has it: LHipJoint and RHipJoint are at the pelvis, above LeftHip and RightHip."""
+    names = {f"{side}{part}": f"{side}{theirs}" for side in ("Left", "Right") for part, theirs in FRIENDLY.items()}
+    for side in ("Left", "Right"):
+        own = with_between(own, f"{side[0]}HipJoint", f"{side}UpLeg", 0.0)
+    return renamed(own, lambda name: names.get(name, name).replace("Spine", "Chest"))
+
+
 WRITTEN = {
+    "CMU, 3ds Max": lambda path: write_bvh(path, with_hip_joints(turned_dancer()), 0.0254 / 0.45),
     "CMU": lambda path: write_bvh(path, with_rest(turned_dancer(), no_turns(), "ZYX"), 0.0254 / 0.45),
     "Mixamo, cm, A-pose": lambda path: write_bvh(
         path, renamed(with_more(with_rest(turned_dancer(), a_pose())), lambda name: f"mixamorig:{name}"), 0.01
@@ -170,3 +183,28 @@ def test_an_end_site_at_its_parent_is_no_joint(tmp_path):
     motion = load_motion(write_bvh(tmp_path / "clip.bvh", turned_dancer()))
     assert sorted(motion.joint_names) == sorted(NAMES)
     assert isinstance(motion, HumanMotion) and set(NEEDED) <= set(find_roles(motion.joint_names))
+
+
+def as_clip(places, names=NAMES):
+    """Keypoints of the dancer, with some joints at the places of others."""
+    motion = HumanMotion("clip", 30.0, tuple(NAMES), turned_dancer().forward()[0][..., [2, 0, 1]])
+    positions = motion.positions.copy()
+    for name, other in places.items():
+        positions[:, NAMES.index(name)] = motion.track(other)
+    return names, positions
+
+
+@pytest.mark.parametrize("pair", [("LeftUpLeg", "RightUpLeg"), ("LeftLeg", "LeftFoot"), ("RightHand", "RightForeArm")])
+def test_two_landmarks_at_one_point_are_told(pair):
+    names, positions = as_clip({pair[0]: pair[1]})
+    roles = find_roles(tuple(names))
+    both = f"\\({pair[0]}\\) and .*\\({pair[1]}\\)|\\({pair[1]}\\) and .*\\({pair[0]}\\)"
+    for mapping in (None, roles):
+        with pytest.raises(ValueError, match=f"({both}) are at one point in all frames; say which"):
+            find_roles(tuple(names), mapping, positions=positions)
+    near = positions.copy()
+    near[0, NAMES.index(pair[0])] += 0.1  # in one frame they are apart
+    assert find_roles(tuple(names), positions=near) == roles
+    # such a toe is no toe, and is made up as where there is none
+    names, positions = as_clip({"LeftToeBase": "LeftFoot"})
+    assert "left_toe" not in find_roles(tuple(names), positions=positions)

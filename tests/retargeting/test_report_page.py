@@ -1,6 +1,7 @@
 """The page of ``osik retarget --report``: what it says is what MuJoCo and the contacts say, and it needs no network."""
 
 import csv
+import json
 import re
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import osik_jax as osik
 from osik_jax.cli._retarget import Retarget
 from osik_jax.retargeting import Retargeter, load_profile, report
 from osik_jax.retargeting._command import write_folder
+from osik_jax.retargeting._page import write_index
 from osik_jax.viewer.live._playback import read_motion
 
 FRAMES = 20
@@ -87,24 +89,38 @@ def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, ca
     write_bvh(clips / "dance <1>.bvh", dancer(FRAMES), 0.01)
     write_bvh(clips / "dance 2.bvh", dancer(FRAMES), 0.01)
     (clips / "broken.csv").write_text("time,Hips.x\n0,1\n1,2\n")
+    for other in ("walk <2>.txt", "07.asf", ".hidden"):
+        (clips / other).write_text("")
+    (clips / "more").mkdir()
 
     def run() -> int:
         return Retarget(clip=str(clips), robot="nao", out=out, report=True).run()
 
     assert run() == 1
     index = (out / "index.html").read_text(encoding="utf-8")
-    links = re.findall(r'<td><a href="(.*?)">(.*?)</a><td>', index)
+    links = re.findall(r'<tr><td><a href="(.*?)">(.*?)</a><td', index)
     assert links == [("dance%202/report.html", "dance 2"), ("dance%20%3C1%3E/report.html", "dance &lt;1&gt;")]
     rows = re.findall(r"<tr>(.*)", index)
-    assert (
-        rows[0].startswith("<th>clip<th>look at<th>frames") and rows[1].startswith("<td>broken<td>") and len(rows) == 4
-    )
-    assert "NAME.x, NAME.y and NAME.z" in rows[1] and " src=" not in index
+    assert rows[0].startswith("<th>clip<th>frames<th>") and rows[1].startswith("<td>broken<td class=failed")
+    assert "NAME.x, NAME.y and NAME.z" in rows[1] and " src=" not in index and "width=device-width" in index
     with (out / "index.csv").open(newline="", encoding="utf-8") as file:
         table = list(csv.reader(file))
     assert [row[0] for row in table[2:]] == ["dance 2", "dance <1>"]
-    slip = float(table[2][table[0].index("slip_mm_max")])
-    assert f"<td>{slip:.4g}" in rows[2]
+    for name, title in (
+        ("acceleration_max", "acceleration [rad/s²]"),
+        ("chest_angle_deg_mean", "chest off, mean [deg]"),
+    ):
+        assert f"<th>{title}" in rows[0] and not set(table[0][4:]) & set(re.findall("<th>([^<]*)", rows[0]))
+        assert f'<td title="{title}">{float(table[2][table[0].index(name)]):.2f}' in rows[2]
+    # what is no clip is told
+    assert "no clips, and not read: more/, walk <2>.txt\n" in capsys.readouterr().out
+    assert "<p>No clips: more/, walk &lt;2&gt;.txt" in index
+    # notes stand below the figures of their clip
+    noted = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    noted["notes"] = {"dance <1>": ["feet slip by <1> mm"]}
+    write_index(noted, out / "index.html")
+    rows = re.findall(r"<tr.*", (out / "index.html").read_text(encoding="utf-8"))
+    assert "dance &lt;1&gt;</a>" in rows[2] and "<li>feet slip by &lt;1&gt; mm</ul>" in rows[3] and "dance 2" in rows[4]
     page = out / "dance 2" / "report.html"
     assert "<h1>dance 2</h1>" in page.read_text(encoding="utf-8")
     # the same command makes what is missing, and nothing else

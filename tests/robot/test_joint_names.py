@@ -4,6 +4,7 @@ import itertools
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from refusals import refuses
 
@@ -43,8 +44,8 @@ def joints_of(convention, spelled=lambda name: name, form=None, words=None):
     return tuple(dict.fromkeys(names)), roles
 
 
-def assert_found(names, roles):
-    found = find_roles(names)
+def assert_found(names, roles, positions=None):
+    found = find_roles(names, positions=positions)
     assert {role: found.get(role) for role in (*NEEDED, "chest")} == {"chest": None} | roles
 
 
@@ -74,6 +75,28 @@ def test_the_word_for_the_side_stands_before_or_after(convention):
     forms = ("{side}{name}", "{side}_{name}", "{side} {name}", "{name}_{side}", "{name}{side}", "{name}.{side}")
     for form, sides in itertools.product(forms, (CAPITAL, LEFT_RIGHT, LETTER, SMALL)):
         assert_found(*joints_of(convention, form=form, words=sides))
+
+
+@pytest.mark.parametrize("convention", CONVENTIONS)
+def test_joints_at_one_point_do_not_change_what_a_convention_means(convention):
+    """All joints that are none of a limb's are in the pelvis, and so is a joint called as each limb's joint."""
+    names, roles = joints_of(convention)
+    limbs = [roles[role] for role in NEEDED]
+    spare = [name for name in (f"{name}Joint" for name in limbs) if name not in names]
+    names = tuple([*spare, *names])
+    positions = np.zeros((2, len(names), 3))
+    for name in limbs:
+        positions[:, names.index(name)] = np.random.default_rng(limbs.index(name)).normal(size=3)
+    found = find_roles(names, positions=positions)
+    assert {role: found[role] for role in NEEDED} == {role: roles[role] for role in NEEDED}
+    # the spare ones are apart as well, or are all there is
+    rng = np.random.default_rng(0)
+    assert_found(names, roles, rng.normal(size=positions.shape))
+    only = tuple(name for name in names if name not in limbs)
+    apart = find_roles(only, positions=rng.normal(size=(2, len(only), 3)))
+    assert {role: apart[role] for role in NEEDED} == {role: f"{roles[role]}Joint" for role in NEEDED}
+    with pytest.raises(ValueError, match="are at one point in all frames; say which joint is which"):
+        find_roles(only, positions=np.zeros((2, len(only), 3)))
 
 
 def test_the_error_names_what_is_found_and_what_is_not():

@@ -100,7 +100,7 @@ def turned_dancer(frames: int = 24, fps: float = 30.0) -> Figure:
 
 def seen(motion: HumanMotion) -> Person:
     """The person of a clip whose joints are told by their names."""
-    return read_person(motion, find_roles(motion.joint_names))
+    return read_person(motion, find_roles(motion.joint_names, positions=motion.positions))
 
 
 def assert_same_person(motion: HumanMotion, truth: Person, atol: float = 2e-8) -> Person:
