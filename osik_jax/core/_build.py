@@ -53,17 +53,18 @@ def build_if_changed() -> list[Path]:
         RuntimeError: as ``build``.
     """
     paths, mark = [library_path(level) for level in levels()], fingerprint()
-    return paths if all(_sources_of(path) == mark for path in paths) else build()
+    return paths if all(_is_current(path, mark) for path in paths) else build()
 
 
-def _sources_of(path: Path) -> str | None:
-    """Return the fingerprint that a library was built with, None where it cannot be loaded."""
+def _is_current(path: Path, mark: str) -> bool:
+    """Return whether a library has this fingerprint and can be loaded here.
+
+    A library of other sources is not loaded: this process would get it again in place of the one that replaces it.
+    """
     try:
-        sources = ctypes.CDLL(str(path)).osik_sources
-    except (OSError, AttributeError):  # of another platform, or no library of ours
-        return None
-    sources.restype = ctypes.c_char_p
-    return sources().decode()
+        return mark.encode() in path.read_bytes() and bool(ctypes.CDLL(str(path)))
+    except OSError:  # missing, or of another platform
+        return False
 
 
 def build(flags: tuple[str, ...] = ()) -> list[Path]:
@@ -84,13 +85,11 @@ def build(flags: tuple[str, ...] = ()) -> list[Path]:
         raise RuntimeError("the core is not built on Windows")
     if compiler is None:
         raise RuntimeError(f"no C++ compiler {name!r} on the PATH")
-    mark, text = fingerprint(), [str(path) for path in sources() if path.suffix == ".cpp"]
     running = {}
     for level, own in levels().items():
         out = library_path(level)
-        command = [compiler, *_FLAGS, *own, *flags, f'-DOSIK_SOURCES="{mark}"', "-shared", "-fPIC", *text]
         running[out] = subprocess.Popen(
-            [*command, "-o", str(part(out))], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+            command(compiler, part(out), *own, *flags), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
         )
     said = {out: process.communicate()[1] for out, process in running.items()}
     for out, process in running.items():
@@ -98,6 +97,13 @@ def build(flags: tuple[str, ...] = ()) -> list[Path]:
             raise RuntimeError(f"{name} failed with status {process.returncode}: {said[out][-800:]}")
         part(out).replace(out)  # at once, so that no process loads half a library
     return list(running)
+
+
+def command(compiler: str | Path, out: Path, *flags: str) -> list[str]:
+    """Return the command that compiles all sources into one library, with more flags for the compiler."""
+    text = [str(path) for path in sources() if path.suffix == ".cpp"]
+    mark = f'-DOSIK_SOURCES="{fingerprint()}"'
+    return [str(compiler), *_FLAGS, mark, "-shared", "-fPIC", *flags, *text, "-o", str(out)]
 
 
 def part(out: Path) -> Path:

@@ -43,7 +43,8 @@ template <class Call> void place(const Call& call) {
   const int bodies = call.result_size(0, 1), dofs = call.result_size(2, 1);
   const int nq = *call.integers(2), joints = (call.size(2, 0) - 1 - bodies - nq) / 2;  // nq: of MuJoCo's configuration
   Reader<const int*> integers{call.integers(2) + 1};
-  Tree<In> tree{bodies, joints, dofs};
+  Tree<In> tree{};
+  tree.bodies = bodies, tree.joints = joints, tree.dofs = dofs;
   tree.parents = integers.take(bodies), tree.types = integers.take(joints), tree.owners = integers.take(joints);
   const int* source = integers.take(nq);
   call.each_lane([&](int lane) {
@@ -112,7 +113,8 @@ template <class Call> void find_center_rows(const Call& call) {
     typename Call::Real point[3];
     const auto columns = center.find(call, lane, point + 0);
     Reader<In> numbers{call.in(7, lane)};
-    CenterGoal<In> goal{m, axes, turning};
+    CenterGoal<In> goal{};
+    goal.m = m, goal.axes = axes, goal.turning = turning;
     goal.target = numbers.take(m), goal.velocity = numbers.take(m), goal.weight = numbers.take(m), goal.gain = numbers.at;
     with_columns(columns, center.space.data() + 4 * center.bodies,
                  [&](auto columns) { center_rows(goal, point + 0, columns, nv, rows_of(call, lane)); });

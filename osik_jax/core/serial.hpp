@@ -2,6 +2,7 @@
 #pragma once
 #include <cmath>
 #include <type_traits>
+#include <utility>
 
 #include "team.hpp"
 
@@ -204,16 +205,21 @@ template <class R> struct Serial {
   // the totals of LANES vectors, as one vector
   template <int K> OSIK_FN static Value totals_of(const Value* x) {
     if constexpr (K == 1) return x[0];
-    else {  // lane e of the result has the sum over one of K groups of lanes, of vector e % K
-      const Value a = totals_of<K / 2>(x), b = totals_of<K / 2>(x + K / 2);
-      Mask low, high;
-      for (int e = 0; e < LANES; ++e) {
-        const bool second = e % K >= K / 2;
-        const int own = second ? LANES : 0, lower = e - (second ? K / 2 : 0);
-        low[e] = own + lower, high[e] = own + lower + K / 2;
-      }
-      return __builtin_shuffle(a, b, low) + __builtin_shuffle(a, b, high);
-    }
+    else return sum_of_groups<K>(totals_of<K / 2>(x), totals_of<K / 2>(x + K / 2), std::make_integer_sequence<int, LANES>());
+  }
+  // lane e of the result has the sum over one of K groups of lanes, of vector e % K; a has the sums over K / 2 groups of the
+  // first K / 2 vectors, b those of the last
+  template <int K, int... e> OSIK_FN static Value sum_of_groups(Value a, Value b, std::integer_sequence<int, e...>) {
+    constexpr auto low = [](int lane) { return lane % K < K / 2 ? lane : LANES + lane - K / 2; };
+    return shuffled<low(e)...>(a, b) + shuffled<low(e) + K / 2 ...>(a, b);
+  }
+  // lanes of two vectors, those of b numbered after those of a
+  template <int... lane> OSIK_FN static Value shuffled(Value a, Value b) {
+#if defined(__clang__)
+    return __builtin_shufflevector(a, b, lane...);
+#else  // before version 12, GCC has no __builtin_shufflevector
+    return __builtin_shuffle(a, b, Mask{lane...});
+#endif
   }
   // the first `count` numbers of a vector in memory, then zeros; the places of these zeros are read too
   OSIK_FN static Value first_of(const Real* a, int count) {

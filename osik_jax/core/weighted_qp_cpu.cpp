@@ -28,9 +28,9 @@ void solve_weighted_qps(const xla::Call& call) {
   const int* guess = call.in<int>(2);
   QPAnswer<double> a{call.out<double>(0), call.out<double>(1), call.out<int>(2), call.out<int>(3)};
   for (int k = 0; k < batch; ++k) {
-    QPData<double> d{matrix, packed};
+    QPData<double> d{};
     const double* at = read(d, packed, s);
-    d.guess = guess, d.tolerance = tolerance[k];
+    d.matrix = matrix, d.guess = guess, d.tolerance = tolerance[k];
     method.solve(d, a);
     matrix += size_t(m) * n, packed = at, guess += N;
     a.x += n, a.multipliers += p, a.active += N, a.report += 3;
@@ -47,8 +47,8 @@ void judge_weighted_qps(const xla::Call& call) {
   const double* packed = call.in<double>(1);
   for (size_t k = 0; k < size_t(batch); ++k) {
     const double* tolerances = call.in<double>(5) + 2 * k;
-    QPData<double> d{call.in<double>(0) + k * m * n};
-    packed = read(d, packed, s), d.tolerance = tolerances[0];
+    QPData<double> d{};
+    packed = read(d, packed, s), d.matrix = call.in<double>(0) + k * m * n, d.tolerance = tolerances[0];
     const Certificate found = certificate.judge(d, call.in<double>(2) + k * n, call.in<double>(3) + k * p,
                                                 call.in<int>(4) + k * N, tolerances[1]);
     call.out<int>(0)[k] = found.holds && found.is_exact, call.out<double>(1)[k] = found.residual;

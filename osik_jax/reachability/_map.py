@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ..scaling._chunk_file import whole_file
+from .._whole_file import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -57,7 +56,7 @@ class ReachabilityMap:
             OSError: it cannot be written.
         """
         arrays = {field.name: np.asarray(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        with whole_file(Path(path)) as partial, partial.open("wb") as file:
+        with whole_file(path) as file:
             np.savez_compressed(file, allow_pickle=False, format=np.array(_FORMAT), **arrays)
 
     def figure(self, at: tuple[float, float, float] | None = None) -> Figure:

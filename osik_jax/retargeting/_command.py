@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._whole_file import write_text
 from ..robot import Robot
 from ._film import film
 from ._fit import Fit, fit
@@ -82,7 +83,5 @@ def write_motion(
 
 
 def write_json(figures: dict[str, Any], path: Path) -> None:
-    """Write a JSON file through a temporary file, so that a file of this name is always complete."""
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(figures, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    partial.replace(path)
+    """Write a JSON file, so that a file of this name is always complete."""
+    write_text(path, json.dumps(figures, indent=2, allow_nan=False) + "\n")

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._errors import OsikValueError, unknown_name
+from .._whole_file import write_text
 from ..robot import Robot
 from ._goals import Weights
 from ._guess import guess_profile
@@ -39,7 +40,7 @@ def load_profile(path: str | os.PathLike[str]) -> Profile:
 
 def save_profile(profile: Profile, path: str | os.PathLike[str]) -> None:
     """Write a profile as a TOML file for ``load_profile``."""
-    Path(path).write_text(profile_text(profile), encoding="utf-8")
+    write_text(path, profile_text(profile))
 
 
 def find_profile(robot: Robot) -> Profile:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Self
 
 import equinox as eqx
@@ -13,6 +12,7 @@ import jax
 import mujoco
 from jaxtyping import Array, ArrayLike, DTypeLike, Num
 
+from .._whole_file import write_text
 from ..numerics._arguments import float_dtype
 from . import loading
 from ._configuration import check_configuration, with_joints
@@ -322,7 +322,7 @@ class Robot(RobotModel):
         """
         text = loading.to_mjcf(self)
         if path is not None:
-            Path(path).write_text(text, encoding="utf-8")
+            write_text(path, text)
         return text
 
     def check_configuration(self, q: Num[ArrayLike, " nq"] | Sequence[float], name: str = "q") -> None:

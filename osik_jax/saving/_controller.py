@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._errors import OsikValueError, OsikWarning
+from .._errors import OsikError, OsikValueError, OsikWarning
+from .._whole_file import write_text
 from ..control._checks import check_setting, check_tasks, checked_limits
 from ..control._packed_step import packed_step
 from ..control._step import build_problem
@@ -31,6 +33,7 @@ from ..tasks import Task
 from ._parts import decode, encode
 
 _FORMAT = "osik-jax controller 2"
+_CHECKSUM = ',\n "checksum": '
 _ACCURACY = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-4}
 """Largest difference of a step's numbers, relative to the largest of each array, that is roundoff of an MJCF."""
 
@@ -70,7 +73,7 @@ def save_controller(
 
     The file's last two entries are for programs without Python (``core/c``): the step of the controller that
     ``load_controller`` returns, as numbers for the compiled core, and a checksum of the text before them.
-    ``load_controller`` ignores both: it still reads a file that was edited by hand, which those programs refuse.
+    To edit the file by hand, remove both: ``load_controller`` reads it, and those programs refuse it.
 
     Args:
         path: of the file.
@@ -87,7 +90,7 @@ def save_controller(
     Raises:
         TypeError, ValueError: as in ``solve``; a task, limit or scheme of a class that is not in osik_jax; a robot that
             its source does not make again, or whose MJCF gives other numbers, for example the distances of its meshes.
-        OSError: the file cannot be written.
+        OSError: the file cannot be written. An older file of this name is unchanged.
     """
     check_setting("save_controller(path, robot, tasks)", robot, scheme, dt)
     check_tasks(tasks, robot)
@@ -104,14 +107,19 @@ def save_controller(
     saved = Controller(robot, dict(tasks), used, given, content["dt"])
     if source is None:
         saved = _check_written(saved, content)
-    Path(path).write_text(_with_packed_step(json.dumps(content, indent=1), saved), encoding="utf-8")
+    write_text(path, _with_packed_step(json.dumps(content, indent=1), saved))
 
 
 def _with_packed_step(text: str, saved: Controller) -> str:
     """Return the file's text with its last two entries: the step for programs without Python, and a checksum."""
     step = packed_step(saved.robot, saved.tasks, saved.scheme, saved.limits, saved.dt)
     text = f'{text[:-2]},\n "core": {json.dumps(step, ensure_ascii=False)}'
-    return f'{text},\n "checksum": {zlib.crc32(text.encode())}\n}}\n'
+    return text + _CHECKSUM + _checksum(text)
+
+
+def _checksum(text: str) -> str:
+    """Return the end of a file whose text before its checksum is this."""
+    return f"{zlib.crc32(text.encode())}\n}}\n"
 
 
 def load_controller(path: str | os.PathLike[str]) -> Controller:
@@ -119,16 +127,42 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
 
     Raises:
         FileNotFoundError: no such file, or the robot's file is not where it was.
-        ValueError: the file is no controller, or one of another version; the robot's file has changed.
+        ValueError: the file is no controller, or one of another version, is damaged, or was edited to something that
+            ``solve`` does not take; the robot's file has changed.
     """
+    content = _content(path)
     try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        found = _made(content, _robot(content["robot"]))
+        check_setting("load_controller(path)", found.robot, found.scheme, found.dt)
+        with _no_own_warnings():  # check_setting has given them
+            jax.eval_shape(lambda q: build_problem(found.robot, q, found.tasks, limits=found.limits), found.robot.q0)
+    except OSError:  # of the robot's file
+        raise
+    except KeyError as problem:
+        said = problem if isinstance(problem, OsikError) else f"its entry {problem} is missing"
+        raise OsikValueError(f"{path} cannot be loaded: {said}") from problem
+    except Exception as problem:  # whatever an edited file leads the constructors to
+        raise OsikValueError(f"{path} cannot be loaded: {problem}") from problem
+    return found
+
+
+def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return the content of a file; raise ValueError if it is no controller, or not as it was written."""
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+        content = json.loads(text)
         known = isinstance(content, dict) and content.get("format") == _FORMAT
-    except ValueError:
+    except (RecursionError, ValueError):
         known = False
     if not known:
-        raise OsikValueError(f"{path} is no controller that save_controller wrote ({_FORMAT})")
-    return _made(content, _robot(content["robot"]))
+        raise OsikValueError(f"{path} is no controller that save_controller wrote ({_FORMAT}), or is damaged")
+    before, _, end = text.rpartition(_CHECKSUM)
+    if not content.keys().isdisjoint(("core", "checksum")) and end != _checksum(before):
+        raise OsikValueError(
+            f"{path} is not as save_controller wrote it: save it again, or, if you edited it, remove its last two "
+            'entries, "core" and "checksum"'
+        )
+    return content
 
 
 def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
@@ -196,9 +230,15 @@ def _arrays_are_close(one: Any, other: Any) -> bool:
 
 
 def _quietly_loaded(described: Mapping[str, Any]) -> Robot:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)  # what the robot does not keep was said when it was loaded
+    with _no_own_warnings():  # what the robot does not keep was said when it was loaded
         return _loaded(described)
+
+
+@contextlib.contextmanager
+def _no_own_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OsikWarning)
+        yield
 
 
 def _robot(described: Mapping[str, Any]) -> Robot:

@@ -15,6 +15,7 @@ import numpy as np
 
 from .._errors import OsikValueError
 from ..limits import NoLimits, no_limits
+from ..numerics._replace import Replaceable
 from ..robot._tree import KinematicTree
 
 _PACKAGE = "osik_jax."
@@ -115,6 +116,8 @@ def _made(cls: Any, fields: dict[str, Any]) -> Any:
     made = object.__new__(cls)
     for name, value in fields.items():
         object.__setattr__(made, name, value)
+    if isinstance(made, Replaceable):  # raises for numbers that the constructor would refuse
+        made.replace(**{name: getattr(made, name) for name in made.replaceable})
     return made
 
 

@@ -6,15 +6,15 @@ import contextlib
 import errno
 import os
 import re
-import uuid
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
+from .._whole_file import whole_file
 
 _RESULT = "result."
 _JOB, _PART, _NAMES, _LANES = "job", "part", "names", "lanes"
@@ -98,10 +98,8 @@ def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arr
         _LANES: np.array(blocks, np.int64).reshape(-1, 2),
     }
     named = {_RESULT + name: array for name, array in arrays.items()}
-    with whole_file(folder / part.file_name) as partial, partial.open("wb") as file:
+    with job_file(folder / part.file_name) as file:
         np.savez(file, allow_pickle=False, **marks, **named)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _check_type(name: str, dtype: np.dtype) -> None:
@@ -112,18 +110,13 @@ def _check_type(name: str, dtype: np.dtype) -> None:
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a unique temporary name to write a file under; rename the file to its own name if all goes well."""
-    partial = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
+def job_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a file of a job for writing inside the block, as ``whole_file`` does; errors say how to continue the job."""
     try:
-        yield partial
-        partial.replace(path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise unwritable(path.parent, f"{path.name} cannot be written", error) from error
-        raise
+        with whole_file(path) as file:
+            yield file
+    except OSError as error:
+        raise unwritable(path.parent, f"{path.name} cannot be written", error) from error
 
 
 def remove_partial_files(folder: Path) -> None:
@@ -134,8 +127,9 @@ def remove_partial_files(folder: Path) -> None:
 
 def unwritable(folder: Path, what: str, error: OSError) -> OSError:
     """Return an error of the same type that names the folder and states how to continue the job."""
-    message = f"{what}: {error.strerror or error}; chunks that are finished stay, call again when this is cured"
-    return OSError(error.errno or errno.EIO, message, str(folder))
+    code = error.errno or errno.EIO
+    message = f"{what}: {os.strerror(code)}; chunks that are finished stay, call again when this is cured"
+    return OSError(code, message, str(folder))
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError
 from ..batching._names import leaf_names
-from ._chunk_file import DamagedFile, Part, chunk_files, complete, opened, read_chunk, result_names, whole_file
+from ._chunk_file import DamagedFile, Part, chunk_files, complete, job_file, opened, read_chunk, result_names
 from ._fingerprint import identifier
 
 FORMAT = 2
@@ -24,10 +24,8 @@ MANIFEST = "manifest.json"
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Write the manifest."""
-    with whole_file(folder / MANIFEST) as partial, partial.open("w") as file:
-        json.dump(manifest, file, indent=1)
-        file.flush()
-        os.fsync(file.fileno())
+    with job_file(folder / MANIFEST) as file:
+        file.write(json.dumps(manifest, indent=1).encode())
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:

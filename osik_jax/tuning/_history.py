@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ from jaxtyping import Float, Int
 
 from .._errors import OsikValueError
 from .._npz import open_npz
+from .._whole_file import whole_file
 from ._parameters import ParameterSpace
 
 _FORMAT = 1
@@ -83,11 +83,8 @@ def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace
     arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
     arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
     arrays |= {f"space/{name}": value for name, value in _described(space).items()}
-    whole = Path(path)
-    partial = whole.with_name(f".{whole.name}.partial")
-    with partial.open("wb") as file:
+    with whole_file(path) as file:
         np.savez(file, allow_pickle=False, format=_FORMAT, vector=np.asarray(state.vector), **arrays)
-    partial.replace(whole)
 
 
 def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:

@@ -2,14 +2,26 @@
 
 import os
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
-from core_checks import needs_core
+import pytest
+from core_checks import compile_core, compiler, needs_core, run_tests_with
 
-from osik_jax.core import _build
+from osik_jax.core import _build, _library
+from osik_jax.core._library import core
 from osik_jax.numerics import _constants
+
+SOLVES = (
+    "core/test_core_qps.py::test_recorded_problems",
+    "core/test_core_hierarchies.py::test_recorded_hierarchies",
+    "core/test_core_null_space.py::test_as_numpy",
+    "kinematics/test_core_kinematics.py::test_beside_mujoco",
+    "control/test_compiled_step.py::test_the_core_answers_as_plain_jax_does",
+)
 
 
 def test_constants_are_those_of_python():
@@ -28,11 +40,9 @@ def test_constants_are_those_of_python():
 
 @needs_core
 def test_a_library_of_other_sources_is_refused(tmp_path, monkeypatch):
-    from osik_jax.core import _library
-
     monkeypatch.setattr(_build, "fingerprint", lambda: "another state")
-    core = _library.core.__wrapped__()
-    assert core.library is None and "built from other sources" in core.reason and "_build" in core.reason
+    found = _library.core.__wrapped__()
+    assert found.library is None and "built from other sources" in found.reason and "_build" in found.reason
 
 
 @needs_core
@@ -40,9 +50,13 @@ def test_a_library_is_built_again_where_its_sources_changed_or_it_cannot_be_load
     monkeypatch.setattr(_build, "build", lambda: "built")
     there = _build.build_if_changed()
     assert there == [_build.library_path(level) for level in _build.levels()]
+    older = Path(shutil.copy(there[-1], tmp_path / "older.so"))
     with monkeypatch.context() as patch:
         patch.setattr(_build, "fingerprint", lambda: "another state")
+        patch.setattr(_build, "library_path", lambda level: older)
         assert _build.build_if_changed() == "built"
+    maps = Path("/proc/self/maps")  # loaded, it would stay in place of the new one
+    assert not maps.exists() or str(older) not in maps.read_text()
     broken = tmp_path / "core.so"
     broken.write_text("no library")
     for path in (broken, tmp_path / "none.so"):
@@ -57,6 +71,22 @@ def test_without_the_core_a_warning_says_what_to_do():
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ)
     assert "[1. 1.]" in ran.stdout
     assert ran.stderr.count("OsikWarning") == 1 and "install a C++ compiler" in ran.stderr
+
+
+@pytest.mark.parametrize("name", ["g++", "clang++"])
+def test_each_compiler_takes_all_of_the_core_without_a_warning(name):
+    texts = [*_build.FOLDER.glob("*.cpp"), *_build.FOLDER.glob("c/*.cpp")]
+    flags = (*_build._FLAGS, '-DOSIK_SOURCES=""', "-Wall", "-Wextra", "-Werror", "-fsyntax-only")
+    done = subprocess.run([compiler(name), *flags, *texts], capture_output=True, text=True)
+    assert len(texts) > 8 and done.returncode == 0, done.stderr[-4000:]
+
+
+@pytest.mark.slow
+def test_a_core_by_clang_solves_as_plain_jax_does(tmp_path):
+    own, library = core().path, tmp_path / "core.so"
+    flags = _build.levels().get(own.stem.removeprefix("_core_"), []) if own else []
+    compile_core(compiler("clang++"), library, *flags, "-Wall", "-Wextra", "-Werror")
+    run_tests_with(library, SOLVES)
 
 
 def test_a_compiler_that_fails_is_named(monkeypatch):

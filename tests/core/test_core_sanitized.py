@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from core_checks import compile_core, run_tests_with
 
-from osik_jax.core import _build
-
-TESTS = Path(__file__).parents[1]
 SOME = (
     "core/test_core_qps.py::test_recorded_problems",
     "core/test_core_qps.py::test_lanes_that_are_left_to_the_search",
@@ -47,18 +45,7 @@ def test_sanitizers_find_nothing(tests, tmp_path):
     if not preload:
         pytest.skip("needs a compiler with libasan and libubsan")
     library = tmp_path / "core.so"
-    flags = ["-std=c++20", "-O1", "-g", "-Wno-psabi", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
-    text = [str(path) for path in _build.sources() if path.suffix == ".cpp"]
-    command = [str(compiler), *flags, '-DOSIK_SOURCES="sanitized"', "-shared", "-fPIC", *text, "-o", str(library)]
-    subprocess.run(command, check=True)
+    flags = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
+    compile_core(str(compiler), library, *flags)
     # leaks are those of Python and XLA
-    env = os.environ | dict(LD_PRELOAD=preload, OSIK_CORE_LIBRARY=str(library), ASAN_OPTIONS="detect_leaks=0")
-    ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-n", "0", "-p", "no:cacheprovider", *tests],
-        cwd=TESTS,
-        env=env,
-        capture_output=True,
-        text=True,
-    )
-    assert ran.returncode == 0, (ran.stdout + ran.stderr)[-4000:]
-    assert " passed" in ran.stdout
+    run_tests_with(library, tests, LD_PRELOAD=preload, ASAN_OPTIONS="detect_leaks=0")

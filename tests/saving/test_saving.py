@@ -1,4 +1,4 @@
-"""Controllers as files: every class of tasks, limits and schemes comes back to the last bit."""
+"""Controllers as files: every class of tasks, limits and schemes comes back to the last bit; errors name the file."""
 
 import inspect
 import json
@@ -11,6 +11,7 @@ import pytest
 from every_class import all_limits, all_tasks
 from model_files import mjcf
 from refusals import refuses
+from small_files import files_of_at_most
 
 import osik_jax as osik
 
@@ -217,8 +218,81 @@ def test_other_files_and_classes_are_refused(tmp_path, arm):
     osik.save_controller(path, arm, {"p": osik.PostureTask(arm)}, source="arm7")
     content = json.loads(path.read_text())
     content["scheme"]["class"] = "os.system"
-    path.write_text(json.dumps(content))
+    path.write_text(edited(content))
     refuses(ValueError, "'os.system' is no class of this version", osik.load_controller, path)
+
+
+def edited(content: dict[str, Any]) -> str:
+    """Return the text of a file that was edited by hand: without its last two entries."""
+    return json.dumps({name: value for name, value in content.items() if name not in ("core", "checksum")})
+
+
+@pytest.fixture(scope="module")
+def saved(arm, tmp_path_factory) -> str:
+    """The text of a controller's file."""
+    path = tmp_path_factory.mktemp("saved") / "c.json"
+    tasks = {"hand": osik.FrameTask(arm, "hand"), "rest": osik.PostureTask(arm, priority=2)}
+    osik.save_controller(path, arm, tasks, scheme=osik.HierarchicalQP(), source="arm7")
+    return path.read_text()
+
+
+def test_a_byte_that_changed_is_refused(saved, tmp_path, rng):
+    path, whole = tmp_path / "c.json", saved.encode()
+    for place, change in zip(rng.integers(len(whole), size=400), rng.integers(1, 256, 400), strict=True):
+        changed = bytearray(whole)
+        changed[place] ^= change
+        path.write_bytes(changed)
+        refuses(ValueError, rf"{path} is (no controller|not as) .*save_controller wrote", osik.load_controller, path)
+    path.write_text(saved[: len(saved) // 2])
+    refuses(ValueError, rf"{path} is .* damaged", osik.load_controller, path)
+
+
+EDITS = {
+    "period": (["dt"], 0.0, "dt is 0.0; it has to be positive and finite"),
+    "no period": (["dt"], float("nan"), "dt is nan; it has to be positive"),
+    "no tasks": (["tasks"], [], "there is no task"),
+    "frame": (["tasks", 0, 1, "fields", "frame"], "paw", "no frame 'paw'"),
+    "joint": (["tasks", 1, 1, "fields", "joints", "of", 2], "knee", "the robot has no 'knee' in its joint_names"),
+    "weight": (["tasks", 0, 1, "fields", "weight", "array"], -1.0, "weight is -1.0; it has to be .* not negative"),
+    "shape": (["tasks", 0, 1, "fields", "weight", "shape"], [3], "cannot reshape"),
+    "task": (["tasks", 0, 1], None, r"tasks\['hand'\] is a NoneType, not a Task"),
+    "robot": (["robot", "name"], "arm77", "no robot 'arm77'|arm77"),
+    "no scheme": (["scheme"], ..., "its entry 'scheme' is missing"),
+    "no robot": (["robot"], ..., "its entry 'robot' is missing"),
+    "no fields": (["scheme", "fields"], ..., "its entry 'fields' is missing"),
+    "no shape": (["tasks", 0, 1, "fields", "weight", "shape"], ..., "its entry 'shape' is missing"),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edited_file_that_solve_does_not_take_is_refused(saved, tmp_path, edit):
+    place, value, message = EDITS[edit]
+    part = content = json.loads(saved)
+    for key in place[:-1]:
+        part = part[key]
+    if value is ...:
+        del part[place[-1]]
+    else:
+        part[place[-1]] = value
+    path = tmp_path / "c.json"
+    path.write_text(edited(content))
+    refuses(ValueError, rf"{path} cannot be loaded: .*{message}", osik.load_controller, path)
+
+
+def test_an_edited_file_is_loaded(saved, tmp_path):
+    content = json.loads(saved)
+    content["tasks"][0][1]["fields"]["weight"]["array"] = 3.0
+    path = tmp_path / "c.json"
+    path.write_text(edited(content))
+    assert osik.load_controller(path).tasks["hand"].weight == 3.0
+
+
+def test_on_a_full_disk_the_older_file_stays(saved, arm, tmp_path):
+    (path := tmp_path / "c.json").write_text(saved)
+    with files_of_at_most(500), pytest.raises(OSError, match="cannot be written: File too large") as caught:
+        osik.save_controller(path, arm, {"p": osik.PostureTask(arm)}, source="arm7")
+    assert caught.value.filename == str(path)
+    assert [one.name for one in tmp_path.iterdir()] == ["c.json"] and path.read_text() == saved
 
 
 def test_no_public_class_is_left_out(arm):

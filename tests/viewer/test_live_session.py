@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_files import files_of_at_most
 
 import osik_jax as osik
 from osik_jax.control import _checks
@@ -64,6 +65,9 @@ def test_a_session_comes_back_from_its_file_to_the_last_bit(tmp_path: Path) -> N
     assert loaded.off == {"waist"} and loaded.limits_off == {1} and loaded.dt == 0.004
     assert eqx.tree_equal(*((one.tasks, one.scheme, one.limits, one.q) for one in (saved, loaded)))
     assert list(loaded.tasks) == list(saved.tasks)
+    with files_of_at_most(500), pytest.raises(OSError, match="cannot be written: File too large"):
+        session().save(tmp_path / "session.json")
+    assert load_session(tmp_path / "session.json").limits_off == {1}  # the older file
 
 
 def test_its_lines_of_python_make_the_same_controller() -> None:

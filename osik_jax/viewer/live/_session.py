@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError
+from ..._whole_file import write_text
 from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
 from ...schemes import Scheme
@@ -87,7 +88,7 @@ class Session:
         Raises:
             ValueError: it holds what a file cannot, such as a task of a class of one's own.
         """
-        Path(path).write_text(self.to_json(), encoding="utf-8")
+        write_text(path, self.to_json())
 
     def to_json(self) -> str:
         """Return the session as JSON, the content of the file that ``save`` writes.
