@@ -16,7 +16,7 @@ from ..robot._joint_selection import dof_names, scalar_layout
 from ._chain import Chain, Layout, chain_kinematics, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
-from ._pool import Errors, Pace
+from ._pool import Pace
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._turns import one_turn
@@ -130,7 +130,8 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
         near=near,
         seeds=jnp.asarray(settings.seeds, first.dtype),
         shift=shift_of(settings.key, len(coordinates)),
-        length=_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0),
+        # links in one point have no length, but the steps' damping needs one
+        length=jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), settings.tolerance[0]),
         tolerance=allowed(settings.tolerance, length),
         enough=jnp.asarray(_ENOUGH, first.dtype),
     )
@@ -197,10 +198,11 @@ def answer(
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
     """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
-    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
-    fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
-    turned = lanes_last(goal)
-    residual, active, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
+    x = search.unwound(jax.lax.stop_gradient(search).polished(x, jax.lax.stop_gradient(goal)))
+    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+    fixed_search, fixed_goal = jax.lax.stop_gradient((search, goal))
+    residual, active = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))
+    errors = search.linearised(x.T, lanes_last(goal))[2]
     converged = errors.score <= 1.0
     coordinates = np.array(search.chain.layout.dofs, int)
     whole = jnp.broadcast_to(search.home, (len(x), robot.nq)).at[:, coordinates].set(x)
@@ -214,13 +216,13 @@ def answer(
         steps=steps,
         residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
         at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(active.T),
-        beyond_reach=_beyond(fixed_search, jax.lax.stop_gradient(goal)),
+        beyond_reach=_beyond(fixed_search, fixed_goal),
         joints=tuple(dof_names(robot)),
     )
 
 
-def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
-    """Return the residual of each frame (frames, 6, lanes), the limits that stop it (n, lanes), and the errors."""
+def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array]:
+    """Return the residual of each frame (frames, 6, lanes), and the limits that stop it (n, lanes)."""
     error, matrix, errors = search.linearised(x, goal)
     rows = np.array(search.rows)
     scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]
@@ -229,15 +231,15 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
     most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
     stopped = jnp.abs(gradient) > _STOPPED * most
     low, high = (x <= search.lower[:, None]) & (gradient > 0.0), (x >= search.upper[:, None]) & (gradient < 0.0)
-    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
+    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0)
 
 
 def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
     length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
     asked = np.array(search.rows)[:, :3].all(-1)
-    # rounded up, so that a target on the boundary is never called out of reach
-    longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))
-    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest
+    # rounded up, so that a target on the boundary is never called out of reach; positions round by their own size
+    rounding = _ROUNDOFF * float(jnp.finfo(length.dtype).eps) * (length + jnp.max(jnp.abs(root), -1))
+    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - (length + rounding)
     away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)
     return jnp.maximum(jnp.max(away, -1), 0.0)

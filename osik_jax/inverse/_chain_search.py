@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
-from typing import NamedTuple
+from functools import partial, reduce
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,7 +18,7 @@ from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobia
 from ._chain_kernel import advanced
 from ._error import rotation_error
 from ._linear import solve_positive, solve_with_pivots
-from ._minimum import minimum
+from ._minimum import inverse_hessian, minimum
 from ._pool import Errors
 from ._seeds import unit_points
 from ._turns import unwound
@@ -157,6 +157,32 @@ class ChainSearch(eqx.Module):
         step = _transposed_times(matrix, solve_positive(_gram(matrix, ridge), error))
         return forced - step[:, 0]
 
+    def moved(self, x: Float[Array, " n"], goal: Goal, rates: Any) -> Float[Array, " n"]:
+        """Return the derivative of a solution x, or of a least error, for the rates of the search and the goal."""
+        aim = Goal(goal.position[..., None], goal.rotation[..., None])
+        error, matrix, curved = (part[..., 0] for part in self._measuring().model(x[:, None], aim))
+        gradient = jnp.sum(matrix * error[:, None], 0)
+        low, high = (x <= self.lower) & (gradient >= 0.0), (x >= self.upper) & (gradient <= 0.0)
+        inverse = inverse_hessian(matrix, curved, ~(low | high))
+
+        def slope(search: ChainSearch, goal: Goal) -> tuple[Array, Array]:
+            placed = jnp.where(low, search.lower, jnp.where(high, search.upper, x))
+            aim = Goal(goal.position[..., None], goal.rotation[..., None])
+            error, matrix, _ = search._measuring().linearised(placed[:, None], aim)
+            return placed, _transposed_times(matrix, error)[:, 0]
+
+        _, along = jax.jvp(lambda search, goal: search.newton_step(x, goal), (self, goal), rates)
+        _, (placed, turned) = jax.jvp(slope, (self, goal), rates)
+        reached = self.linearised(x[:, None], aim)[2].score[0] <= self.enough
+        return jnp.where(reached, along, placed - jnp.matmul(inverse, turned, precision="highest"))
+
+    def polished(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, "lanes n"]:
+        """Return solutions after one more step where that lowers the error; other configurations stay."""
+        exact = self.finishing(exact=True)
+        before, (after, _, errors) = exact.advance(x, goal, 1)[2], exact.advance(x, goal, 2)
+        better = (before.score <= 1.0) & (errors.score < before.score)
+        return jnp.where(better[:, None], after, x)
+
     def unwound(self, x: Float[Array, "*lanes n"]) -> Float[Array, "*lanes n"]:
         """Return the same poses, each joint turned as near to the first configuration as its limits allow."""
         return unwound(x, self.first, self.lower, self.upper, self.turns)
@@ -232,8 +258,9 @@ class ChainSearch(eqx.Module):
 
     def _errors(self, linear: Array, angular: Array, cost: Array) -> Errors:
         kept = np.array(self.rows)
+        # by pairs: the derivative of jnp.max is NaN where XLA computes the norms twice and rounds them differently
         sizes = [
-            jnp.max(jnp.sqrt(jnp.sum(jnp.where(mask[:, :, None], part, 0.0) ** 2, 1)), 0)
+            reduce(jnp.maximum, _lengths(jnp.where(mask[:, :, None], part, 0.0)))
             for part, mask in ((linear, kept[:, :3]), (angular, kept[:, 3:]))
         ]
         score = jnp.maximum(sizes[0] / self.tolerance[0], sizes[1] / self.tolerance[1])
@@ -246,6 +273,12 @@ def _one_lane(search: ChainSearch, x: Float[Array, " n"], goal: Goal, *, steps: 
 
 
 _by_kernel = by_kernel(_one_lane, partial(advanced, damping=(_DAMPING, _LEAST_DAMPING)))
+
+
+def _lengths(vectors: Float[Array, "frames 3 lanes"]) -> Float[Array, "frames lanes"]:
+    """Return the norms; the derivative at 0 is 0."""
+    squared = jnp.sum(vectors**2, 1)
+    return jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), squared)
 
 
 def _times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "n lanes"]) -> Float[Array, "m lanes"]:

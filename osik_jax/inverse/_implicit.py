@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 from jaxtyping import Array, Float
 
 from ..execution._rules import custom_jvp
@@ -16,7 +15,8 @@ def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"
 
     Where ``error(x, problem) = 0``, the implicit function theorem gives ``J dx = -d error``: of all such dx the
     shortest, over the coordinates that stand at no limit; those that do move with their limit. That is the derivative
-    of one Newton step from x, which is what is differentiated here.
+    of one Newton step from x. Where the error is least and not 0, its gradient is 0, and ``H dx = -d gradient`` with
+    the Hessian H of half the squared error.
     """
     del search, goal
     return x
@@ -24,8 +24,6 @@ def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"
 
 @attached.defjvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    start, *problem = primals
-    x = attached(start, *problem)
-    step, moved = jax.jvp(lambda search, goal: search.newton_step(x, goal), tuple(problem), tuple(tangents[1:]))
-    del step
-    return x, moved
+    start, search, goal = primals
+    x = attached(start, search, goal)
+    return x, search.moved(x, goal, tangents[1:])
