@@ -16,7 +16,8 @@ from ..robot._joint_selection import dof_names, scalar_layout
 from ._chain import Chain, Layout, chain_kinematics, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
-from ._pool import Pace
+from ._implicit import errors_at
+from ._pool import Errors, Pace
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._turns import one_turn
@@ -131,7 +132,9 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
         seeds=jnp.asarray(settings.seeds, first.dtype),
         shift=shift_of(settings.key, len(coordinates)),
         # links in one point have no length, but the steps' damping needs one
-        length=jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), settings.tolerance[0]),
+        length=jax.lax.stop_gradient(
+            jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), settings.tolerance[0])
+        ),
         tolerance=allowed(settings.tolerance, length),
         enough=jnp.asarray(_ENOUGH, first.dtype),
     )
@@ -201,17 +204,18 @@ def answer(
     x = search.unwound(jax.lax.stop_gradient(search).polished(x, jax.lax.stop_gradient(goal)))
     x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
     fixed_search, fixed_goal = jax.lax.stop_gradient((search, goal))
-    residual, active = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))
-    errors = search.linearised(x.T, lanes_last(goal))[2]
+    residual, active, errors = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))
     converged = errors.score <= 1.0
+    sizes = jnp.stack([errors.position, errors.orientation], 1)
+    sizes = jax.vmap(errors_at, in_axes=(0, 0, None, 0))(sizes, x, search, goal)
     coordinates = np.array(search.chain.layout.dofs, int)
     whole = jnp.broadcast_to(search.home, (len(x), robot.nq)).at[:, coordinates].set(x)
     at_limit = jnp.zeros((len(x), robot.nv), jnp.int32)
     return InverseKinematicsSolution(
         q=whole,
         converged=converged,
-        position_error=errors.position,
-        orientation_error=errors.orientation,
+        position_error=sizes[:, 0],
+        orientation_error=sizes[:, 1],
         seed=seed,
         steps=steps,
         residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
@@ -221,8 +225,8 @@ def answer(
     )
 
 
-def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array]:
-    """Return the residual of each frame (frames, 6, lanes), and the limits that stop it (n, lanes)."""
+def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
+    """Return the residual of each frame (frames, 6, lanes), the limits that stop it (n, lanes), and the errors."""
     error, matrix, errors = search.linearised(x, goal)
     rows = np.array(search.rows)
     scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]
@@ -231,7 +235,7 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
     most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
     stopped = jnp.abs(gradient) > _STOPPED * most
     low, high = (x <= search.lower[:, None]) & (gradient > 0.0), (x >= search.upper[:, None]) & (gradient < 0.0)
-    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0)
+    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
 
 
 def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:

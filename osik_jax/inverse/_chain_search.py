@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ..core import _library
 from ..execution._computed import by_kernel
+from ..numerics._guarded import greatest, safe_norm
 from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobian
 from ._chain_kernel import advanced
 from ._error import rotation_error
@@ -167,14 +168,25 @@ class ChainSearch(eqx.Module):
 
         def slope(search: ChainSearch, goal: Goal) -> tuple[Array, Array]:
             placed = jnp.where(low, search.lower, jnp.where(high, search.upper, x))
-            aim = Goal(goal.position[..., None], goal.rotation[..., None])
-            error, matrix, _ = search._measuring().linearised(placed[:, None], aim)
-            return placed, _transposed_times(matrix, error)[:, 0]
+            error, matrix = search._measuring().rows_at(placed, goal)
+            return placed, jnp.sum(matrix * error[:, None], 0)
 
         _, along = jax.jvp(lambda search, goal: search.newton_step(x, goal), (self, goal), rates)
         _, (placed, turned) = jax.jvp(slope, (self, goal), rates)
         reached = self.linearised(x[:, None], aim)[2].score[0] <= self.enough
         return jnp.where(reached, along, placed - jnp.matmul(inverse, turned, precision="highest"))
+
+    def rows_at(self, x: Float[Array, " n"], goal: Goal) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """Return the error of each used row [m] at x, and its derivative."""
+        error, matrix, _ = self.linearised(x[:, None], Goal(goal.position[..., None], goal.rotation[..., None]))
+        return error[:, 0], matrix[..., 0]
+
+    def sizes(self, error: Float[Array, " m"]) -> Float[Array, "2"]:
+        """Return the largest position error [m] and orientation error [rad] of the used rows."""
+        rows = np.array(self.rows)
+        scale = jnp.where(np.arange(6) < 3, 1.0, self.length)[None].repeat(len(rows), 0)[rows]
+        off = jnp.zeros(rows.shape, error.dtype).at[np.nonzero(rows)].set(error / scale)
+        return greatest(jax.vmap(jax.vmap(safe_norm))(off.reshape(-1, 2, 3)).T)
 
     def polished(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return solutions after one more step where that lowers the error; other configurations stay."""
@@ -258,9 +270,8 @@ class ChainSearch(eqx.Module):
 
     def _errors(self, linear: Array, angular: Array, cost: Array) -> Errors:
         kept = np.array(self.rows)
-        # by pairs: the derivative of jnp.max is NaN where XLA computes the norms twice and rounds them differently
         sizes = [
-            reduce(jnp.maximum, _lengths(jnp.where(mask[:, :, None], part, 0.0)))
+            jnp.max(jnp.sqrt(jnp.sum(jnp.where(mask[:, :, None], part, 0.0) ** 2, 1)), 0)
             for part, mask in ((linear, kept[:, :3]), (angular, kept[:, 3:]))
         ]
         score = jnp.maximum(sizes[0] / self.tolerance[0], sizes[1] / self.tolerance[1])
@@ -273,12 +284,6 @@ def _one_lane(search: ChainSearch, x: Float[Array, " n"], goal: Goal, *, steps: 
 
 
 _by_kernel = by_kernel(_one_lane, partial(advanced, damping=(_DAMPING, _LEAST_DAMPING)))
-
-
-def _lengths(vectors: Float[Array, "frames 3 lanes"]) -> Float[Array, "frames lanes"]:
-    """Return the norms; the derivative at 0 is 0."""
-    squared = jnp.sum(vectors**2, 1)
-    return jnp.where(squared > 0.0, jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0)), squared)
 
 
 def _times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "n lanes"]) -> Float[Array, "m lanes"]:

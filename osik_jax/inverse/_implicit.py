@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._rules import custom_jvp
@@ -20,6 +22,23 @@ def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"
     """
     del search, goal
     return x
+
+
+@custom_jvp
+def errors_at(sizes: Float[Array, "2"], x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, "2"]:
+    """Return the position error [m] and the orientation error [rad] unchanged, with their derivatives at x."""
+    del x, search, goal
+    return sizes
+
+
+@errors_at.defjvp
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    (sizes, x, search, goal), (_, rate, *rates) = primals, tangents
+    # by the Jacobian, because JAX 0.10 cannot transpose the scan over the joints where a cotangent is a symbolic 0
+    error, matrix = search.rows_at(x, goal)
+    _, aside = jax.jvp(lambda search, goal: search.rows_at(x, goal)[0], (search, goal), tuple(rates))
+    moved = aside + jnp.matmul(matrix, rate, precision="highest")
+    return errors_at(sizes, x, search, goal), jax.jvp(search.sizes, (error,), (moved,))[1]
 
 
 @attached.defjvp

@@ -115,11 +115,13 @@ def _step(model: Model, lower: Array, upper: Array, gain: Array, state: _State) 
     free = ~(((x <= lower) & (gradient > 0.0)) | ((x >= upper) & (gradient < 0.0)))
     gradient, kept = jnp.where(free, gradient, 0.0), jnp.where(free, matrix, 0.0)
     move = _move(gradient, kept, jnp.where(free & free[:, None], curvature, 0.0), damping)
+    trial = jnp.clip(x + move, lower, upper)
     return _State(
-        x=x,
+        # the last step is taken unseen: it is shorter than the one before, whose gain was hardly any
+        x=jnp.where(state.open_ & settled, trial, x),
         cost=lowest,
         model=(error, matrix, curvature),
-        trial=jnp.clip(x + move, lower, upper),
+        trial=trial,
         promised=-0.5 * jnp.sum(gradient * move, 0),
         damping=damping,
         open_=state.open_ & ~settled & (damping < _GIVEN_UP),

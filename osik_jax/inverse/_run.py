@@ -187,12 +187,16 @@ def explored(
         best = choose(outcomes, away)
         x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
         if not (go_on and route.starts_anew):
-            return outcomes, alone, Closest(x, best, jnp.zeros_like(best))
-        unmet = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0] > 1.0
-        further = closest(fixed_search, goals, outcomes.x, unmet, near=near)
-        x = jnp.where(unmet[:, None], further.x, x)
-        seed, more = jnp.where(unmet, further.seed, best), jnp.where(unmet, further.steps, 0)
-        return outcomes, alone, Closest(x, seed, more)
+            return outcomes, alone, Closest(x, jnp.zeros_like(x[:, 0]), best, jnp.zeros_like(best))
+        score = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0]
+        unmet, loose = score > 1.0, score > fixed_search.enough
+        # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch
+        starts = jnp.where(unmet[:, None, None], outcomes.x, x[:, None])
+        further = closest(fixed_search, goals, starts, loose, near=near)
+        takes = unmet | (loose & (further.error <= fixed_search.tolerance[0]))
+        x = jnp.where(takes[:, None], further.x, x)
+        seed, more = jnp.where(unmet, further.seed, best), jnp.where(loose, further.steps, 0)
+        return outcomes, alone, Closest(x, further.error, seed, more)
 
     outcomes, alone, found = in_blocks(some, (fixed_goals,), _TOGETHER)
     taken = seeds * (steps + (0 if last is None else LAST)) + found.steps
