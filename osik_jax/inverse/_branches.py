@@ -50,7 +50,9 @@ def with_all(
         # a score is the error over its tolerance, so up to 1 it is a solution
         good = score[target] <= 1.0
         solved = np.concatenate([q[target, own.entries][None], x[target][good]])
-        alone = np.append(separation[target, found.seed[target]], separation[target][good])
+        # one that a further search has found is alone, so its separation does not matter
+        own_seed = np.minimum(found.seed[target], rows - 1)
+        alone = np.append(separation[target, own_seed], separation[target][good])
         distinct = _distinct(solved, alone, own.turns)[:rows]
         every = np.concatenate([distinct, _copies(distinct, own, rows)])[:rows]
         branches[target], counts[target] = len(distinct), len(every)

@@ -16,6 +16,7 @@ from ..robot._joint_selection import dof_names, scalar_layout
 from ._chain import Chain, Layout, chain_kinematics, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
+from ._implicit import errors_at
 from ._pool import Errors, Pace
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
@@ -130,7 +131,10 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
         near=near,
         seeds=jnp.asarray(settings.seeds, first.dtype),
         shift=shift_of(settings.key, len(coordinates)),
-        length=_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0),
+        # links in one point have no length, but the steps' damping needs one
+        length=jax.lax.stop_gradient(
+            jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), settings.tolerance[0])
+        ),
         tolerance=allowed(settings.tolerance, length),
         enough=jnp.asarray(_ENOUGH, first.dtype),
     )
@@ -197,24 +201,26 @@ def answer(
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
     """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
-    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
-    fixed_search, fixed_x = jax.lax.stop_gradient((search, x))
-    turned = lanes_last(goal)
-    residual, active, errors = _evaluated(fixed_search, fixed_x.T, jax.lax.stop_gradient(turned))
+    x = search.unwound(jax.lax.stop_gradient(search).polished(x, jax.lax.stop_gradient(goal)))
+    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+    fixed_search, fixed_goal = jax.lax.stop_gradient((search, goal))
+    residual, active, errors = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))
     converged = errors.score <= 1.0
+    sizes = jnp.stack([errors.position, errors.orientation], 1)
+    sizes = jax.vmap(errors_at, in_axes=(0, 0, None, 0))(sizes, x, search, goal)
     coordinates = np.array(search.chain.layout.dofs, int)
     whole = jnp.broadcast_to(search.home, (len(x), robot.nq)).at[:, coordinates].set(x)
     at_limit = jnp.zeros((len(x), robot.nv), jnp.int32)
     return InverseKinematicsSolution(
         q=whole,
         converged=converged,
-        position_error=errors.position,
-        orientation_error=errors.orientation,
+        position_error=sizes[:, 0],
+        orientation_error=sizes[:, 1],
         seed=seed,
         steps=steps,
         residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
         at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(active.T),
-        beyond_reach=_beyond(fixed_search, jax.lax.stop_gradient(goal)),
+        beyond_reach=_beyond(fixed_search, fixed_goal),
         joints=tuple(dof_names(robot)),
     )
 
@@ -236,8 +242,8 @@ def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
     length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
     asked = np.array(search.rows)[:, :3].all(-1)
-    # rounded up, so that a target on the boundary is never called out of reach
-    longest = length * (1.0 + _ROUNDOFF * float(jnp.finfo(length.dtype).eps))
-    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - longest
+    # rounded up, so that a target on the boundary is never called out of reach; positions round by their own size
+    rounding = _ROUNDOFF * float(jnp.finfo(length.dtype).eps) * (length + jnp.max(jnp.abs(root), -1))
+    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - (length + rounding)
     away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)
     return jnp.maximum(jnp.max(away, -1), 0.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -14,11 +14,12 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 
 from ..core import _library
 from ..execution._computed import by_kernel
+from ..numerics._guarded import greatest, safe_norm
 from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobian
 from ._chain_kernel import advanced
 from ._error import rotation_error
 from ._linear import solve_positive, solve_with_pivots
-from ._minimum import minimum
+from ._minimum import inverse_hessian, minimum
 from ._pool import Errors
 from ._seeds import unit_points
 from ._turns import unwound
@@ -156,6 +157,43 @@ class ChainSearch(eqx.Module):
         ridge = 100.0 * jnp.finfo(x.dtype).eps * jnp.maximum(jnp.sum(matrix**2, (0, 1)), self.length**2)
         step = _transposed_times(matrix, solve_positive(_gram(matrix, ridge), error))
         return forced - step[:, 0]
+
+    def moved(self, x: Float[Array, " n"], goal: Goal, rates: Any) -> Float[Array, " n"]:
+        """Return the derivative of a solution x, or of a least error, for the rates of the search and the goal."""
+        aim = Goal(goal.position[..., None], goal.rotation[..., None])
+        error, matrix, curved = (part[..., 0] for part in self._measuring().model(x[:, None], aim))
+        gradient = jnp.sum(matrix * error[:, None], 0)
+        low, high = (x <= self.lower) & (gradient >= 0.0), (x >= self.upper) & (gradient <= 0.0)
+        inverse = inverse_hessian(matrix, curved, ~(low | high))
+
+        def slope(search: ChainSearch, goal: Goal) -> tuple[Array, Array]:
+            placed = jnp.where(low, search.lower, jnp.where(high, search.upper, x))
+            error, matrix = search._measuring().rows_at(placed, goal)
+            return placed, jnp.sum(matrix * error[:, None], 0)
+
+        _, along = jax.jvp(lambda search, goal: search.newton_step(x, goal), (self, goal), rates)
+        _, (placed, turned) = jax.jvp(slope, (self, goal), rates)
+        reached = self.linearised(x[:, None], aim)[2].score[0] <= self.enough
+        return jnp.where(reached, along, placed - jnp.matmul(inverse, turned, precision="highest"))
+
+    def rows_at(self, x: Float[Array, " n"], goal: Goal) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """Return the error of each used row [m] at x, and its derivative."""
+        error, matrix, _ = self.linearised(x[:, None], Goal(goal.position[..., None], goal.rotation[..., None]))
+        return error[:, 0], matrix[..., 0]
+
+    def sizes(self, error: Float[Array, " m"]) -> Float[Array, "2"]:
+        """Return the largest position error [m] and orientation error [rad] of the used rows."""
+        rows = np.array(self.rows)
+        scale = jnp.where(np.arange(6) < 3, 1.0, self.length)[None].repeat(len(rows), 0)[rows]
+        off = jnp.zeros(rows.shape, error.dtype).at[np.nonzero(rows)].set(error / scale)
+        return greatest(jax.vmap(jax.vmap(safe_norm))(off.reshape(-1, 2, 3)).T)
+
+    def polished(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, "lanes n"]:
+        """Return solutions after one more step where that lowers the error; other configurations stay."""
+        exact = self.finishing(exact=True)
+        before, (after, _, errors) = exact.advance(x, goal, 1)[2], exact.advance(x, goal, 2)
+        better = (before.score <= 1.0) & (errors.score < before.score)
+        return jnp.where(better[:, None], after, x)
 
     def unwound(self, x: Float[Array, "*lanes n"]) -> Float[Array, "*lanes n"]:
         """Return the same poses, each joint turned as near to the first configuration as its limits allow."""

@@ -19,11 +19,13 @@ class Closest(NamedTuple):
 
     Attributes:
         x: coordinates. (targets, n)
+        error: length of all errors [m], where a radian counts as the tolerances' ratio. (targets,)
         seed: number of the search that it began with. (targets,)
         steps: that were taken to all of the target's optima. (targets,)
     """
 
     x: Float[Array, "targets n"]
+    error: Float[Array, " targets"]
     seed: Int[Array, " targets"]
     steps: Int[Array, " targets"]
 
@@ -60,6 +62,7 @@ def closest(
     best = jnp.argmin(jnp.where(equal, away, jnp.inf), 1)[:, None]
     return Closest(
         jnp.take_along_axis(ends, best[:, :, None], 1)[:, 0],
+        jnp.take_along_axis(errors, best, 1)[:, 0],
         jnp.take_along_axis(taken, best, 1)[:, 0].astype(jnp.int32),
         jnp.sum(steps.reshape(targets, groups), 1, dtype=jnp.int32),
     )

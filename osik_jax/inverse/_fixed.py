@@ -29,23 +29,52 @@ class Outcomes(NamedTuple):
     errors: Errors
 
 
-def search_all(search: Search, goals: Any, *, seeds: int, steps: int, last: Search | None = None) -> Outcomes:
+def search_all(
+    search: Search,
+    goals: Any,
+    *,
+    seeds: int,
+    steps: Int[Array, ""] | int,
+    last: Search | None = None,
+    starts: Float[Array, "targets seeds n"] | None = None,
+) -> Outcomes:
     """Run ``seeds`` searches of ``steps`` steps for each target.
 
     Args:
         search: the method.
         goals: pytree of the targets, with the targets in front.
         seeds: searches for each target.
-        steps: of each.
+        steps: of each; traced where it may be 0, for searches that are not needed.
         last: the method of a few more steps at the end, if another.
+        starts: where the searches start. Default: where the method begins.
     """
     targets = len(jax.tree.leaves(goals)[0])
     number = jnp.tile(jnp.arange(seeds, dtype=jnp.int32), targets)
     lanes = jax.tree.map(lambda a: jnp.repeat(a, seeds, 0), goals)
-    at, there, errors = search.advance(search.begin(number, lanes), lanes, steps)
+    begin = search.begin(number, lanes) if starts is None else starts.reshape(-1, starts.shape[-1])
+    at, there, errors = search.advance(begin, lanes, steps)
     if last is not None:
-        at, _, errors = last.advance(there, lanes, LAST)
+        at, _, errors = last.advance(there, lanes, LAST if isinstance(steps, int) else jnp.minimum(steps, LAST))
     return jax.tree.map(lambda a: a.reshape(targets, seeds, *a.shape[1:]), Outcomes(at, errors))
+
+
+def or_plain(search: Any, goals: Any, outcomes: Outcomes, *, seeds: int, steps: int) -> Outcomes:
+    """Return the outcomes of searches near home; for targets that none has met, those of plain searches.
+
+    The plain searches then walk home, each as far as it stays a solution. Where all targets are met, no step is taken.
+    """
+    plain = search.finishing(exact=False)
+    unmet = ~(outcomes.errors.score <= 1.0).any(1)
+    needed = jnp.where(unmet.any(), steps, 0)
+    found = search_all(plain, goals, seeds=seeds, steps=needed)
+    home = search_all(search, goals, seeds=seeds, steps=needed, last=plain, starts=found.x)
+    walked = home.errors.score <= 1.0
+
+    def chosen(near: Array, walking: Array, away: Array) -> Array:
+        kept, missed = (a.reshape(*a.shape, *[1] * (near.ndim - a.ndim)) for a in (walked, unmet))
+        return jnp.where(missed, jnp.where(kept, walking, away), near)
+
+    return jax.tree.map(chosen, outcomes, home, found)
 
 
 def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -> Int[Array, " targets"]:

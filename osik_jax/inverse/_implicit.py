@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..execution._rules import custom_jvp
@@ -16,16 +17,32 @@ def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"
 
     Where ``error(x, problem) = 0``, the implicit function theorem gives ``J dx = -d error``: of all such dx the
     shortest, over the coordinates that stand at no limit; those that do move with their limit. That is the derivative
-    of one Newton step from x, which is what is differentiated here.
+    of one Newton step from x. Where the error is least and not 0, its gradient is 0, and ``H dx = -d gradient`` with
+    the Hessian H of half the squared error.
     """
     del search, goal
     return x
 
 
+@custom_jvp
+def errors_at(sizes: Float[Array, "2"], x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, "2"]:
+    """Return the position error [m] and the orientation error [rad] unchanged, with their derivatives at x."""
+    del x, search, goal
+    return sizes
+
+
+@errors_at.defjvp
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    (sizes, x, search, goal), (_, rate, *rates) = primals, tangents
+    # by the Jacobian, because JAX 0.10 cannot transpose the scan over the joints where a cotangent is a symbolic 0
+    error, matrix = search.rows_at(x, goal)
+    _, aside = jax.jvp(lambda search, goal: search.rows_at(x, goal)[0], (search, goal), tuple(rates))
+    moved = aside + jnp.matmul(matrix, rate, precision="highest")
+    return errors_at(sizes, x, search, goal), jax.jvp(search.sizes, (error,), (moved,))[1]
+
+
 @attached.defjvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
-    start, *problem = primals
-    x = attached(start, *problem)
-    step, moved = jax.jvp(lambda search, goal: search.newton_step(x, goal), tuple(problem), tuple(tangents[1:]))
-    del step
-    return x, moved
+    start, search, goal = primals
+    x = attached(start, search, goal)
+    return x, search.moved(x, goal, tangents[1:])

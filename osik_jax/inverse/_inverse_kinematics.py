@@ -26,7 +26,7 @@ from ._branches import Coordinates, with_all
 from ._chain_problem import ChainRoute, Settings
 from ._host import in_chunks
 from ._problem import read_problem
-from ._run import explored, searched
+from ._run import explored, searched, searched_on
 from ._seeds import starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_search import entry_limits
@@ -127,6 +127,7 @@ def inverse_kinematics(
         [checked_tolerance(position_tolerance, dtype), checked_tolerance(orientation_tolerance, dtype)]
     )
     route = problem.route
+    once = _SEEDS if seeds is None else seeds
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
     settings = Settings(home, lower, upper, key, tolerance, seeds, problem.parts)
@@ -137,12 +138,17 @@ def inverse_kinematics(
     if all and traced:
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     if traced or nearest or all:
-        run = partial(explored, robot, settings=settings, seeds=seeds, steps=steps, near=nearest, every=all, **start)
+        kind = dict(near=nearest, every=all, fall_back=nearest and traced)
+        run = partial(explored, robot, settings=settings, seeds=seeds, steps=steps, **kind, **start)
         results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
         found, outcomes, isolated = results
+        if not traced:
+            more = once * (1 + restarts), steps
+            options = dict(route=route, warm=q0 is not None, near=nearest)
+            found = searched_on(robot, problem.goals, settings, found, *more, **options)
         found = with_all(found, outcomes, isolated, _coordinates(robot, route, settings)) if all else found
     else:
-        found = searched(robot, problem.goals, settings, seeds * (1 + restarts), steps, **start)
+        found = searched(robot, problem.goals, settings, once * (1 + restarts), steps, **start)
     if not (traced or np.all(found.converged)):
         found = dataclasses.replace(found, advice=advice(robot, route.asked(settings)))
     return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))

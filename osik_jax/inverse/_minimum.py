@@ -7,13 +7,14 @@ towards the optimum. Newton's method with the exact Hessian takes some ten steps
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._linear import solve_with_pivots
+from ._linear import solve_positive, solve_with_pivots
 
 _MOST = 60
 """Steps of one start."""
@@ -114,16 +115,41 @@ def _step(model: Model, lower: Array, upper: Array, gain: Array, state: _State) 
     free = ~(((x <= lower) & (gradient > 0.0)) | ((x >= upper) & (gradient < 0.0)))
     gradient, kept = jnp.where(free, gradient, 0.0), jnp.where(free, matrix, 0.0)
     move = _move(gradient, kept, jnp.where(free & free[:, None], curvature, 0.0), damping)
+    trial = jnp.clip(x + move, lower, upper)
     return _State(
-        x=x,
+        # the last step is taken unseen: it is shorter than the one before, whose gain was hardly any
+        x=jnp.where(state.open_ & settled, trial, x),
         cost=lowest,
         model=(error, matrix, curvature),
-        trial=jnp.clip(x + move, lower, upper),
+        trial=trial,
         promised=-0.5 * jnp.sum(gradient * move, 0),
         damping=damping,
         open_=state.open_ & ~settled & (damping < _GIVEN_UP),
         steps=state.steps + state.open_,
     )
+
+
+def inverse_hessian(
+    matrix: Float[Array, "m n"], curvature: Float[Array, "n n"], free: Bool[Array, " n"]
+) -> Float[Array, "n n"]:
+    """Return the pseudo-inverse of the Hessian over the free coordinates; 0 in rows and columns of the others.
+
+    Args:
+        matrix: Jacobian of the errors.
+        curvature: second derivatives of the errors weighted by them.
+        free: coordinates that may move.
+    """
+    times = partial(jnp.matmul, precision="highest")
+    hessian = jnp.where(free & free[:, None], times(matrix.T, matrix) + curvature, 0.0)
+    one, kind = jnp.eye(len(free), dtype=matrix.dtype), jnp.finfo(matrix.dtype)
+    # H (H^2 + ridge)^-1 takes directions without curvature for free, where 1 / (H + ridge) would multiply rounding
+    ridge = jnp.maximum(kind.eps ** (1.0 / 3.0) * jnp.max(jnp.abs(hessian)), kind.tiny**0.25) ** 2
+    squares = times(hessian, hessian) + ridge * one
+    lanes = jnp.broadcast_to(squares[..., None], (*one.shape, len(one)))
+    first = inverse = solve_positive(lanes, hessian)
+    for _ in range(2):  # takes away the share of the ridge where the Hessian is regular
+        inverse = inverse + times(first, one - times(hessian, inverse))
+    return inverse
 
 
 def _move(

@@ -89,16 +89,20 @@ def _of_tasks(
 
 
 def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[dict[str, Any], int | None]:
-    """Return the targets of tasks as arrays with the targets in front, and how many they are."""
+    """Return the targets of tasks as arrays with the targets in front, and how many they are; None: one, no batch."""
     if targets is None:
         return {}, count
     if not isinstance(targets, Mapping):
         raise OsikTypeError(f"targets is a {type(targets).__name__}; it is a dict from names of tasks to many targets")
     aims: dict[str, Any] = {}
+    single: dict[str, Any] = {}
     for name, value in targets.items():
         if name not in tasks:
             raise unknown_name("task", name, tuple(tasks))
         aims[name] = jax.tree.map(jnp.asarray, value)
+        if not _are_many(tasks[name], aims[name]):
+            single[name] = _one_target(name, tasks[name], value)
+            continue
         lengths = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(aims[name])}
         if len(lengths) != 1 or lengths == {()} or (count is not None and lengths != {(count,)}):
             expected = "one length" if count is None else f"length {count}, as those of the others"
@@ -106,4 +110,35 @@ def _aims(targets: Any, tasks: Mapping[str, Task], count: int | None) -> tuple[d
                 f"targets[{name!r}] has leading axes {sorted(lengths)}; they are the targets, of {expected}"
             )
         (count,) = lengths.pop()
-    return aims, count
+    shape = (count or 1,)
+    single = jax.tree.map(lambda a: jnp.broadcast_to(a, (*shape, *jnp.shape(a))), single)
+    return {**aims, **single}, count
+
+
+def _are_many(task: Task, value: Any) -> bool:
+    """Return whether the arrays without their first axis have the shapes of a target of the task.
+
+    Some tasks take a number for an array, so arrays with the shapes of the task's own target are one target.
+    """
+    leaves, own = jax.tree.leaves(value), getattr(task, "target", None)
+    if any(np.ndim(leaf) == 0 for leaf in leaves) or jax.tree.map(jnp.shape, value) == jax.tree.map(jnp.shape, own):
+        return False
+    first = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), value)
+    try:
+        jax.eval_shape(lambda target: task.replace(target=target), first)
+    except (IndexError, TypeError, ValueError):
+        return False
+    return True
+
+
+def _one_target(name: str, task: Task, value: Any) -> Any:
+    """Return the one target that the task reads from the value.
+
+    Raises:
+        TypeError, ValueError: it is not one target either.
+    """
+    try:
+        return task.replace(target=value).target  # pyright: ignore[reportAttributeAccessIssue]
+    except (TypeError, ValueError) as error:
+        given = str(error).removesuffix(". Batch with jax.vmap.")
+        raise type(error)(f"targets[{name!r}]: {given}; many have one more axis in front") from None

@@ -16,7 +16,7 @@ from ..execution._blocks import in_blocks
 from ..robot import Robot
 from ._chain_problem import Settings
 from ._closest import Closest, closest
-from ._fixed import LAST, Outcomes, choose, search_all
+from ._fixed import LAST, Outcomes, choose, or_plain, search_all
 from ._host import in_chunks, lanes_for, only
 from ._packed import Packed, packed, unpacked
 from ._pool import run_pool
@@ -40,10 +40,12 @@ def searched(
     route: Any,
     warm: bool,
     go_on: bool,
+    wanted: Bool[np.ndarray, " targets"] | None = None,
 ) -> InverseKinematicsSolution:
     """Run as many searches as each target needs; with a start configuration, that search alone first.
 
-    ``go_on``: to the configuration with the least error, for targets that are not met.
+    ``go_on``: to the configuration with the least error, for targets that are not met. ``wanted``: the targets that are
+    searched for; default: all.
     """
     lanes = lanes_for(len(jax.tree.leaves(goals)[0]), route.pace.lanes)
     run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
@@ -70,7 +72,38 @@ def searched(
         own = only(left, approach, goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
-    return in_chunks(chunk, goals)
+    wanted = np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted
+    return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
+
+
+def searched_on(
+    robot: Robot,
+    goals: Any,
+    settings: Settings,
+    found: InverseKinematicsSolution,
+    seeds: int,
+    steps: int,
+    *,
+    route: Any,
+    warm: bool,
+    near: bool,
+) -> InverseKinematicsSolution:
+    """Return ``found``; for targets that it has not met, what ``searched`` finds, moved home where ``near``."""
+    left = ~found.converged & (found.beyond_reach <= 0.0)
+    if not left.any():
+        return found
+    new = searched(robot, goals, settings, seeds, steps, route=route, warm=warm, go_on=False, wanted=left)
+    new = dataclasses.replace(new, steps=found.steps + new.steps)
+    left &= new.converged
+    if near and route.starts_anew and left.any():
+
+        def walk(*args: Any) -> InverseKinematicsSolution:
+            return unpacked(jax.device_get(_walked_home(robot, packed((settings, *args)), route=route, steps=steps)))
+
+        home = only(left, walk, goals, new.q, new.seed, new.steps)
+        far, away = (np.linalg.norm(a.q - np.asarray(settings.home), axis=1) for a in (home, new))
+        new = _with(new, home.converged & (far < away), home)
+    return _with(found, left, new)
 
 
 def _with(found: Any, changed: np.ndarray, new: Any) -> Any:
@@ -80,17 +113,19 @@ def _with(found: Any, changed: np.ndarray, new: Any) -> Any:
 @partial(jax.jit, static_argnames=("route", "warm", "lanes"))
 def _pooled(robot: Robot, given: Packed, *, route: Any, warm: bool, lanes: int) -> Packed:
     goals, settings, wanted, seeds, hopeless, longest = unpacked(given)
+    goals, valid = _with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=False)
     most = jnp.where(route.beyond(search, goals) > 0.0, jnp.minimum(seeds, hopeless), seeds)
     limits = dict(seeds=most, longest=longest, enough=search.enough)
     found = run_pool(search, goals, wanted, lanes=lanes, check=route.pace.check, **limits)
-    return packed(route.answer(robot, search, goals, found.x, found.seed, found.steps))
+    return packed(_or_far(route.answer(robot, search, goals, found.x, found.seed, found.steps), valid))
 
 
 @partial(jax.jit, static_argnames=("route", "warm", "starts"))
 def _approached(robot: Robot, given: Packed, *, route: Any, warm: bool, starts: int) -> Packed:
     """Return the least-error configuration for unmet targets, from new searches and the best so far."""
     settings, goals, q, seed, before = unpacked(given)
+    goals, valid = _with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=False)
 
     def some(goals: Any, best: Array) -> Closest:
@@ -103,10 +138,20 @@ def _approached(robot: Robot, given: Packed, *, route: Any, warm: bool, starts: 
     new = starts if route.starts_anew else 0
     steps = before + new * _GLANCE + found.steps
     number = jnp.where(found.seed == new, seed, found.seed)
-    return packed(route.answer(robot, search, goals, found.x, number, steps))
+    return packed(_or_far(route.answer(robot, search, goals, found.x, number, steps), valid))
 
 
-@partial(jax.jit, static_argnames=("route", "seeds", "steps", "warm", "near", "every", "go_on"))
+@partial(jax.jit, static_argnames=("route", "steps"))
+def _walked_home(robot: Robot, given: Packed, *, route: Any, steps: int) -> Packed:
+    """Return the solutions, moved towards the first configuration by what the frames leave free."""
+    settings, goals, q, seed, before = unpacked(given)
+    search = route.search(robot, settings, warm=True, near=True)
+    starts, last = q[:, None, route.entries(robot)], search.finishing(exact=False)
+    x = search_all(search, goals, seeds=1, steps=steps, last=last, starts=starts).x[:, 0]
+    return packed(route.answer(robot, search, goals, x, seed, before + steps + LAST))
+
+
+@partial(jax.jit, static_argnames=("route", "seeds", "steps", "warm", "near", "every", "go_on", "fall_back"))
 def explored(
     robot: Robot,
     goals: Any,
@@ -119,10 +164,11 @@ def explored(
     near: bool,
     every: bool,
     go_on: bool,
+    fall_back: bool,
 ) -> tuple[InverseKinematicsSolution, Outcomes, Bool[Array, "targets seeds"] | None]:
     """Return the results of all searches of each target; with ``every`` also whether solutions are isolated.
 
-    It is a pure function of a limited amount of work.
+    It is a pure function of a limited amount of work. ``fall_back``: on plain searches, where ``near`` meets no target.
     """
     goals, valid = _with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=near)
@@ -131,6 +177,8 @@ def explored(
 
     def some(goals: Any) -> tuple[Outcomes, Array | None, Closest]:
         outcomes = search_all(fixed_search, goals, seeds=seeds, steps=steps, last=last)
+        if fall_back and route.starts_anew:
+            outcomes = or_plain(fixed_search, goals, outcomes, seeds=seeds, steps=steps)
         outcomes = outcomes._replace(x=fixed_search.unwound(outcomes.x))
         each = jax.tree.map(lambda a: jnp.repeat(a, seeds, 0), goals)
         x = outcomes.x.reshape(-1, outcomes.x.shape[-1])
@@ -139,38 +187,49 @@ def explored(
         best = choose(outcomes, away)
         x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
         if not (go_on and route.starts_anew):
-            return outcomes, alone, Closest(x, best, jnp.zeros_like(best))
-        unmet = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0] > 1.0
-        further = closest(fixed_search, goals, outcomes.x, unmet, near=near)
-        x = jnp.where(unmet[:, None], further.x, x)
-        seed, more = jnp.where(unmet, further.seed, best), jnp.where(unmet, further.steps, 0)
-        return outcomes, alone, Closest(x, seed, more)
+            return outcomes, alone, Closest(x, jnp.zeros_like(x[:, 0]), best, jnp.zeros_like(best))
+        score = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0]
+        unmet, loose = score > 1.0, score > fixed_search.enough
+        # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch
+        starts = jnp.where(unmet[:, None, None], outcomes.x, x[:, None])
+        further = closest(fixed_search, goals, starts, loose, near=near)
+        takes = unmet | (loose & (further.error <= fixed_search.tolerance[0]))
+        x = jnp.where(takes[:, None], further.x, x)
+        seed, more = jnp.where(unmet, further.seed, best), jnp.where(loose, further.steps, 0)
+        return outcomes, alone, Closest(x, further.error, seed, more)
 
     outcomes, alone, found = in_blocks(some, (fixed_goals,), _TOGETHER)
     taken = seeds * (steps + (0 if last is None else LAST)) + found.steps
-    answer = route.answer(robot, search, goals, found.x, found.seed, taken)
-    most = jnp.asarray(jnp.finfo(found.x.dtype).max, found.x.dtype)
-    answer = dataclasses.replace(
+    return _or_far(route.answer(robot, search, goals, found.x, found.seed, taken), valid), outcomes, alone
+
+
+def _or_far(answer: InverseKinematicsSolution, valid: Bool[Array, " targets"]) -> InverseKinematicsSolution:
+    """Return the answer, with the largest finite errors where the target is not valid."""
+    most = jnp.asarray(jnp.finfo(answer.q.dtype).max, answer.q.dtype)
+    return dataclasses.replace(
         answer,
         converged=answer.converged & valid,
         position_error=jnp.where(valid, answer.position_error, most),
         orientation_error=jnp.where(valid, answer.orientation_error, most),
     )
-    return answer, outcomes, alone
 
 
 def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
-    """Return the targets with 0 in place of non-finite ones (traced ones may be), and which are valid.
+    """Return the targets with 0 in place of NaN and infinity (traced ones may be), and which are valid.
 
-    One so large that the square of a distance may not be finite is not valid.
+    A target so far away that the square of a distance may not be finite is not valid; a nearer one takes its place.
     """
     numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
     valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
+
+    def largest(a: Array) -> Array:
+        return 1e-3 * jnp.sqrt(jnp.finfo(a.dtype).max)
+
     for leaf in jax.tree.leaves(numbers):
-        largest = 1e-3 * jnp.sqrt(jnp.finfo(leaf.dtype).max)
-        valid &= (jnp.abs(leaf) <= largest).reshape(len(leaf), -1).all(1)
+        valid &= (jnp.abs(leaf) <= largest(leaf)).reshape(len(leaf), -1).all(1)
 
     def kept(a: Array) -> Array:
-        return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0)
+        near = jnp.clip(jnp.where(jnp.isfinite(a), a, 0.0), -largest(a), largest(a))
+        return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, near)
 
     return eqx.combine(jax.tree.map(kept, numbers), rest), valid

@@ -162,6 +162,10 @@ class TaskSearch(eqx.Module):
         goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
         return self._moved(q, self.scheme.solve(self._problem(q, goals)).velocity) - q
 
+    def moved(self, q: Float[Array, " nq"], goal: Aims, rates: Any) -> Float[Array, " nq"]:
+        """Return the derivative of a solution q, for the rates of the search and the goal."""
+        return jax.jvp(lambda search, goal: search.newton_step(q, goal), (self, goal), rates)[1]
+
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
         """Return the rows of the goals at q, and their errors."""
         goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}

@@ -13,6 +13,7 @@ from mujoco_states import mujoco_at
 from refusals import refuses
 
 import osik_jax as osik
+from osik_jax.inverse._problem import read_problem
 
 POSITION, ORIENTATION = 1e-3, 1e-2
 
@@ -134,6 +135,27 @@ def test_nearest_is_the_nearest_of_the_closed_form(planar):
         start = jnp.asarray(expected + 0.1)
         found = osik.inverse_kinematics(planar, {"tip": (0.5, 0.3, 0.0)}, q0=start, nearest=True, seeds=16)
         np.testing.assert_allclose(found.q, expected, atol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
+def test_nearest_finds_what_the_plain_call_finds(rng):
+    """From a configuration outside of its limits, where searches near home stay; by numbers and while tracing."""
+    robot = osik.load_robot("arm7", position_limits={f"joint{i}": (-2.8, 2.8) for i in range(1, 8)})
+    position, rotation = random_poses(robot, "hand", 64, rng)
+
+    def find(position, rotation, **options):
+        options = dict(q0=np.full(7, 4.0), seeds=8) | options
+        return osik.inverse_kinematics(robot, {"hand": (position, rotation)}, **options)
+
+    near, plain = find(position, rotation, nearest=True), find(position, rotation)
+    assert np.asarray(plain.converged).all() and np.asarray(near.converged).all()
+    away, turned = errors_by_mujoco(robot, near.q, "hand", position, rotation)
+    assert away.max() <= POSITION and turned.max() <= ORIENTATION
+    assert_within_limits(robot, near.q)
+    ways = [np.linalg.norm(np.asarray(found.q) - 2.8, axis=1) for found in (near, plain)]
+    assert np.median(ways[0]) < np.median(ways[1]) and (ways[0] < ways[1] + 1e-3).mean() > 0.9
+    traced, fixed = (jax.jit(partial(find, nearest=own))(position, rotation).converged for own in (True, False))
+    assert np.asarray(fixed).any() and (np.asarray(traced) >= np.asarray(fixed)).all()
 
 
 def test_one_and_many_and_each_way_to_write_a_pose(arm):
@@ -282,6 +304,49 @@ def test_configurations_keep_clear_of_an_obstacle(arm):
     assert apart >= 0.01 - 1e-4  # minimum_distance
     assert found.clearance is not None and np.asarray(found.clearance)[0] >= -1e-4
     assert "ball" in found.explain(1)
+
+
+GIMBAL = (
+    '<mujoco><compiler angle="radian"/><worldbody><body pos="{place}"><geom size=".02"/><body>'
+    '<joint name="z" axis="0 0 1" range="-3 3"/><geom size=".02"/><body><joint name="y" axis="0 1 0" range="-3 3"/>'
+    '<geom size=".02"/><body name="end"><joint name="x" axis="1 0 0" range="-3 3"/><geom size=".02"/></body></body>'
+    "</body></body></worldbody></mujoco>"
+)
+
+
+@pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
+@pytest.mark.parametrize("place, kind", [((0, 0, 0), "float64"), ((0.3, -2.0, 1.0), "float32")])
+def test_joints_whose_axes_meet_in_the_frame(place, kind):
+    """A chain without length: any position but its own is out of reach, and any orientation is found."""
+    robot = osik.Robot.from_mjcf(GIMBAL.format(place=" ".join(map(str, place)))).astype(kind)
+    turns = [np.array([0.5, 0.5, 0.5, 0.5]), np.array([np.cos(0.4), 0.0, np.sin(0.4), 0.0])]
+    poses = np.tile(np.array(place, float), (2, 1)), np.stack(turns)
+
+    def find(*poses):
+        return osik.inverse_kinematics(robot, {"end": poses}, seeds=8)
+
+    for found in (find(*poses), jax.jit(find)(*poses), osik.inverse_kinematics(robot, {"end": poses}, nearest=True)):
+        assert np.asarray(found.converged).all() and not np.asarray(found.beyond_reach).any()
+        for q, wanted in zip(np.asarray(found.q), turns, strict=True):
+            own = mujoco_at(robot, q.astype(float)).body("end").xquat
+            assert 2.0 * np.arccos(min(abs(own @ wanted), 1.0)) < ORIENTATION
+    far = find(poses[0] + [0.0, 0.5, 0.0], poses[1])
+    assert np.isfinite(far.q).all() and not np.asarray(far.converged).any()
+    np.testing.assert_allclose(far.beyond_reach, 0.5, atol=200 * np.finfo(kind).eps)
+    np.testing.assert_allclose(far.orientation_error, 0.0, atol=1e-3)
+
+
+def test_one_target_of_tasks_is_one_answer(arm):
+    """As the task's own target, and beside many of another task."""
+    pose = np.array([0.4, 0.1, 0.4]), np.diag([1.0, -1.0, -1.0])
+    tasks = {"tool": osik.FrameTask(arm, "hand", rows=(True,) * 5 + (False,)), "elbow": osik.ComTask(arm)}
+    one = read_problem(arm, tasks, {"tool": pose, "elbow": np.array([0.1, 0.0, 0.3])}, None, None)
+    assert not one.many and one.goals.targets["elbow"].shape == (1, 3)
+    np.testing.assert_allclose(one.goals.targets["tool"][1][0], pose[1])
+    both = read_problem(arm, tasks, {"elbow": np.full((4, 3), 0.1), "tool": pose}, None, None)
+    assert both.many and both.goals.targets["tool"][1].shape == (4, 3, 3)
+    message = r"targets\['tool'\]: got an array of shape \(2, 2\).*many have one more axis in front"
+    refuses(ValueError, message, read_problem, arm, tasks, {"tool": np.zeros((2, 2))}, None, None)
 
 
 class TestMistakes:

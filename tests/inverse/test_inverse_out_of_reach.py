@@ -148,11 +148,83 @@ def test_explain_counts_rows_and_names_those_to_leave_out(arm):
     assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
 
 
+@pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("kind, far", [(jnp.float64, 1e200), (jnp.float32, 1e30)])
 def test_a_target_whose_square_is_not_finite_has_a_finite_answer(kind, far):
+    """While tracing and from the host; the neighbour is found."""
     arm = osik.load_robot("arm7").astype(kind)
-    find = jax.jit(lambda place: osik.inverse_kinematics(arm, {"hand": place}))
-    found = find(jnp.array([0.3, far, 0.6], kind))
-    assert not found.converged
-    for leaf in jax.tree.leaves(found):
-        assert jnp.isfinite(leaf).all()
+    places = jnp.array([[0.3, far, 0.6], [0.4, 0.1, 0.4]], kind)
+
+    def find(places):
+        return osik.inverse_kinematics(arm, {"hand": places}, seeds=8)
+
+    for found in (jax.jit(find)(places), find(np.asarray(places))):
+        assert np.asarray(found.converged).tolist() == [False, True]
+        for leaf in jax.tree.leaves(found):
+            assert jnp.isfinite(leaf).all()
+        assert found.position_error[0] == jnp.finfo(kind).max and found.beyond_reach[0] > 1.0
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return osik.Robot.from_mjcf(mjcf("two_links_with_a_tip"))
+
+
+def nearest_of_two_links(x, y):
+    """Configuration of links of 0.5 m and 0.4 m that is nearest to a target out of reach, joints within 170 degrees."""
+    end = np.radians(170.0)
+    if abs(np.arctan2(y, x)) < end:
+        return np.array([np.arctan2(y, x), 0.0])
+    elbow = 0.5 * np.cos(end), 0.5 * np.sin(end)
+    return np.array([end, np.arctan2(y - elbow[1], x - elbow[0]) % (2.0 * np.pi) - end])
+
+
+def differences(function, at, step=1e-6):
+    """Central differences along x and y."""
+    return np.stack([(function(*at + step * e) - function(*at - step * e)) / (2.0 * step) for e in np.eye(2)], -1)
+
+
+def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar):
+    """In closed form: stretched towards the target, and with the first joint at its limit."""
+
+    def find(p):
+        found = osik.inverse_kinematics(planar, {"tip": p}, seeds=4, steps=40)
+        return found.q, found.position_error, found.orientation_error
+
+    both = jax.jit(jax.vmap(lambda p: (find(p), jax.jacfwd(find)(p), jax.jacrev(find)(p))))
+    targets = np.array([[1.2, 0.3, 0.0], [-1.3, 0.05, 0.0], [3.0, 0.0, 0.0], [0.9005, 0.0, 0.0]])
+    (q, error, _), forward, reverse = both(targets)
+    for at, p in enumerate(targets):
+        expected = nearest_of_two_links(*p[:2])
+        np.testing.assert_allclose(q[at], expected, atol=2e-5)
+        slope = differences(nearest_of_two_links, p[:2])
+        distance = differences(lambda x, y: np.hypot(*tip_of_two_links(nearest_of_two_links(x, y)) - (x, y)), p[:2])
+        assert error[at] == pytest.approx(np.hypot(*tip_of_two_links(expected) - p[:2]), abs=1e-7)
+        for moved, widened, turned in (forward, reverse):
+            np.testing.assert_allclose(moved[at][:, :2], slope, atol=1e-4)
+            np.testing.assert_allclose(widened[at][:2], distance, atol=1e-4)
+            assert not np.asarray(turned[at]).any()
+
+
+def tip_of_two_links(q):
+    return 0.5 * np.array([np.cos(q[0]), np.sin(q[0])]) + 0.4 * np.array([np.cos(q.sum()), np.sin(q.sum())])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("frames", ["position", "pose"])
+def test_errors_of_an_arm_out_of_reach_have_the_derivatives_of_the_answer(arm, frames):
+    """Against central differences of the least error itself, which is unique where its configuration is not."""
+    rotation = np.diag([1.0, -1.0, -1.0])
+
+    def find(p):
+        pose = p if frames == "position" else (p, rotation)
+        found = osik.inverse_kinematics(arm, {"hand": pose}, seeds=16, steps=24)
+        return found.position_error**2 + (RADIAN * found.orientation_error) ** 2, found.q
+
+    both = jax.jit(jax.vmap(lambda p: (find(p), jax.jacfwd(find)(p))))
+    positions, step = np.array([[1.5, 0.1, 0.3], [-0.4, 0.3, 1.2]]), 1e-4
+    (squared, _), (slope, moved) = both(positions)
+    assert np.sqrt(squared).min() > 0.05 and np.abs(moved).max() < 20.0
+    for axis in np.eye(3):
+        ahead, behind = (both(positions + sign * step * axis)[0][0] for sign in (1.0, -1.0))
+        np.testing.assert_allclose(slope @ axis, (ahead - behind) / (2.0 * step), atol=1e-4)
