@@ -54,9 +54,11 @@ def nao_reaching(*, training: int = 32, held_out: int = 32, steps: int = 75, dt:
     """NAO reaches with both hands, feet flat, centre of mass over them; 15 parameters."""
     robot = osik.load_robot("nao")
     polygon = osik.support_polygon(robot, robot.q0, tuple(FEET.values()))
-    tasks: dict[str, osik.Task] = {name: osik.FrameTask(robot, sole) for name, sole in FEET.items()}
+    tasks: dict[str, osik.Task] = {
+        name: osik.FrameTask(robot, sole, orientation_weight=1.0) for name, sole in FEET.items()
+    }
     tasks["com"] = osik.ComTask(robot, polygon=osik.support_polygon(robot, robot.q0, tuple(FEET.values()), margin=0.02))
-    tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation")
+    tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation", orientation_weight=1.0)
     tasks |= {name: osik.FrameTask(robot, hand, rows="position") for name, hand in HANDS.items()}
     tasks["posture"] = osik.PostureTask(robot, weight=1.0)
     loop = loop_of(robot, tasks, dt, steps)
@@ -75,7 +77,7 @@ def arm_reaching(*, training: int = 8, held_out: int = 8, steps: int = 30, dt: f
     robot = osik.load_robot("arm7")
     tasks = {
         "hand": osik.FrameTask(robot, "hand", rows="position", gain=osik.AdaptiveGain(10.0, 5.0, 1.0)),
-        "wrist": osik.FrameTask(robot, "hand", rows="orientation"),
+        "wrist": osik.FrameTask(robot, "hand", rows="orientation", orientation_weight=1.0),
         "elbow": osik.FrameTask(robot, "link4", rows="position"),
         "posture": osik.PostureTask(robot, weight=1.0),
     }

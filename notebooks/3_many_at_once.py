@@ -57,7 +57,7 @@ BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8
 # %%
 robot = osik.load_robot("arm7" if FAST else "nao")
 feet, hand = ((), "hand") if FAST else (("l_sole", "r_sole"), "l_gripper")
-tasks = {foot: osik.FrameTask(robot, foot, weight=100.0) for foot in feet}
+tasks = {foot: osik.FrameTask(robot, foot, weight=100.0, orientation_weight=1.0) for foot in feet}
 tasks |= {"com": osik.ComTask(robot, weight=10.0)} if feet else {}
 tasks["hand"] = osik.FrameTask(robot, hand, rows="position")
 tasks["posture"] = osik.PostureTask(robot, gain=1.0, weight=1e-3)

@@ -62,16 +62,16 @@ STATE = data / "tuned_nao.npz"  # what the tuning below went through
 # ## The problem: NAO reaches with both hands
 #
 # Seven tasks compete for 31 degrees of freedom: two feet, the centre of mass, an upright torso, two hands, the posture.
-# Under `WeightedQP` they share by weight. All weights begin at the library's default, 1: the posture pulls as hard as
+# Under `WeightedQP` they share by weight. All weights begin at 1: the posture pulls as hard as
 # the hands, and the feet give way.
 
 # %%
 robot = osik.load_robot("nao")
 feet, hands = {"left_foot": "l_sole", "right_foot": "r_sole"}, {"left_hand": "l_gripper", "right_hand": "r_gripper"}
 soles = tuple(feet.values())
-tasks = {name: osik.FrameTask(robot, sole) for name, sole in feet.items()}
+tasks = {name: osik.FrameTask(robot, sole, orientation_weight=1.0) for name, sole in feet.items()}
 tasks["com"] = osik.ComTask(robot, polygon=osik.support_polygon(robot, robot.q0, soles, margin=0.02))
-tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation")
+tasks["torso"] = osik.FrameTask(robot, "torso", rows="orientation", orientation_weight=1.0)
 tasks |= {name: osik.FrameTask(robot, hand, rows="position") for name, hand in hands.items()}
 tasks["posture"] = osik.PostureTask(robot, weight=1.0)
 limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))

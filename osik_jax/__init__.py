@@ -70,5 +70,9 @@ from .tasks import Task as Task
 from .tasks import TaskRows as TaskRows
 from .tasks import WheelTask as WheelTask
 from .tasks import support_polygon as support_polygon
+from .verdicts import RolloutVerdict as RolloutVerdict
+from .verdicts import StepVerdict as StepVerdict
+from .verdicts import explain_rollout as explain_rollout
+from .verdicts import explain_step as explain_step
 
 __version__ = _installed_version()

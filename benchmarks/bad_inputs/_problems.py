@@ -3,6 +3,7 @@
 # pyright: reportArgumentType=false
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -96,6 +97,18 @@ def problems(add: Add) -> None:
     )
     add("targets a list", lambda: rollout(steps=10, targets=[np.zeros((10, 3))]), T, "dict")
     add("feedback of another length", lambda: rollout(steps=10, feedback=np.zeros((10, 6))), V, "(10, 7)")
+    add(
+        "a verdict with a tolerance of 0",
+        lambda: osik.explain_step(arm(), arm().q0, {"p": posture()}, position_tolerance=0.0),
+        V,
+        "positive",
+    )
+    add(
+        "a verdict inside jit",
+        lambda: jax.jit(lambda q: osik.explain_step(arm(), q, {"p": posture()}))(arm().q0),
+        V,
+        "outside of jit",
+    )
 
 
 def limits(add: Add) -> None:

@@ -112,7 +112,9 @@ def tasks_of(robot: osik.Robot, work: Workload, start: jax.Array) -> dict[str, o
     """The workload's tasks; priorities matter to the schemes that rank, weights within a level."""
     c, gain = work.costs, 1.0 / DT
     tasks: dict[str, osik.Task] = {
-        name: osik.FrameTask(robot, name, target=(p, R), weight=c.foot**2, priority=1, gain=gain)
+        name: osik.FrameTask(
+            robot, name, target=(p, R), weight=c.foot**2, orientation_weight=1.0, priority=1, gain=gain
+        )
         for name, p, R in zip(work.feet, work.foot_positions, work.foot_rotations, strict=True)
     }
     if work.feet:

@@ -107,7 +107,7 @@ def _in_osik(
 ) -> np.ndarray:
     """With ``lm_damping``: mink's term, the squared weighted error, added to the damping of the scheme."""
     points, rotation = target_at(robot, where)
-    hand = osik.FrameTask(robot, "pinch", gain=1.0 / DT, error=error)
+    hand = osik.FrameTask(robot, "pinch", orientation_weight=1.0, gain=1.0 / DT, error=error)
     others = {
         "posture": osik.PostureTask(robot, target=START, weight=np.r_[np.zeros(2), np.full(8, 1e-6)], gain=1.0 / DT),
         "base": osik.DampingTask(robot, joints=("x", "y", "turn"), weight=100.0**2),

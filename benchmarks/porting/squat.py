@@ -90,7 +90,9 @@ def _in_osik(g1: G1, start: np.ndarray, error: Any, limit_gain: float, curvature
     whole: dict[str, Any] = dict(position_weight=200.0**2, orientation_weight=10.0**2, **shared)
     point: dict[str, Any] = dict(rows="position", weight=4.0**2, **shared)
     tasks: dict[str, osik.Task] = {
-        "pelvis": osik.FrameTask(robot, "pelvis", target=poses["pelvis"], rows="orientation", weight=100.0, **shared),
+        "pelvis": osik.FrameTask(
+            robot, "pelvis", target=poses["pelvis"], rows="orientation", orientation_weight=100.0, **shared
+        ),
         "com": osik.ComTask(robot, weight=200.0**2, gain=gain),
         "posture": osik.PostureTask(robot, target=g1.configuration(start), weight=0.01, gain=gain),
         **{foot: osik.FrameTask(robot, foot, target=poses[foot], **whole) for foot in FEET},

@@ -87,7 +87,7 @@ def _in_osik(
     for frame, pose in targets.items():
         options: dict[str, Any] = dict(target=pose, error=error, gain=gain)
         if frame in FEET:
-            tasks[frame] = osik.FrameTask(robot, frame, weight=100.0, **options)
+            tasks[frame] = osik.FrameTask(robot, frame, weight=100.0, orientation_weight=1.0, **options)
         elif turned:
             tasks[frame] = osik.FrameTask(robot, frame, position_weight=4.0, orientation_weight=0.25, **options)
         else:

@@ -17,6 +17,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
+from ..kinematics import forward_kinematics
 from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
 from ..robot import Robot
@@ -24,10 +25,15 @@ from ..robot._made_for import check_made_for, check_robot
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
 from ..schemes._default import priorities
-from ..tasks import Task, TaskRows
+from ..tasks import DampingTask, LowAccelerationTask, Task, TaskRows
+from ..tasks._rows import rows_of
 
 _DIVERGES = 2.0
 """An error e becomes (1 - gain dt) e in a step."""
+_SPAN = 1e-3
+"""Singular value of rows of length 1 below which they leave a direction free, and what then counts as 0."""
+CALMING = (LowAccelerationTask, DampingTask)
+"""Tasks that are asked to calm a motion, which they cannot beneath tasks that leave no freedom."""
 _DEGREES = 6.5
 """Configurations without larger numbers are not looked at for degrees: those would be less than a turn in radians."""
 
@@ -185,6 +191,52 @@ def warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task])
         f"a WeightedQP ignores priorities ({shown}): only weights count. For strict priorities use HierarchicalQP() or "
         "leave scheme out; else give all tasks the same priority"
     )
+
+
+_said_idle: set[tuple[Any, ...]] = set()
+"""Sets of tasks that ``warn_of_idle_tasks`` has looked at: whether priorities count, and each task's name and kind."""
+
+
+def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme | None) -> None:
+    """Warn, once for each set of tasks, of calming tasks beneath tasks that leave their joints no freedom at q.
+
+    The rank of the tasks above decides, not the number of their rows.
+    """
+    strict = not isinstance(scheme, WeightedQP)
+    above = {
+        name: [other for other, own in tasks.items() if own.hard or (strict and own.priority < task.priority)]
+        for name, task in tasks.items()
+        if isinstance(task, CALMING) and not task.hard
+    }
+    named = strict, *((name, type(task).__name__, task.priority, task.hard) for name, task in tasks.items())
+    if not any(above.values()) or named in _said_idle or _is_traced((robot, q, tasks)):
+        return
+    _said_idle.add(named)
+    rows = {name: np.asarray(own) for name, own in _equality_rows(robot, q, dict(tasks)).items()}
+    for name, others in above.items():
+        first = [rows[other] for other in others if other in rows]
+        if first and _span(np.concatenate(first), rows[name]):
+            warn(
+                f"the {type(tasks[name]).__name__} {name!r} does nothing: tasks that come first ({', '.join(others)}) "
+                "fix its joints. Use a lower gain against noise, or a WeightedQP, where its weight counts"
+            )
+
+
+@jax.jit
+def _equality_rows(robot: Robot, q: Array, tasks: dict[str, Task]) -> dict[str, Array]:
+    """Return the Jacobians of the equality tasks, without rows of weight 0. {name: (m, nv)}."""
+    rows = rows_of(robot, forward_kinematics(robot, q), q, tasks)
+    return {name: (r.weight > 0.0)[:, None] * r.jacobian for name, r in rows.items() if r.is_equality}
+
+
+def _span(above: np.ndarray, rows: np.ndarray) -> bool:
+    """Return whether rows (m, nv) are combinations of the rows above (k, nv): no motion that keeps these moves them."""
+    if not np.isfinite(above).all():
+        return False
+    lengths = np.linalg.norm(above, axis=1, keepdims=True)
+    _, sizes, basis = np.linalg.svd(above / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
+    basis = basis[sizes > _SPAN * max(float(sizes.max(initial=0.0)), 1.0)]
+    return bool(np.abs(rows - rows @ basis.T @ basis).max(initial=0.0) < _SPAN)
 
 
 def _is_traced(tree: Any) -> bool:

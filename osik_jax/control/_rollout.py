@@ -28,6 +28,7 @@ from ._checks import (
     checked_configuration,
     checked_limits,
     checked_start,
+    warn_of_idle_tasks,
     warn_of_ignored_priorities,
     warn_of_large_gains,
 )
@@ -99,6 +100,7 @@ def rollout(
     if not callable(tasks):
         warn_of_large_gains(tasks, dt)
         warn_of_ignored_priorities(scheme, tasks)
+        warn_of_idle_tasks(robot, q0, tasks, scheme)
     path = _rollout(
         robot,
         q0,

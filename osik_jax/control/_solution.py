@@ -16,7 +16,8 @@ class Solution(eqx.Module):
             status: SOLVED, the optimum; INFEASIBLE, the least violation of hard rows; MAX_ITERATIONS, a step in the
             box that costs no more than standing still; NUMERICAL_ERROR, zero, clipped into the box.
             (nv,)
-        status: a ``Status`` code.
+        status: a ``Status`` code. SOLVED says that no velocity serves the tasks better, not that targets are near:
+            ``explain_step`` and ``explain_rollout`` say how near they are, and what stops the robot.
         iterations: changes of the active set, all levels together.
         factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
         kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``), of

@@ -36,6 +36,7 @@ from ._checks import (
     checked_limits,
     solved_with,
     warn_of_degrees,
+    warn_of_idle_tasks,
     warn_of_ignored_priorities,
     warn_of_large_gains,
 )
@@ -92,7 +93,8 @@ def solve(
     Warns:
         OsikWarning: a robot that has float32 numbers while ``jax_enable_x64`` is on; numbers that are probably in other
             units: a joint far outside its range, or a gain times dt above 2; once for each set of tasks, priorities
-            that differ while ``scheme`` is a ``WeightedQP``, which ignores them.
+            that differ while ``scheme`` is a ``WeightedQP``, which ignores them, and a ``LowAccelerationTask`` or
+            ``DampingTask`` beneath tasks that leave its joints no freedom.
     """
     check_setting("solve(robot, q, tasks)", robot, scheme, dt)
     limits = checked_limits(robot, limits)
@@ -103,6 +105,7 @@ def solve(
     warn_of_degrees(robot, q)
     warn_of_large_gains(tasks, dt)
     warn_of_ignored_priorities(scheme, tasks)
+    warn_of_idle_tasks(robot, q, tasks, scheme)
     solution = step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
     watch_memory_maps("solve", step)
     return solution

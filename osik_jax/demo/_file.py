@@ -60,7 +60,15 @@ def file_motion(
         q0 = raised(robot, q0, -robot_outline(robot, q0, look).lowest)
     kinematics = forward_kinematics(robot, q0)
     still: dict[str, Task] = {
-        foot: FrameTask(robot, foot, target=kinematics.frame_pose(robot, foot), rows=rows, weight=1e4, gain=GAIN)
+        foot: FrameTask(
+            robot,
+            foot,
+            target=kinematics.frame_pose(robot, foot),
+            rows=rows,
+            weight=1e4,
+            orientation_weight=1.0,  # soles have to stay level
+            gain=GAIN,
+        )
         for foot in standing
     }
     # weak and slow: the posture only decides between motions that serve the other tasks

@@ -95,8 +95,9 @@ class Motion:
 
 def tracking(robot: Robot, goal: Goal, *, weight: float, priority: int) -> FrameTask:
     """Return the task that follows a goal, with its target at the start of the path."""
-    pose = (goal.path.position, goal.path.rotation)
-    return FrameTask(robot, goal.frame, target=pose, rows=goal.rows, weight=weight, gain=GAIN, priority=priority)
+    numbers: Any = dict(target=(goal.path.position, goal.path.rotation), weight=weight, gain=GAIN, priority=priority)
+    # a radian counts as 1 m: feet and waist have to stay level
+    return FrameTask(robot, goal.frame, rows=goal.rows, orientation_weight=1.0, **numbers)
 
 
 def along(task: FrameTask, goal: Goal, t: Any) -> FrameTask:

@@ -41,7 +41,8 @@ def start(robot: Robot, outline: Outline, moving: str, standing: Sequence[str], 
     if not standing:
         return _dexterous(robot, outline, moving)
     home = home_kinematics(robot)
-    feet = [FrameTask(robot, foot, target=home.frame_pose(robot, foot), rows=rows) for foot in standing]
+    poses = {foot: home.frame_pose(robot, foot) for foot in standing}
+    feet = [FrameTask(robot, foot, target=pose, rows=rows, orientation_weight=1.0) for foot, pose in poses.items()]
     p, R = home.frame_pose(robot, moving)
     ground = min(float(foot.target[0][2]) for foot in feet)
     sunk = p - jnp.array([0.0, 0.0, _SINK * (float(p[2]) - ground)])

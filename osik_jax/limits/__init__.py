@@ -1,4 +1,4 @@
-"""Limits: hard bounds on the velocity, feasible by construction."""
+"""Limits: hard bounds on the velocity. Those of single joints form a box, which is never empty."""
 
 from ._acceleration import AccelerationLimit as AccelerationLimit
 from ._barrier import PositionBarrier as PositionBarrier

@@ -8,16 +8,16 @@ from jaxtyping import Array, Float
 from ..robot import Robot
 from ..robot._size import robot_size
 
-_BACKGROUND = 1e-3
-"""Default weight of a background task, small against other tasks of the same priority."""
+_BACKGROUND = 1e-4
+"""Default weight of a background task: small against the positions and, 100 times less so, orientations of a pose."""
 _FULL_SIZE = 0.5
 """Robot size [m] from which joint angles have their full weight."""
-_LEAST_SIZE = 0.005
+_LEAST_SIZE = 0.016
 """Robot size [m] below which the weight stays constant, so that it stays above the schemes' damping."""
 
 
 def background_weight(robot: Robot) -> Float[Array, ""] | float:
-    """Return the default weight of background rows of joint angles: 1e-3 for robots of half a metre or more.
+    """Return the default weight of background rows of joint angles: 1e-4 for robots of half a metre or more.
 
     A joint moves a frame by its angle times a lever arm, so squared angles outweigh squared distances on a small robot.
     Below half a metre the weight falls with the square of the robot's size (``robot_size``).

@@ -20,7 +20,7 @@ from ..robot import Robot
 from ._core_rows import Fields, equality_rows, fields_by_core
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
-from ._pose import PoseTask, goal_arguments, pose_fields
+from ._pose import RADIAN, PoseTask, goal_arguments, pose_fields
 from ._targets import PoseLike
 from ._task import DEFAULT_GAIN, TaskRows
 
@@ -55,6 +55,8 @@ class FrameTask(PoseTask):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         position_weight: weight of the squared position rows, scalar or (3,) along the axes of ``axes``.
         orientation_weight: weight of the squared orientation rows, scalar or (3,). A row of weight 0 costs nothing.
+            Beside a ``position_weight`` of 1 it is the square of the length [m] that a radian counts as. The default,
+            0.01, is a length of 0.1 m, as in ``inverse_kinematics``; 1 is a length of 1 m.
         weight: multiplies all rows' weights.
         rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
             that the task has. Static; weights are not.
@@ -82,7 +84,7 @@ class FrameTask(PoseTask):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         position_weight: ArrayLike | Array = 1.0,
-        orientation_weight: ArrayLike | Array = 1.0,
+        orientation_weight: ArrayLike | Array = RADIAN**2,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
         axes: Literal["world", "frame"] | None = None,

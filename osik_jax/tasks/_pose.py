@@ -27,6 +27,10 @@ from ._targets import Pose, PoseLike, as_pose
 from ._task import TaskRows, check_priority
 from ._twist import pose_log, seen_from
 
+RADIAN = 0.1
+"""Length [m] that an error of one radian counts as in pose tasks by default, and in ``inverse_kinematics``: a hand that
+turns by a radian about its wrist moves its fingertips by about this.
+"""
 _ROWS = {
     "pose": (True,) * 6,
     "position": (True,) * 3 + (False,) * 3,

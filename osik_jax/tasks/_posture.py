@@ -43,8 +43,8 @@ class PostureTask(Task):
             Default: all but the free base, which has to be named to take part.
         weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
             globs to weights, in which a joint that is not named has 0. Default: 1 where joints are named, and for
-            bounds; for a target of the whole robot 1e-3, so that other tasks win, and less on a robot whose size s, the
-            longest way along its links, is below half a metre: 1e-3 (s / 0.5 m)^2.
+            bounds; for a target of the whole robot 1e-4, so that other tasks win, and less on a robot whose size s, the
+            longest way along its links, is below half a metre: 1e-4 (s / 0.5 m)^2.
         gain: [1/s], a number or an ``AdaptiveGain``.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.

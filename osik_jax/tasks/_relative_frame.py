@@ -16,7 +16,7 @@ from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
-from ._pose import PoseTask
+from ._pose import RADIAN, PoseTask
 from ._rotation import cross_matrix, dot
 from ._targets import Pose, PoseLike
 from ._task import DEFAULT_GAIN, TaskRows
@@ -40,7 +40,8 @@ class RelativeFrameTask(PoseTask):
         lower: makes an inequality task: lower bounds on the rows of e, one for each row that is kept, or a scalar.
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         position_weight: weight of the squared position rows, scalar or (3,) along the axes of ``axes``.
-        orientation_weight: weight of the squared orientation rows, scalar or (3,). A row of weight 0 costs nothing.
+        orientation_weight: weight of the squared orientation rows, scalar or (3,), see ``FrameTask``. A row of weight 0
+            costs nothing.
         weight: multiplies all rows' weights.
         rows: ``"pose"``, ``"position"``, ``"orientation"``, or six booleans (x, y, z, rotation about x, y, z): the rows
             that the task has. Static; weights are not.
@@ -70,7 +71,7 @@ class RelativeFrameTask(PoseTask):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         position_weight: ArrayLike | Array = 1.0,
-        orientation_weight: ArrayLike | Array = 1.0,
+        orientation_weight: ArrayLike | Array = RADIAN**2,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
         axes: Literal["root", "frame"] | None = None,

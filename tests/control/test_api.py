@@ -95,7 +95,7 @@ def test_errors_are_of_one_family_and_print_plainly(arm):
 
 def test_a_posture_lets_other_tasks_win(arm, pose):
     background, named = osik.PostureTask(arm), osik.PostureTask(arm, joints=("*",))
-    assert (background.weight == 1e-3).all()
+    assert (background.weight == 1e-4).all()
     assert (named.weight == 1.0).all() and (osik.PostureTask(arm, upper=1.0).weight == 1.0).all()
     hand = osik.FrameTask(arm, "hand", gain=5.0).replace(target=pose)
     scheme = osik.WeightedQP(curvature_damping=0.0)  # which would keep the hand back too
@@ -151,3 +151,28 @@ class TestDefaultScheme:
             warnings.simplefilter("error")
             osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP())
             osik.solve(arm, arm.q0, {**tasks, "other": hand})
+
+    @pytest.mark.parametrize("task", [osik.LowAccelerationTask, osik.DampingTask])
+    def test_a_calming_task_beneath_tasks_that_leave_no_freedom_is_named_once(self, arm, task):
+        hand = osik.FrameTask(arm, "hand", priority=1)
+        fixed = {"hand": hand, "rest": osik.PostureTask(arm, priority=2), "idle": task(arm, priority=3)}
+        with pytest.warns(osik.OsikWarning, match=f"the {task.__name__} 'idle' does nothing.* .hand, rest."):
+            osik.solve(arm, arm.q0, fixed)
+        # nine rows of rank six above seven joints leave freedom: the rank counts
+        more = {"hand": hand, "again": osik.FrameTask(arm, "hand", rows="position", priority=2)}
+        free = {**more, "calm": task(arm, priority=3)}
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            osik.solve(arm, arm.q0, fixed)
+            osik.rollout(arm, arm.q0, free, steps=1)
+            osik.solve(arm, arm.q0, {"hand": hand, "calm": task(arm)})
+            jax.jit(lambda q: osik.solve(arm, q, {**fixed, "traced": hand}).velocity)(arm.q0)
+
+    @pytest.mark.filterwarnings("ignore:the LowAccelerationTask")
+    def test_a_task_of_which_it_is_said_that_it_does_nothing_does_nothing(self, arm):
+        above = {"hand": osik.FrameTask(arm, "hand", priority=1), "rest": osik.PostureTask(arm, priority=2)}
+        smooth = osik.LowAccelerationTask(arm, velocity=1.0, weight=10.0, priority=3)
+        q = arm.q0 + 0.1
+        alone, both = (osik.solve(arm, q, {**above, **extra}).velocity for extra in ({}, {"smooth": smooth}))
+        np.testing.assert_allclose(both, alone, atol=1e-6)
+        assert np.abs(alone).max() > 0.1

@@ -226,10 +226,19 @@ class TestWeightedQP:
         posture = np.array(robot.q0)
         posture[robot.joint_qpos_index("left_shoulder_pitch_joint")] -= 0.8
         ours = {
-            **{foot: osik.FrameTask(robot, foot, axes="frame", weight=25.0, gain=gain) for foot in feet},
+            **{
+                foot: osik.FrameTask(robot, foot, axes="frame", weight=25.0, orientation_weight=1.0, gain=gain)
+                for foot in feet
+            },
             "com": osik.ComTask(robot, target=goal, weight=4.0, gain=gain),
             "turn": osik.FrameTask(
-                robot, turn, target=(np.zeros(3), R), axes="frame", rows="orientation", weight=0.25, gain=gain
+                robot,
+                turn,
+                target=(np.zeros(3), R),
+                axes="frame",
+                rows="orientation",
+                orientation_weight=0.25,
+                gain=gain,
             ),
             "posture": osik.PostureTask(robot, target=posture, weight=0.01, gain=gain),
         }

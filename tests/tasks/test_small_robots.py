@@ -50,13 +50,13 @@ class TestSize:
 class TestWeights:
     @pytest.mark.parametrize("kind", [osik.PostureTask, osik.DampingTask, osik.LowAccelerationTask])
     def test_the_default_falls_with_the_square_of_the_size(self, arm, kind):
-        for k, expected in ((1.0, 1e-3), (0.5, 1e-3), (0.25, 0.25e-3), (0.05, 1e-5), (0.001, 1e-7)):
+        for k, expected in ((1.0, 1e-4), (0.5, 1e-4), (0.25, 0.25e-4), (0.05, 1e-6), (0.001, 1.024e-7)):
             np.testing.assert_allclose(kind(arm.scaled(length=k)).weight, expected, rtol=1e-6)
         np.testing.assert_allclose(kind(arm.scaled(length=0.05), weight=1e-3).weight, 1e-3)
 
     @pytest.mark.parametrize("name", ["arm7", "nao"])
     def test_the_embedded_robots_keep_theirs(self, name):
-        assert float(osik.PostureTask(osik.load_robot(name)).weight) == 1e-3
+        assert float(osik.PostureTask(osik.load_robot(name)).weight) == 1e-4
 
     def test_named_joints_and_bounds_keep_a_weight_of_1(self, arm):
         small = arm.scaled(length=0.05)
@@ -65,7 +65,7 @@ class TestWeights:
 
     def test_in_a_batch_of_sizes(self, arm):
         weights = jax.vmap(lambda k: osik.PostureTask(arm.scaled(length=k)).weight)(jnp.array([0.05, 0.25, 2.0]))
-        np.testing.assert_allclose(weights, [1e-5, 0.25e-3, 1e-3], rtol=1e-9)
+        np.testing.assert_allclose(weights, [1e-6, 0.25e-4, 1e-4], rtol=1e-9)
 
 
 @pytest.mark.variants(slow=["0.2"], release=["0.05"])

@@ -155,7 +155,7 @@ class TestAgainstPeers:
         expected = mink.solve_ik(configuration, theirs, DT, "daqp", limits=[], constraints=[frozen])
         ours = {
             "hand": osik.FrameTask(
-                arm, "hand", target=(np.zeros(3), turn), rows="orientation", axes="frame", weight=4.0
+                arm, "hand", target=(np.zeros(3), turn), rows="orientation", axes="frame", orientation_weight=4.0
             ),
             "posture": osik.PostureTask(arm, target=wanted, weight=0.09, gain=0.05 / DT),
             "damping": osik.DampingTask(arm, weight=0.04),

@@ -1,5 +1,6 @@
 """FrameTask, and the rotations that it rests on, against mink, Pinocchio, SciPy and exact solutions."""
 
+import inspect
 import math
 from functools import partial
 
@@ -25,6 +26,18 @@ SMALL = """
   </body>
 </worldbody></mujoco>
 """
+# six joints whose forearm and wrist rolls are in line where the pitch of the wrist, joint 5, is 0
+_LINKS = {"1": ("0 0 .1", "0 0 1"), "2": ("0 0 0", "0 1 0"), "3": (".05 0 .3", "0 1 0"), "4": (".2 0 0", "1 0 0")}
+_LINKS |= {"5": (".1 0 0", "0 1 0"), "tool": (".17 0 0", "1 0 0")}
+WRISTED = (
+    '<mujoco><compiler angle="radian"/><worldbody>'
+    + "".join(
+        f'<body name="{name}" pos="{place}"><joint name="j{name}" axis="{axis}" range="-3 3"/><geom size=".02"/>'
+        for name, (place, axis) in _LINKS.items()
+    )
+    + "</body>" * len(_LINKS)
+    + "</worldbody></mujoco>"
+)
 
 
 @pytest.fixture
@@ -214,3 +227,50 @@ class TestMistakes:
     )
     def test_frame_task(self, arm, options, error, message):
         refuses(error, message, osik.FrameTask, arm, "hand", **options)
+
+
+class TestLengthOfARadian:
+    """An orientation error beside a position error: one length for a radian in the loop and in inverse kinematics."""
+
+    def test_it_is_the_ratio_of_the_tolerances_of_inverse_kinematics(self, arm: osik.Robot) -> None:
+        defaults = inspect.signature(osik.inverse_kinematics).parameters
+        length = defaults["position_tolerance"].default / defaults["orientation_tolerance"].default
+        for task in (osik.FrameTask(arm, "hand"), osik.RelativeFrameTask(arm, "hand", "link3")):
+            np.testing.assert_allclose(task.orientation_weight / task.position_weight, length**2, rtol=1e-12)
+
+    def test_the_loop_rests_where_inverse_kinematics_finds_the_least_error(self, arm: osik.Robot) -> None:
+        """Out of reach the loop trades position for orientation as ``inverse_kinematics`` does."""
+        target = np.array([1.2, 0.3, 0.5]), np.array([0.0, 1.0, 0.0, 0.0])
+        least = osik.inverse_kinematics(arm, {"hand": target}, seeds=8, restarts=0)
+        hand = osik.FrameTask(arm, "hand", target=target)
+        path = osik.rollout(arm, least.q, {"hand": hand}, scheme=osik.WeightedQP(), dt=0.02, steps=100)
+        np.testing.assert_allclose(path.q[-1], least.q, atol=1e-3)
+        far = osik.rollout(arm, least.q, {"hand": hand.replace(orientation_weight=1.0)}, dt=0.02, steps=100)
+        assert np.abs(far.q[-1] - least.q).max() > 0.05  # with a radian as 1 m the least error is elsewhere
+
+    def test_a_posture_of_default_weight_lets_both_parts_of_a_pose_win(self, arm: osik.Robot) -> None:
+        away = arm.q0 + 0.5
+        target = jax.jit(osik.forward_kinematics)(arm, away).frame_pose(arm, "hand")
+        tasks = {"hand": osik.FrameTask(arm, "hand", target=target), "rest": osik.PostureTask(arm)}
+        path = osik.rollout(arm, arm.q0, tasks, scheme=osik.WeightedQP(), dt=0.02, steps=200)
+        error = np.abs(path.solution.error["hand"][-1])
+        assert error[:3].max() < 1e-3 and error[3:].max() < 1e-2  # the tolerances of inverse kinematics
+
+    def test_a_turn_past_a_singular_wrist_keeps_the_position(self) -> None:
+        """A tool turns at 0.5 rad/s and passes the wrist's singularity at 0.06 rad; the speed limits stop the rolls."""
+        robot, dt, steps = osik.Robot.from_mjcf(WRISTED, velocity_limits={"*": 3.0}), 0.02, 100
+        q = np.array([0.0, 0.4, 0.8, 0.0, -0.5, 0.0])
+        p, R = jax.jit(osik.forward_kinematics)(robot, q).frame_pose(robot, "tool")
+        about = np.outer(0.5 * dt * np.arange(1, steps + 1), [0.0, 1.0, 0.0])
+        aside = Rotation.from_rotvec([0.0, 0.0, 0.06]) * Rotation.from_matrix(np.asarray(R))
+        turned = jnp.array((Rotation.from_rotvec(about) * aside).as_matrix())
+        targets = {"tool": (jnp.tile(p, (steps, 1)), turned)}
+        task = osik.FrameTask(robot, "tool", gain=40.0)
+        lost = {}
+        for weight in (task.orientation_weight, 1.0):
+            tool = {"tool": task.replace(orientation_weight=weight)}
+            path = osik.rollout(robot, q, tool, dt=dt, steps=steps, targets=targets)
+            lost[float(np.mean(weight))] = np.abs(path.solution.error["tool"][:, :3]).max()
+            assert np.abs(path.q[:, 4]).min() < 0.05 and np.abs(path.solution.velocity).max() > 2.5
+        by_default, as_a_metre = lost.values()
+        assert by_default < 3e-3 and as_a_metre > 5e-2  # metres

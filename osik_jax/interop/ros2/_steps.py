@@ -125,7 +125,9 @@ def _default_tasks(robot: Robot, settings: Settings) -> tuple[dict[str, Task], t
     frames, feet = settings.frames or find_hands(robot), _support(robot, settings)
     if not frames:
         raise OsikValueError("no frame looks like a hand: name those that get targets in the setting frames")
-    tasks: dict[str, Task] = {foot: FrameTask(robot, foot, weight=_SUPPORT, gain=_GAIN) for foot in feet}
+    tasks: dict[str, Task] = {
+        foot: FrameTask(robot, foot, weight=_SUPPORT, orientation_weight=1.0, gain=_GAIN) for foot in feet
+    }
     if feet:
         tasks["centre of mass"] = ComTask(robot, axes="xy", weight=_BALANCE, gain=_GAIN)
     for frame in frames:

@@ -41,8 +41,8 @@ def default_session(
     poses = forward_kinematics(robot, start)
     flat = "pose" if len(feet) <= 2 else "position"
     tasks: dict[str, Task] = {
-        foot: FrameTask(robot, foot, target=poses.frame_pose(robot, foot), rows=flat, weight=WEIGHTS["foot"])
-        for foot in feet
+        foot: FrameTask(robot, foot, target=pose, rows=flat, weight=WEIGHTS["foot"], orientation_weight=1.0)
+        for foot, pose in ((foot, poses.frame_pose(robot, foot)) for foot in feet)
     }
     if polygon is not None:
         tasks["balance"] = ComTask(robot, polygon=polygon, weight=WEIGHTS["balance"], gain=_GAIN, priority=2)

@@ -1,0 +1,267 @@
+"""What stops a control step, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from ..control._checks import check_setting, check_target_names, check_tasks, checked_configuration, checked_limits
+from ..control._step import Targets, Tasks, aim, in_type_of, step, velocity_problem
+from ..kinematics import forward_kinematics
+from ..limits import (
+    AccelerationLimit,
+    CollisionAvoidanceLimit,
+    ConfigurationLimit,
+    Limit,
+    Limits,
+    VelocityLimit,
+    with_own_limits,
+)
+from ..robot import Robot
+from ..robot._joint_selection import dof_names
+from ..schemes import Scheme, VelocityProblem, WeightedQP
+from ..schemes._default import scheme_for
+from ..solvers import Status
+from ..tasks import Task
+from ._goals import as_tolerances, check_concrete, errors_of, in_words
+
+_PUSHED = 1e-3
+"""A bound or a task stops a goal if the goal's force on it is at least this, relative to the largest possible one."""
+_AT_BOUND = 1e-6
+"""Distance to a bound on a velocity, relative to the bound or 1, up to which the velocity is at the bound."""
+_AT_REST = 1e-3
+"""Speed of the fastest joint [rad/s or m/s] up to which a robot counts as at rest."""
+_NEAR = 5e-3
+"""Pairs of shapes are named if they are nearer than this to their least distance [m]."""
+_BOUNDS = {ConfigurationLimit: "limit", VelocityLimit: "speed limit", AccelerationLimit: "acceleration limit"}
+
+
+class StepVerdict(NamedTuple):
+    """Verdict on a control step; ``print`` shows it in words.
+
+    Attributes:
+        status: of the step.
+        missed: the goals that are beyond their tolerance: error [m] and [rad], by task name. {name: (2,)}
+        joints: names of the joints whose bounds stop a missed goal.
+        pairs: names of the shapes that may come no nearer and stop a missed goal.
+        tasks: names of the tasks that stop a missed goal: of a higher priority, or pulling the other way.
+        text: the verdict in words.
+    """
+
+    status: Status
+    missed: dict[str, Float[np.ndarray, "2"]]
+    joints: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    tasks: tuple[str, ...]
+    text: str
+
+    def __str__(self) -> str:
+        return self.text
+
+
+class _Stops(NamedTuple):
+    """What stops one goal.
+
+    Attributes:
+        joints: -1 or 1 where a dof's lower or upper bound does, else 0. (nv,)
+        limits: whether the rows of each limit do.
+        tasks: whether each other task does, by name.
+        stretched: whether the goal has no force on the dofs that are not at a bound.
+    """
+
+    joints: Array
+    limits: list[Array]
+    tasks: dict[str, Array]
+    stretched: Array
+
+
+class _Measured(NamedTuple):
+    """Numbers of a step from which its verdict is made.
+
+    Attributes:
+        status: of the step.
+        speed: of the fastest joint [rad/s or m/s].
+        errors: of each goal: [m] and [rad]. {name: (2,)}
+        stops: by goal.
+        tightest: the place of the limit that gives each dof's lower and upper bound. (2, nv)
+        gaps: of each collision limit, the distances of its pairs less the least ones [m].
+    """
+
+    status: Any
+    speed: Any
+    errors: dict[str, Any]
+    stops: dict[str, _Stops]
+    tightest: Any
+    gaps: list[Any]
+
+
+class _Reasons(NamedTuple):
+    lines: list[str]
+    joints: list[str]
+    pairs: list[tuple[str, str]]
+    tasks: list[str]
+
+
+def explain_step(
+    robot: Robot,
+    q: Num[ArrayLike, " nq"] | Sequence[float],
+    tasks: Tasks,
+    *,
+    scheme: Scheme | None = None,
+    limits: Limits | None = None,
+    dt: float = 0.005,
+    targets: Targets | None = None,
+    position_tolerance: float = 1e-3,
+    orientation_tolerance: float = 1e-2,
+) -> StepVerdict:
+    """Return what stops the tasks at configuration q: joints at their bounds, near shapes, other tasks.
+
+    It takes the arguments of ``solve`` and solves the step again, outside of ``jit``. A goal is a task on where
+    something is (``FrameTask``, ``ComTask`` and so on), or a hard task with an error; postures and dampings are none.
+
+    Args:
+        robot: the robot.
+        q: configuration, such as the last one of a rollout. (nq,)
+        tasks: as in ``solve``.
+        scheme: as in ``solve``.
+        limits: as in ``solve``.
+        dt: as in ``solve``.
+        targets: as in ``solve``.
+        position_tolerance: error up to which a goal is met [m]; errors in other units count as metres.
+        orientation_tolerance: the same for angles [rad].
+
+    Raises:
+        KeyError, TypeError, ValueError: as in ``solve``; something is traced, or a tolerance is not positive.
+    """
+    check_concrete("explain_step", robot, q, tasks, targets)
+    check_setting("explain_step(robot, q, tasks)", robot, scheme, dt)
+    limits = checked_limits(robot, limits)
+    check_tasks(tasks, robot)
+    check_target_names(tasks, targets)
+    q = checked_configuration(robot, q)
+    aimed, allowed = aim(dict(tasks), targets), as_tolerances(position_tolerance, orientation_tolerance)
+    bounds = with_own_limits(robot, limits)
+    chosen = scheme_for(aimed, q.dtype) if scheme is None else scheme
+    measured = jax.device_get(_measured(robot, q, aimed, chosen, bounds, in_type_of(dt, q)))
+    missed = {name: error for name, error in measured.errors.items() if (error > allowed).any()}
+    reasons = {name: _reasons(robot, measured, bounds, name) for name in missed}
+    return _verdict(measured, missed, reasons)
+
+
+def _verdict(measured: _Measured, missed: dict[str, Any], reasons: Mapping[str, _Reasons]) -> StepVerdict:
+    status, speed = Status(int(measured.status)), float(measured.speed)
+    moving = "at rest" if speed <= _AT_REST else f"moving, the fastest joint at {speed:.3g} rad/s or m/s"
+    lines = [f"{status.name}, {moving}"]
+    for name, error in measured.errors.items():
+        lines.append(f"{name}: {'' if name in missed else 'met, '}{in_words(error)} off")
+        lines += [f"  {line}" for line in reasons[name].lines] if name in missed else []
+    joints, pairs, tasks = (
+        tuple(dict.fromkeys(name for own in reasons.values() for name in getattr(own, kind)))
+        for kind in ("joints", "pairs", "tasks")
+    )
+    return StepVerdict(status, missed, joints, pairs, tasks, "\n".join(lines))
+
+
+@jax.jit
+def _measured(
+    robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array
+) -> _Measured:
+    answer, kinematics = step(robot, q, tasks, scheme, limits, dt), forward_kinematics(robot, q)
+    problem, v = velocity_problem(robot, kinematics, q, tasks, limits, dt), answer.velocity
+    errors, slack = errors_of(robot, q, tasks), problem.slack(v)
+    boxes = jnp.stack([jnp.stack(limit.box(robot, q, dt)) for limit in limits])
+    own = [limit.rows(robot, kinematics, q, dt) for limit in limits]
+
+    def stops(goal: str) -> _Stops:
+        rows = problem.rows[goal]
+        force = rows.jacobian.T @ (rows.weight * slack[goal])
+        most = jnp.sqrt(rows.weight @ slack[goal] ** 2) * jnp.sqrt(rows.weight @ rows.jacobian**2)
+        pushed = jnp.abs(force) > _PUSHED * most
+        low, high = _at(v, problem.lower, problem.upper)
+        joints = jnp.where(pushed & high & (force < 0.0), 1, jnp.where(pushed & low & (force > 0.0), -1, 0))
+        free = jnp.where(joints == 0, force, 0.0)
+        by_limits = [
+            jnp.zeros((), bool) if of is None else _stopping(of.jacobian, of.lower, of.upper, v, free) for of in own
+        ]
+        by_tasks = {name: _in_the_way(problem, name, goal, scheme, v, slack, free) for name in tasks if name != goal}
+        return _Stops(joints, by_limits, by_tasks, ~(pushed & (joints == 0)).any())
+
+    gaps = [
+        limit.distances(robot, kinematics) - limit.minimum_distance
+        for limit in limits
+        if isinstance(limit, CollisionAvoidanceLimit)
+    ]
+    tightest = jnp.stack([jnp.argmax(boxes[:, 0], 0), jnp.argmin(boxes[:, 1], 0)])
+    speed = jnp.max(jnp.abs(v), initial=0.0)
+    return _Measured(answer.status, speed, errors, {name: stops(name) for name in errors}, tightest, gaps)
+
+
+def _at(value: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return whether each value is at its lower, and at its upper bound."""
+    near = _AT_BOUND * jnp.maximum(1.0, jnp.abs(value))
+    return value <= lower + near, value >= upper - near
+
+
+def _stopping(jacobian: Array, lower: Array, upper: Array, v: Array, force: Array) -> Array:
+    """Return whether an active row of these keeps v from going on against a force (the gradient of a goal's cost)."""
+    low, high = _at(jacobian @ v, lower, upper)
+    along = jacobian @ force
+    most = _PUSHED * jnp.linalg.norm(jacobian, axis=1) * jnp.linalg.norm(force)
+    return ((low & (along > most)) | (high & (along < -most))).any()
+
+
+def _in_the_way(
+    problem: VelocityProblem, name: str, goal: str, scheme: Scheme, v: Array, slack: dict[str, Array], force: Array
+) -> Array:
+    """Return whether a task stops a goal: it comes first and its active rows feel the force, or it pulls against it."""
+    rows, rank = problem.rows[name], dict(problem.priorities)
+    hard = name in problem.hard
+    if hard or (goal not in problem.hard and not isinstance(scheme, WeightedQP) and rank[name] < rank[goal]):
+        return _stopping(jnp.where(rows.weight[:, None] > 0.0, rows.jacobian, 0.0), rows.lower, rows.upper, v, force)
+    against = (rows.jacobian.T @ (rows.weight * slack[name])) @ force
+    return against < -_PUSHED * jnp.sum(force**2)
+
+
+def _reasons(robot: Robot, measured: _Measured, limits: Sequence[Limit], goal: str) -> _Reasons:
+    """Return what stops a goal, one sentence each, with the names of joints, shapes and tasks."""
+    stops, names = measured.stops[goal], dof_names(robot)
+    dofs, pairs = np.flatnonzero(stops.joints), _near_pairs(measured, limits, stops)
+    lines = [
+        f"{names[i]} is at its {('lower', 'upper')[upper]} {_bound(limits[int(measured.tightest[upper, i])])}"
+        for i, upper in ((i, int(stops.joints[i] > 0)) for i in dofs)
+    ]
+    lines += [f"{one} and {other} are {gap:+.3g} m from as near as they may be" for (one, other), gap in pairs.items()]
+    lines += [
+        f"a {type(limit).__name__} stops it"
+        for limit, stopping in zip(limits, stops.limits, strict=True)
+        if stopping and not isinstance(limit, CollisionAvoidanceLimit)
+    ]
+    tasks = [name for name, stopping in stops.tasks.items() if stopping]
+    if tasks:
+        lines.append(f"other tasks come first or pull the other way: {', '.join(tasks)}")
+    if not lines:
+        links = "the links are stretched, folded or turned as far as they go"
+        lines.append(f"no limit and no task stops it: {links if stops.stretched else 'it is on its way'}")
+    return _Reasons(lines, [names[i] for i in dofs], list(pairs), tasks)
+
+
+def _near_pairs(measured: _Measured, limits: Sequence[Limit], stops: _Stops) -> dict[tuple[str, str], float]:
+    """Return the pairs of the collision limits that stop a goal: those nearer than ``_NEAR``, else the nearest one."""
+    avoiding = [limit for limit in limits if isinstance(limit, CollisionAvoidanceLimit)]
+    stopping = [bool(own) for limit, own in zip(limits, stops.limits, strict=True) if limit in avoiding]
+    return {
+        limit.pairs[at]: float(gaps[at])
+        for limit, gaps, stops_it in zip(avoiding, measured.gaps, stopping, strict=True)
+        if stops_it
+        for at in np.flatnonzero(gaps <= max(_NEAR, gaps.min()))
+    }
+
+
+def _bound(limit: Limit) -> str:
+    """Return what the bound of a limit is called."""
+    return _BOUNDS.get(type(limit), f"bound of a {type(limit).__name__}")
