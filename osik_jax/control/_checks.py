@@ -202,17 +202,22 @@ def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme
 
     The rank of the tasks above decides, not the number of their rows.
     """
+    calming = [name for name, task in tasks.items() if type(task) in CALMING and not task.hard]
+    if not calming:
+        return
     strict = not isinstance(scheme, WeightedQP)
     above = {
-        name: [other for other, own in tasks.items() if own.hard or (strict and own.priority < task.priority)]
-        for name, task in tasks.items()
-        if isinstance(task, CALMING) and not task.hard
+        name: [other for other, own in tasks.items() if own.hard or (strict and own.priority < tasks[name].priority)]
+        for name in calming
     }
+    if not any(above.values()) or _is_traced((robot, q, tasks)):
+        return
     named = strict, *((name, type(task).__name__, task.priority, task.hard) for name, task in tasks.items())
-    if not any(above.values()) or named in _said_idle or _is_traced((robot, q, tasks)):
+    if named in _said_idle:
         return
     _said_idle.add(named)
-    rows = {name: np.asarray(own) for name, own in _equality_rows(robot, q, dict(tasks)).items()}
+    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
+        rows = {name: np.asarray(own) for name, own in _equality_rows(robot, q, dict(tasks)).items()}
     for name, others in above.items():
         first = [rows[other] for other in others if other in rows]
         if first and _span(np.concatenate(first), rows[name]):

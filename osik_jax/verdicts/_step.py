@@ -84,7 +84,6 @@ class _Measured(NamedTuple):
     """Numbers of a step from which its verdict is made.
 
     Attributes:
-        status: of the step.
         speed: of the fastest joint [rad/s or m/s].
         errors: of each goal: [m] and [rad]. {name: (2,)}
         stops: by goal.
@@ -92,7 +91,6 @@ class _Measured(NamedTuple):
         gaps: of each collision limit, the distances of its pairs less the least ones [m].
     """
 
-    status: Any
     speed: Any
     errors: dict[str, Any]
     stops: dict[str, _Stops]
@@ -147,14 +145,18 @@ def explain_step(
     aimed, allowed = aim(dict(tasks), targets), as_tolerances(position_tolerance, orientation_tolerance)
     bounds = with_own_limits(robot, limits)
     chosen = scheme_for(aimed, q.dtype) if scheme is None else scheme
-    measured = jax.device_get(_measured(robot, q, aimed, chosen, bounds, in_type_of(dt, q)))
+    dt = in_type_of(dt, q)
+    answer = step(robot, q, aimed, scheme, limits, dt)  # the program of ``solve``
+    measured = jax.device_get(_measured(robot, q, aimed, chosen, bounds, dt, answer.velocity))
     missed = {name: error for name, error in measured.errors.items() if (error > allowed).any()}
     reasons = {name: _reasons(robot, measured, bounds, name) for name in missed}
-    return _verdict(measured, missed, reasons)
+    return _verdict(Status(int(answer.status)), measured, missed, reasons)
 
 
-def _verdict(measured: _Measured, missed: dict[str, Any], reasons: Mapping[str, _Reasons]) -> StepVerdict:
-    status, speed = Status(int(measured.status)), float(measured.speed)
+def _verdict(
+    status: Status, measured: _Measured, missed: dict[str, Any], reasons: Mapping[str, _Reasons]
+) -> StepVerdict:
+    speed = float(measured.speed)
     moving = "at rest" if speed <= _AT_REST else f"moving, the fastest joint at {speed:.3g} rad/s or m/s"
     lines = [f"{status.name}, {moving}"]
     for name, error in measured.errors.items():
@@ -169,10 +171,11 @@ def _verdict(measured: _Measured, missed: dict[str, Any], reasons: Mapping[str, 
 
 @jax.jit
 def _measured(
-    robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array
+    robot: Robot, q: Array, tasks: dict[str, Task], scheme: Scheme, limits: tuple[Limit, ...], dt: Array, v: Array
 ) -> _Measured:
-    answer, kinematics = step(robot, q, tasks, scheme, limits, dt), forward_kinematics(robot, q)
-    problem, v = velocity_problem(robot, kinematics, q, tasks, limits, dt), answer.velocity
+    """Return the errors at q and what stops each goal, from the step's velocity v."""
+    kinematics = forward_kinematics(robot, q)
+    problem = velocity_problem(robot, kinematics, q, tasks, limits, dt)
     errors, slack = errors_of(robot, q, tasks), problem.slack(v)
     boxes = jnp.stack([jnp.stack(limit.box(robot, q, dt)) for limit in limits])
     own = [limit.rows(robot, kinematics, q, dt) for limit in limits]
@@ -198,7 +201,7 @@ def _measured(
     ]
     tightest = jnp.stack([jnp.argmax(boxes[:, 0], 0), jnp.argmin(boxes[:, 1], 0)])
     speed = jnp.max(jnp.abs(v), initial=0.0)
-    return _Measured(answer.status, speed, errors, {name: stops(name) for name in errors}, tightest, gaps)
+    return _Measured(speed, errors, {name: stops(name) for name in errors}, tightest, gaps)
 
 
 def _at(value: Array, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -167,6 +167,9 @@ class TestDefaultScheme:
             osik.rollout(arm, arm.q0, free, steps=1)
             osik.solve(arm, arm.q0, {"hand": hand, "calm": task(arm)})
             jax.jit(lambda q: osik.solve(arm, q, {**fixed, "traced": hand}).velocity)(arm.q0)
+            jax.jit(lambda gain: gain * osik.solve(arm, arm.q0, {**more, "constant": task(arm, priority=3)}).velocity)(
+                2.0
+            )
 
     @pytest.mark.filterwarnings("ignore:the LowAccelerationTask")
     def test_a_task_of_which_it_is_said_that_it_does_nothing_does_nothing(self, arm):
