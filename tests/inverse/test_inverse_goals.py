@@ -100,6 +100,15 @@ def test_says_how_far_a_free_base_went():
     assert answer.converged and went > 0.4 and f"the base {went:.3g} m" in answer.explain()
 
 
+@pytest.mark.slow
+def test_wheels_stand_on_the_ground_and_may_slip():
+    robot = osik.Robot.from_mjcf(PLANAR.format(free='<freejoint name="base"/>'))
+    wheel = osik.WheelTask(robot, "hull", radius=0.05)
+    aside = REACH + np.array([0.2, 1.0, -0.05])
+    answer = found(robot, {"tip": tip(robot, aside), "wheel": wheel}, seeds=16)
+    assert answer.converged and abs(answer.q[2] - 0.05) < 1e-3 and abs(answer.q[1]) > 0.1
+
+
 def test_a_robot_without_a_free_base_has_none_that_moves(planar):
     assert found(planar, {"tip": REACH}).base_moved is None
 
