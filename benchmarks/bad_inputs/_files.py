@@ -38,7 +38,8 @@ def files(add: Add) -> None:
     add("an empty text", lambda: read(""), V, "empty")
     add("broken XML", lambda: read("<robot><link name='a'>"), V, "line 1, column 23", foreign=True)
     add("a xacro", lambda: read('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>'), V, "run xacro")
-    add("no inertia anywhere", lambda: urdf(link("a", ""), link("b", ""), joint("j", "a", "b")), V, "inertial: b")
+    add("masses of 0, and their centre", lambda: osik.ComTask(arm().scaled(mass=0.0)), V, "has no mass")
+    add("a text for a joint's value", lambda: arm().configuration({"joint1": "x"}), T, "'joint1' is 'x'")
     add(
         "a negative mass",
         lambda: urdf(link("a"), link("b", '<inertial><mass value="-1"/></inertial>'), joint("j", "a", "b")),

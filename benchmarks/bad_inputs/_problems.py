@@ -160,9 +160,9 @@ def limits(add: Add) -> None:
     )
     add(
         "collisions of a geom that does not exist",
-        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("zz", "geom1")]),
+        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("zz", "link0:1")]),
         K,
-        "geom0",
+        "link0:0",
     )
     add(
         "collisions of names, not of pairs",
@@ -172,7 +172,7 @@ def limits(add: Add) -> None:
     )
     add(
         "collisions of neighbours alone",
-        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("geom3", "geom[6]")]),
+        lambda: osik.CollisionAvoidanceLimit(arm(), pairs=[("link1:0", "link2:[0]")]),
         V,
         "neighbouring",
     )

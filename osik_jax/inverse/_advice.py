@@ -30,56 +30,82 @@ def advice(robot: Robot, rows: Mapping[str, tuple[bool, ...]]) -> tuple[str, ...
         rows: by the name of a frame, which of x, y, z, rotation about x, y, z are asked for.
     """
     plain = {name: own for name, own in rows.items() if is_plain(robot.tree, (name,))}
-    counts = {name: len(chain_layout(robot.tree, (name,)).dofs) for name in plain}
-    short = [name for name, own in plain.items() if sum(own) > counts[name]]
-    lines = [_line(robot, name, plain[name], counts[name]) for name in short]
+    ways = {name: _rank(robot, {name: own}) for name, own in plain.items()}
+    short = [name for name, own in plain.items() if sum(own) > ways[name]]
+    lines = [_line(robot, name, plain[name], ways[name]) for name in short]
     if not short and len(plain) > 1:
         asked, joints = sum(map(sum, plain.values())), len(chain_layout(robot.tree, tuple(plain)).dofs)
-        if asked > joints:
+        rank = _rank(robot, plain)
+        if asked > rank:
             lines.append(
-                f"the frames ask for {asked} rows of {joints} joints, so most sets of poses have no solution: "
-                "leave out a frame's orientation, by giving its position alone"
+                f"the frames ask for {asked} rows of {_moved_by(joints, rank)}, so most sets of poses have no "
+                "solution: leave out a frame's orientation, by giving its position alone"
             )
     return tuple(lines)
 
 
-def _line(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> str:
-    kept, axes = _rows_to_keep(robot, frame, asked, joints)
-    free = sum(asked) - sum(kept)
-    carried = f"{joints} joints carry" if joints > 1 else "1 joint carries"
+def _moved_by(joints: int, rank: int) -> str:
+    shown = f"{joints} joints" if joints > 1 else "1 joint"
+    return shown if rank == joints else f"{shown} that move them {rank} ways"
+
+
+def _rank(robot: Robot, rows: Mapping[str, tuple[bool, ...]]) -> int:
+    """Return the number of independent rows at a configuration where it is largest."""
+    if not any(map(any, rows.values())):
+        return 0
+    kept = np.concatenate([np.array(own) for own in rows.values()])
+    matrices = [np.asarray(own)[:, kept] for own in _jacobians(robot, tuple(rows))]
+    return max(int(np.linalg.matrix_rank(own, tol=_SINGULAR).max()) for own in matrices)
+
+
+def _line(robot: Robot, frame: str, asked: tuple[bool, ...], ways: int) -> str:
+    kept, axes = _rows_to_keep(robot, frame, asked, ways)
+    free, joints = sum(asked) - sum(kept), len(chain_layout(robot.tree, (frame,)).dofs)
+    carried = f"{joints} joints carry it" if joints > 1 else "1 joint carries it"
+    moved = carried if ways == joints else f"its {joints} joints move it {ways} ways"
     return (
-        f"{frame} asks for {sum(asked)} rows and {carried} it, so most poses have no solution: leave out {free} "
+        f"{frame} asks for {sum(asked)} rows and {moved}, so most poses have no solution: leave out {free} "
         f"{'rows' if free > 1 else 'row'}, such as FrameTask(robot, {frame!r}, target=..., rows={kept}, axes={axes!r})"
     )
 
 
-def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], joints: int) -> tuple[tuple[bool, ...], str]:
-    """Return the rows that the joints move best, and their axes; all position rows are kept if possible."""
-    matrices = {axes: np.asarray(own) for axes, own in zip(("world", "frame"), _jacobians(robot, frame), strict=True)}
-    sets = list(combinations(np.flatnonzero(asked).tolist(), joints))
+def _rows_to_keep(robot: Robot, frame: str, asked: tuple[bool, ...], ways: int) -> tuple[tuple[bool, ...], str]:
+    """Return the rows that the joints move best, as many as they move ways, and their axes.
+
+    All position rows are kept if possible.
+    """
+    world, own = _jacobians(robot, (frame,))
+    matrices = {"world": np.asarray(world), "frame": np.asarray(own)}
+    sets = list(combinations(np.flatnonzero(asked).tolist(), ways))
 
     def worth(choice: tuple[tuple[int, ...], str]) -> tuple[bool, float]:
         rows, axes = choice
         least = float(np.median(np.linalg.svd(matrices[axes][:, list(rows)], compute_uv=False)[:, -1]))
         # sets that keep the whole position come first, then those that the joints move best
-        return least > _SINGULAR and set(rows) >= set(range(min(3, joints))), least
+        return least > _SINGULAR and set(rows) >= set(range(min(3, ways))), least
 
     rows, axes = max(((rows, axes) for axes in matrices for rows in sets), key=worth)
     return tuple(at in rows for at in range(6)), axes
 
 
-@partial(jax.jit, static_argnames="frame")
-def _jacobians(robot: Robot, frame: str) -> tuple[Float[Array, "samples 6 n"], Float[Array, "samples 6 n"]]:
-    """Return Jacobians at sample configurations, in world and frame axes; lengths relative to the longest lever."""
-    layout = chain_layout(robot.tree, (frame,))
-    chain = make_chain(robot, (frame,), layout)
+@partial(jax.jit, static_argnames="frames")
+def _jacobians(
+    robot: Robot, frames: tuple[str, ...]
+) -> tuple[Float[Array, "samples rows n"], Float[Array, "samples rows n"]]:
+    """Return Jacobians at sample configurations, in world and frame axes; lengths relative to the longest lever.
+
+    Six rows for each frame.
+    """
+    layout = chain_layout(robot.tree, frames)
+    chain = make_chain(robot, frames, layout)
     points = unit_points(shift_of(0, len(layout.dofs)), jnp.arange(_SAMPLES), robot.q0.dtype)
     x = _RANGE * (2.0 * points - 1.0)
     kinematics = chain_kinematics(chain, x.T)
-    matrix = jnp.moveaxis(jacobian(chain, kinematics)[0], -1, 0)
+    matrix = jnp.moveaxis(jacobian(chain, kinematics), -1, 0)
     # lengths in units of the longest lever make rows of position and orientation comparable
-    size = jnp.maximum(jnp.max(jnp.abs(matrix[:, :3])), jnp.finfo(x.dtype).tiny)
-    world = jnp.concatenate([matrix[:, :3] / size, matrix[:, 3:]], 1)
-    turn = jnp.moveaxis(kinematics.rotation[0], -1, 0)
-    own = jnp.concatenate([jnp.einsum("lij,lik->ljk", turn, part) for part in (world[:, :3], world[:, 3:])], 1)
-    return world, own
+    size = jnp.maximum(jnp.max(jnp.abs(matrix[:, :, :3])), jnp.finfo(x.dtype).tiny)
+    parts = matrix[:, :, :3] / size, matrix[:, :, 3:]
+    turn = jnp.moveaxis(kinematics.rotation, -1, 0)
+    world = jnp.concatenate(parts, 2)
+    own = jnp.concatenate([jnp.einsum("lfij,lfik->lfjk", turn, part) for part in parts], 2)
+    return world.reshape(len(world), -1, len(x[0])), own.reshape(len(own), -1, len(x[0]))

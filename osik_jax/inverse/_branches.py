@@ -6,11 +6,11 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ._fixed import Outcomes
 from ._solution import InverseKinematicsSolution
-from ._turns import TURN, apart
+from ._turns import TURN, apart, unwound
 
 _SEPARATION = 0.1
 """Solutions that differ by less in every joint [rad or m] are one."""
@@ -45,34 +45,41 @@ def with_all(
     separation = np.where(isolated, _ISOLATED_SEPARATION, _SEPARATION)
     rows = score.shape[1]
     solutions = np.full((*score.shape, q.shape[1]), np.nan, q.dtype)
+    alone = np.zeros(score.shape, bool)
     counts, branches = np.zeros(len(q), np.int32), np.zeros(len(q), np.int32)
     for target in np.flatnonzero(np.asarray(found.converged)):
         # a score is the error over its tolerance, so up to 1 it is a solution
         good = score[target] <= 1.0
-        solved = np.concatenate([q[target, own.entries][None], x[target][good]])
-        # one that a further search has found is alone, so its separation does not matter
-        own_seed = np.minimum(found.seed[target], rows - 1)
-        alone = np.append(separation[target, own_seed], separation[target][good])
-        distinct = _distinct(solved, alone, own.turns)[:rows]
+        near = unwound(x[target][good], own.first, own.lower, own.upper, own.turns)  # pyright: ignore
+        solved = np.concatenate([q[target, own.entries][None], near])
+        # a solution that a further search has found takes the last start's place, whose neighbours are as near
+        at = np.append(np.minimum(found.seed[target], rows - 1), np.flatnonzero(good))
+        kept = _distinct(solved, separation[target][at], own.turns)[:rows]
+        distinct, alone[target, : len(kept)] = solved[kept], np.asarray(isolated)[target][at[kept]]
         every = np.concatenate([distinct, _copies(distinct, own, rows)])[:rows]
         branches[target], counts[target] = len(distinct), len(every)
         solutions[target, : len(every)] = q[target]
         solutions[target, : len(every), own.entries] = every.T
     return dataclasses.replace(
-        found, solutions=jnp.asarray(solutions), count=jnp.asarray(counts), branches=jnp.asarray(branches)
+        found,
+        solutions=jnp.asarray(solutions),
+        count=jnp.asarray(counts),
+        branches=jnp.asarray(branches),
+        isolated=jnp.asarray(alone),
     )
 
 
 def _distinct(
     x: Float[np.ndarray, "k n"], separation: Float[np.ndarray, " k"], turns: Bool[np.ndarray, " n"]
-) -> Float[np.ndarray, "m n"]:
+) -> Int[np.ndarray, " m"]:
     """Return the first of each set of configurations that differ by less than their separation, modulo whole turns."""
-    kept: list[np.ndarray] = []
-    while len(x):
-        kept.append(x[0])
-        different = apart(x, x[0], turns) > np.maximum(separation, separation[0])
-        x, separation = x[different], separation[different]
-    return np.stack(kept)
+    kept: list[int] = []
+    left = np.arange(len(x))
+    while len(left):
+        first = int(left[0])
+        kept.append(first)
+        left = left[apart(x[left], x[first], turns) > np.maximum(separation[left], separation[first])]
+    return np.array(kept)
 
 
 def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> Float[np.ndarray, "m n"]:

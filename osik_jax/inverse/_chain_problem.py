@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -30,6 +31,8 @@ _RADIAN = 0.1
 """Length that a radian counts as, relative to the length of the chain."""
 _STOPPED = 1e-3
 """A joint is stopped by its limit where the gradient is at least this, relative to its largest value for the error."""
+_SWEEPS = 4
+"""Passes over the slides for the nearest point of what they reach; one is exact where they are at right angles."""
 
 
 class Settings(NamedTuple):
@@ -115,7 +118,8 @@ def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: b
     first = jnp.clip(settings.home[coordinates], lower, upper)
     box, turns = starting_box(lower, upper), turning(layout)
     low, high = _starts(layout, turns, *box, first)
-    length = jnp.max(jax.lax.stop_gradient(reaches(chain, first, *box)[0]))
+    found = jax.lax.stop_gradient(reaches(chain, first, *box))
+    length = jnp.max(jnp.stack([reach.length + jnp.sum(_norm(reach.slides)) for reach in found]))
     return ChainSearch(
         rows=rows,
         by_core=by_core,
@@ -175,20 +179,45 @@ def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array,
     return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
 
-def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> tuple[Float[Array, " frames"], Array]:
-    """Return the links' length to each frame [m], slides extended, and the first joint's position. (frames, 3)."""
+class Reach(NamedTuple):
+    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move.
+
+    Attributes:
+        root: the first hinge's position with the slides before it in the middle of their ranges [m]. (3,)
+        slides: half the travel of each of these slides, along its direction in the world [m]. (k, 3)
+        length: of the links from there to the frame, with the slides among them drawn out [m]. ()
+    """
+
+    root: Float[Array, "3"]
+    slides: Float[Array, "k 3"]
+    length: Float[Array, ""]
+
+
+def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> list[Reach]:
+    """Return the reach of each frame, which does not depend on the configuration x."""
     kinematics, layout = chain_kinematics(chain, x[:, None]), chain.layout
-    travel = jnp.maximum(jnp.abs(upper - x), jnp.abs(lower - x))
-    lengths, roots = [], []
+    axis, anchor = kinematics.axis[..., 0], kinematics.anchor[..., 0]
+    middle, half = 0.5 * (lower + upper) - x, 0.5 * (upper - lower)
+    found = []
     for at, carried in enumerate(layout.carries):
-        path = np.flatnonzero(carried)
-        points = jnp.concatenate([kinematics.anchor[path, :, 0], kinematics.position[at, :, 0][None]])
-        whole = jnp.sum(jnp.sqrt(jnp.sum((points[1:] - points[:-1]) ** 2, -1)))
-        slides = [(j, layout.entries[j]) for j in path.tolist() if not layout.hinges[j] and layout.entries[j] >= 0]
-        drawn = [abs(layout.factors[j]) * travel[layout.dofs.index(entry)] for j, entry in slides]
-        lengths.append(sum(drawn, whole))
-        roots.append(points[0])
-    return jnp.stack(lengths), jnp.stack(roots)
+        path = np.flatnonzero(carried).tolist()
+        hinges = [j for j in path if layout.hinges[j]]
+        points = [*(anchor[j] for j in hinges), kinematics.position[at, :, 0]]
+        before = [points[0], *(after - here for here, after in pairwise(points))]
+        travels: list[list[Array]] = [[] for _ in before]
+        for j in path:
+            if not layout.hinges[j] and layout.entries[j] >= 0:
+                segment, entry = sum(hinge < j for hinge in hinges), layout.dofs.index(layout.entries[j])
+                before[segment] = before[segment] + layout.factors[j] * middle[entry] * axis[j]
+                travels[segment].append(abs(layout.factors[j]) * half[entry] * axis[j])
+        links = [_norm(own) for own in before[1:]] + [_norm(own) for travel in travels[1:] for own in travel]
+        slides = jnp.array(travels[0], x.dtype).reshape(-1, 3)
+        found.append(Reach(before[0], slides, sum(links, jnp.zeros((), x.dtype))))
+    return found
+
+
+def _norm(vector: Float[Array, "... 3"]) -> Float[Array, "..."]:
+    return jnp.sqrt(jnp.sum(vector**2, -1))
 
 
 def answer(
@@ -240,10 +269,35 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
 
 def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
-    length, root = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
+    found = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
+    away = jnp.stack([_outside(reach, goal.position[:, at]) for at, reach in enumerate(found)], -1)
     asked = np.array(search.rows)[:, :3].all(-1)
+    return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(away) & asked, away, 0.0), -1), 0.0)
+
+
+def _outside(reach: Reach, position: Float[Array, "targets 3"]) -> Float[Array, " targets"]:
+    """Return a lower bound on the distance from each position to all that is within reach; not finite for none.
+
+    The root moves in a convex set. In any direction a position is away from that set by at least as much as it is
+    further than the set's furthest point.
+    """
+    way = position - reach.root
+    shares = [jnp.zeros_like(way[:, 0])] * len(reach.slides)
+    for _ in range(_SWEEPS):
+        for at, slide in enumerate(reach.slides):
+            left = _left(way, reach.slides, shares) + shares[at][:, None] * slide
+            square = jnp.sum(slide**2)
+            nearest = jnp.sum(left * slide, -1) / jnp.where(square > 0.0, square, 1.0)
+            shares[at] = jnp.clip(nearest, -1.0, 1.0)
+    left = _left(way, reach.slides, shares)
+    distance = _norm(left)
+    direction = left / jnp.where(distance > 0.0, distance, 1.0)[:, None]
+    furthest = sum((jnp.abs(jnp.sum(direction * slide, -1)) for slide in reach.slides), reach.length)
     # rounded up, so that a target on the boundary is never called out of reach; positions round by their own size
-    rounding = _ROUNDOFF * float(jnp.finfo(length.dtype).eps) * (length + jnp.max(jnp.abs(root), -1))
-    away = jnp.sqrt(jnp.sum((goal.position - root) ** 2, -1)) - (length + rounding)
-    away = jnp.where(jnp.isfinite(away) & asked, away, 0.0)
-    return jnp.maximum(jnp.max(away, -1), 0.0)
+    rounding = _ROUNDOFF * float(jnp.finfo(way.dtype).eps) * (furthest + jnp.max(jnp.abs(reach.root), -1))
+    return jnp.sum(direction * way, -1) - (furthest + rounding)
+
+
+def _left(way: Float[Array, "targets 3"], slides: Array, shares: list[Array]) -> Float[Array, "targets 3"]:
+    """Return the way that is left after a share of each slide's travel."""
+    return way - sum((share[:, None] * slide for share, slide in zip(shares, slides, strict=True)), jnp.zeros_like(way))

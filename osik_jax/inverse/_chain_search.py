@@ -18,7 +18,7 @@ from ..numerics._guarded import greatest, safe_norm
 from ._chain import Chain, ChainKinematics, chain_kinematics, curvature, jacobian
 from ._chain_kernel import advanced
 from ._error import rotation_error
-from ._linear import solve_positive, solve_with_pivots
+from ._linear import ISOLATED, positive_pivot, solve_positive
 from ._minimum import inverse_hessian, minimum
 from ._pool import Errors
 from ._seeds import unit_points
@@ -29,8 +29,6 @@ _DAMPING = 0.03
 _LEAST_DAMPING = 1e-5
 """Least damping, as a fraction of the squared length of a radian: bounds the steps of a singular arm near its target.
 """
-_ISOLATED = 0.01
-"""An arm is not singular where each motion by 1 rad moves a frame by this, relative to what a radian counts as."""
 _GAIN = 1e-4
 """A step towards a local optimum that promises less, relative to the position tolerance, is the last one."""
 
@@ -217,9 +215,7 @@ class ChainSearch(eqx.Module):
         if len(matrix) < x.shape[1]:
             # with fewer rows than joints there is always a motion that keeps the frames
             return jnp.zeros(len(x), bool)
-        squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
-        _, pivot = solve_with_pivots(squares, jnp.zeros_like(x.T))
-        return pivot > (_ISOLATED * self.length) ** 2
+        return positive_pivot(matrix) > (ISOLATED * self.length) ** 2
 
     def costs(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, " lanes"]:
         """Return the costs that ``local_optima`` minimises."""

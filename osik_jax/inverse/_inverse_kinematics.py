@@ -80,7 +80,8 @@ def inverse_kinematics(
             ``(position, quaternion w x y z (4,))``, a (4, 4) matrix, a ``jaxlie.SE3``, or a position (3,) alone, whose
             orientation is then free [m]. Arrays with one more axis in front are many targets. Or by any name, a task:
             its gain does not matter, nor do target velocities. Tasks on poses (frames, centre of mass, contacts, axes
-            and the like) and hard tasks have to be met; others (postures) are preferences, which fade out on the way.
+            and the like), joints of a ``FreezeTask`` and hard tasks have to be met (``Task.is_goal``); others
+            (postures) are preferences, which fade out on the way. Tasks on velocities ask for no motion from ``q0``.
         targets: of tasks, by name, what ``replace(target=...)`` takes with one more axis in front, for many targets.
         scheme: for tasks, as in ``solve``.
         limits: beside the robot's joint limits, as in ``solve``; ``osik_jax.no_limits``: none. With a
@@ -121,7 +122,7 @@ def inverse_kinematics(
     check_count("restarts", restarts, least=0)
     limits, dtype = checked_limits(robot, limits), robot.q0.dtype
     home = robot.q0 if q0 is None else checked_start(robot, q0).astype(dtype)
-    problem = read_problem(robot, tasks, targets, scheme, limits)
+    problem = read_problem(robot, tasks, targets, scheme, limits, home)
     lower, upper = joint_box(robot, limits)
     tolerance = _together(
         [checked_tolerance(position_tolerance, dtype), checked_tolerance(orientation_tolerance, dtype)]

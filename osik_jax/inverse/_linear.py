@@ -6,6 +6,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+ISOLATED = 0.01
+"""A robot is not singular where each motion by 1 rad changes a row by this, relative to what a radian counts as."""
+
+
+def positive_pivot(matrix: Float[Array, "m n lanes"]) -> Float[Array, " lanes"]:
+    """Return the smallest pivot of ``matrix' matrix``: 0 where a motion along it changes no row."""
+    squares = jnp.sum(matrix[:, :, None] * matrix[:, None], 0)
+    return solve_with_pivots(squares, jnp.zeros_like(matrix[0]))[1]
+
 
 def solve_positive(matrix: Float[Array, "m m lanes"], vector: Float[Array, "m lanes"]) -> Float[Array, "m lanes"]:
     """Return matrix^-1 vector by elimination without pivoting, which a positive definite matrix allows."""

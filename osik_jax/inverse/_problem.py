@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
@@ -39,9 +40,9 @@ class Problem(NamedTuple):
 
 
 def read_problem(
-    robot: Robot, tasks: Any, targets: Any, scheme: Scheme | None, limits: tuple[Limit, ...] | None
+    robot: Robot, tasks: Any, targets: Any, scheme: Scheme | None, limits: tuple[Limit, ...] | None, home: Array
 ) -> Problem:
-    """Return the search problem for a user's poses, tasks and targets.
+    """Return the search problem for a user's poses, tasks and targets; ``home`` (nq,) is where a search begins.
 
     Raises:
         TypeError, KeyError, ValueError: as ``inverse_kinematics``.
@@ -62,7 +63,7 @@ def read_problem(
         if targets is not None:
             raise OsikValueError("targets go with tasks; many poses are arrays with one more axis in front")
         return Problem(ChainRoute(tuple(poses), rows), goal, None, count is not None)
-    return _of_tasks(robot, tasks, poses, (goal, rows, count), targets, scheme, limits)
+    return _of_tasks(robot, tasks, poses, (goal, rows, count), targets, scheme, limits, home)
 
 
 def _of_tasks(
@@ -73,10 +74,11 @@ def _of_tasks(
     targets: Any,
     scheme: Scheme | None,
     limits: tuple[Limit, ...] | None,
+    home: Array,
 ) -> Problem:
     goal, rows, count = read
     framed = {name: FrameTask(robot, name, rows=own) for name, own in zip(poses, rows, strict=True)}
-    known = read_tasks(robot, {name: framed.get(name, task) for name, task in tasks.items()})
+    known = read_tasks(robot, {name: framed.get(name, task) for name, task in tasks.items()}, home)
     aims, number = _aims(targets, known, count)
     many = number is not None
     number = number or 1

@@ -30,12 +30,16 @@ class InverseKinematicsSolution(eqx.Module):
         at_limit: of each entry of v, -1 or 1 where its joint stands at its lower or upper limit and a step past it
             would reduce the error; else 0. (..., nv)
         beyond_reach: how far the target is at least from all that the frame could ever reach, from the lengths of the
-            links alone [m]: more than 0 proves that there is no solution. (...)
+            links and the travel of slides alone [m]: more than 0 proves that there is no solution. (...)
         solutions: with ``all=True``, the distinct solutions: ``q``, then the other branches, then copies of these by
             whole turns of joints whose limits allow it. Each branch is as near to ``q0`` as whole turns bring it. Rows
             from ``count`` on are NaN. (..., seeds, nq)
         count: with ``all=True``, how many there are. (...)
         branches: with ``all=True``, how many differ by more than whole turns: the first rows of ``solutions``. (...)
+        isolated: with ``all=True``, of each branch whether it is an isolated point: every motion of the joints leads
+            off the targets. The others are samples of a continuum; False from ``branches`` on. (..., seeds)
+        base_moved: with tasks, or poses of frames that a free base carries: how far the base is from where it is in
+            ``q0``, its origin [m] and its axes [rad], the largest of several. None for a robot without one. (..., 2)
         clearance: with a ``CollisionAvoidanceLimit``, the distance of the nearest pair less ``minimum_distance`` [m].
             (...)
         nearest_pair: number of that pair in ``pairs``. (...)
@@ -56,6 +60,8 @@ class InverseKinematicsSolution(eqx.Module):
     solutions: Float[Array, "*n seeds nq"] | None = None
     count: Int[Array, "*n"] | None = None
     branches: Int[Array, "*n"] | None = None
+    isolated: Bool[Array, "*n seeds"] | None = None
+    base_moved: Float[Array, "*n 2"] | None = None
     clearance: Float[Array, "*n"] | None = None
     nearest_pair: Int[Array, "*n"] | None = None
     joints: tuple[str, ...] = eqx.field(default=(), static=True)
@@ -80,6 +86,8 @@ class InverseKinematicsSolution(eqx.Module):
             )
         pick = (lambda a: np.asarray(a)) if index is None else (lambda a: np.asarray(a)[index])
         errors = f"{pick(self.position_error):.3g} m and {pick(self.orientation_error):.3g} rad off"
+        if self.base_moved is not None and (moved := pick(self.base_moved)).any():
+            errors += f", with the base {moved[0]:.3g} m and {moved[1]:.3g} rad from q0"
         if pick(self.converged):
             return f"found, {errors} (search {pick(self.seed)})"
         lines = [f"not found in {pick(self.steps)} steps; the best configuration is {errors}"]
@@ -89,14 +97,14 @@ class InverseKinematicsSolution(eqx.Module):
     def _reasons(self, pick: Callable[[Any], np.ndarray]) -> list[str]:
         """Return the reasons that stop the robot, one line each."""
         beyond, at_limit = float(pick(self.beyond_reach)), pick(self.at_limit)
-        if beyond > 0.0:
-            return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line"]
         sides = {-1: "lower", 1: "upper"}
         reasons = [f"{self.joints[i]} is at its {sides[int(at_limit[i])]} limit" for i in np.flatnonzero(at_limit)]
+        if beyond > 0.0:
+            return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line", *reasons]
         if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
             one, other = self.pairs[int(pick(self.nearest_pair))]
             reasons.append(f"{one} and {other} are {float(pick(self.clearance)):+.3g} m from as near as they may be")
-        reasons = [*self.advice, *reasons]
+        reasons += self.advice
         return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
 
 

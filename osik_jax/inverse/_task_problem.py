@@ -12,14 +12,14 @@ from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
 from ..control._checks import check_tasks
-from ..kinematics import forward_kinematics
-from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, PositionBarrier, with_own_limits
+from ..kinematics import difference, forward_kinematics
+from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, with_own_limits
 from ..robot import Robot
 from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
-from ..tasks import AxisAlignTask, ComTask, ContactTask, FrameTask, LookAtTask, RelativeFrameTask, Task
+from ..tasks import FrameTask, Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors, Pace
@@ -28,9 +28,8 @@ from ._solution import InverseKinematicsSolution
 from ._task_search import Aims, TaskSearch, entry_limits, is_goal
 from ._turns import TURN, one_turn
 
-_KEPT = (ConfigurationLimit, CollisionAvoidanceLimit, PositionBarrier)
-_ON_PLACES = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ComTask, ContactTask)
-"""Tasks that see where bodies are and not by which joints."""
+_BACKGROUND = 1e-3
+"""Largest weight of a preference, relative to the goals': that of a ``PostureTask`` by default."""
 # score at which a search ends; the next step would be roundoff
 _ENOUGH = 0.01
 _RADIUS = 1.0
@@ -109,8 +108,9 @@ class TaskRoute(NamedTuple):
         return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
-        """Return whether a whole turn of each of these entries changes no task."""
-        return np.array(turning(robot, settings.parts.tasks))
+        """Return whether a whole turn of each of these entries changes no goal."""
+        tasks = settings.parts.tasks
+        return np.array(turning(robot, {name: task for name, task in tasks.items() if is_goal(task)}))
 
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
         """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
@@ -129,6 +129,7 @@ class TaskRoute(NamedTuple):
             residual=residual,
             at_limit=at_limit,
             beyond_reach=jnp.zeros(len(q), q.dtype),
+            base_moved=_base_moved(robot, fixed.first, here),
             clearance=clearance,
             nearest_pair=pair,
             joints=tuple(dof_names(robot)),
@@ -136,8 +137,8 @@ class TaskRoute(NamedTuple):
         )
 
 
-def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
-    """Return the tasks for a search: with gains of 1 and targets at rest.
+def read_tasks(robot: Robot, given: Mapping[str, Any], home: Array) -> dict[str, Task]:
+    """Return the tasks for a search from ``home`` (nq,), without those that say nothing about a configuration.
 
     Raises:
         TypeError: something that is no task.
@@ -148,11 +149,20 @@ def read_tasks(robot: Robot, given: Mapping[str, Any]) -> dict[str, Task]:
         raise OsikValueError(
             "no task says where anything has to be: give a FrameTask, a ComTask or another task on a pose"
         )
-    tasks = {}
-    for name, task in given.items():
-        still = {field: 0.0 for field in ("target_velocity",) if field in task.replaceable}
-        tasks[name] = task.replace(gain=1.0, **still) if "gain" in task.replaceable else task.replace(**still)
-    return tasks
+    sought = {name: task.sought(robot, home) for name, task in given.items()}
+    return _in_background({name: task for name, task in sought.items() if task is not None})
+
+
+def _in_background(tasks: dict[str, Task]) -> dict[str, Task]:
+    """Return the tasks, preferences so light that they do not keep a search away from the goals of their level."""
+    goals = [task for task in tasks.values() if is_goal(task)]
+    lowest = max(task.priority for task in goals)
+    beside = {name: task for name, task in tasks.items() if not is_goal(task) and task.priority <= lowest}
+    if not beside:
+        return tasks
+    heaviest, light = (jnp.max(jnp.stack([jnp.max(task.weight) for task in own])) for own in (beside.values(), goals))
+    share = jnp.minimum(1.0, _BACKGROUND * light / jnp.where(heaviest > 0.0, heaviest, 1.0))
+    return {**tasks, **{name: task.replace(weight=share * task.weight) for name, task in beside.items()}}
 
 
 def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ...]:
@@ -160,24 +170,20 @@ def read_limits(robot: Robot, limits: Sequence[Limit] | None) -> tuple[Limit, ..
 
     Their rows have gain 1: a step may go as far as their bounds.
     """
-    kept = [limit for limit in with_own_limits(robot, limits) if isinstance(limit, _KEPT)]
-    return tuple(_unhurried(robot, limit) for limit in kept)
+    kept = [own for limit in with_own_limits(robot, limits) if (own := limit.sought(robot)) is not None]
+    return tuple(_projected(robot, limit) if isinstance(limit, ConfigurationLimit) else limit for limit in kept)
 
 
-def _unhurried(robot: Robot, limit: Limit) -> Limit:
-    """Return the limit in the form that a search uses."""
-    if isinstance(limit, ConfigurationLimit):
-        return _ProjectedRange(robot, lower=limit.lower, upper=limit.upper)  # pyright: ignore[reportCallIssue]
-    return limit if "gain" not in limit.replaceable else limit.replace(gain=1.0)
+def _projected(robot: Robot, limit: ConfigurationLimit) -> Limit:
+    return _ProjectedRange(robot, lower=limit.lower, upper=limit.upper)  # pyright: ignore[reportCallIssue]
 
 
 def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
-    """Return whether a whole turn of each entry of q moves nothing, and all tasks depend on places alone."""
+    """Return whether a whole turn of each entry of q moves nothing and changes no task."""
     turns = np.zeros(robot.nq, bool)
-    if not all(isinstance(task, _ON_PLACES) for task in tasks.values()):
-        return tuple(turns.tolist())
+    counted = {dof for task in tasks.values() for dof in task.counted_dofs(robot)}
     for joint, at in robot.tree.qpos_address.items():
-        turns[at] = robot.tree.joint_types[joint] == HINGE
+        turns[at] = robot.tree.joint_types[joint] == HINGE and robot.tree.dof_address[joint] not in counted
     index, factor = robot.tree.qpos_source
     for entry, share in zip(index.tolist(), factor.tolist(), strict=True):
         # a coupled joint with a fractional ratio is elsewhere after a whole turn of its leader
@@ -228,6 +234,16 @@ def _with_balls(search: TaskSearch, q: Array, gradient: Array, most: Array, acti
         driven = jnp.dot(axis, gradient[dofs]) < -_STOPPED * jnp.max(most[dofs])
         active = active.at[dofs[0]].set((driven & (angle >= search.angles[dofs[0]] - _AT)).astype(active.dtype))
     return active
+
+
+def _base_moved(robot: Robot, first: Float[Array, " nq"], q: Float[Array, "n nq"]) -> Float[Array, "n 2"] | None:
+    """Return the largest distance [m] and angle [rad] of a free base from where it is in the first configuration."""
+    bases = [robot.tree.dof_address[joint] for joint in robot.tree.free_bases]
+    if not bases:
+        return None
+    away = jax.vmap(lambda q: difference(robot, first, q))(q)
+    parts = jnp.stack([away[:, base : base + 6].reshape(-1, 2, 3) for base in bases])
+    return jnp.max(jnp.sqrt(jnp.sum(parts**2, -1)), 0)
 
 
 def _clearance(robot: Robot, limit: CollisionAvoidanceLimit, q: Float[Array, " nq"]) -> tuple[Array, Array]:

@@ -18,37 +18,14 @@ from ..robot import Robot
 from ..robot._balls import with_balls_inside
 from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem, WeightedQP
-from ..tasks import (
-    AxisAlignTask,
-    ComTask,
-    ContactTask,
-    EqualityConstraintTask,
-    FrameTask,
-    FunctionTask,
-    JointCouplingTask,
-    LookAtTask,
-    RelativeFrameTask,
-    Task,
-    TaskRows,
-)
+from ..tasks import AxisAlignTask, ContactTask, LookAtTask, Task, TaskRows
 from ..tasks._pose import PoseTask
 from ..tasks._rows import rows_of
+from ._linear import ISOLATED, positive_pivot
 from ._pool import Errors
 from ._seeds import unit_points
 from ._turns import unwound
 
-GOALS = (
-    FrameTask,
-    RelativeFrameTask,
-    LookAtTask,
-    AxisAlignTask,
-    ComTask,
-    ContactTask,
-    EqualityConstraintTask,
-    JointCouplingTask,
-    FunctionTask,
-)
-"""Tasks on where things are, which have to be met; others are preferences. Hard tasks have to be met in any case."""
 _TURNS = (LookAtTask, AxisAlignTask)
 _LONGEST = 1.0
 """Longest step of a coordinate [rad or m]."""
@@ -62,6 +39,8 @@ _ABOVE = 1e6
 """Factor of a level's squared errors over those of the next lower level."""
 _LOOK, _MOST, _PROGRESS = 20, 400, 1e-4
 """Search for a local optimum: steps between checks, most steps, and the least relative decrease of the cost."""
+_RADIAN = 0.1
+"""Length that a radian of a task's error counts as [m], where rows are compared."""
 _CLEAR = 0.1
 """Fraction of the position tolerance by which limits with rows may be off."""
 _SPREADS = 8
@@ -141,13 +120,9 @@ class TaskSearch(eqx.Module):
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Return the next configuration, and the errors at the present one. A finished search does not move."""
         errors = self.errors(q, goal)[1]
-        # preferences fade with the error, so that they vanish at a solution
-        gain = jnp.minimum(_PREFERENCES * errors.score, self.preferred)
-        faded = {
-            name: task if is_goal(task) else task.replace(gain=gain.astype(q.dtype))
-            for name, task in self.aimed(goal).items()
-        }
-        problem = self._problem(q, faded)
+        gain = jnp.minimum(_PREFERENCES * errors.score, self.preferred).astype(q.dtype)
+        tasks = {name: task if is_goal(task) else _faded(task, gain) for name, task in self.aimed(goal).items()}
+        problem = self._problem(q, tasks)
         step = jnp.full_like(problem.lower, _LONGEST)
         problem = dataclasses.replace(
             problem, lower=jnp.clip(problem.lower, -step, step), upper=jnp.clip(problem.upper, -step, step)
@@ -217,9 +192,21 @@ class TaskSearch(eqx.Module):
         return dataclasses.replace(self, enough=jnp.zeros_like(self.enough)) if exact else self
 
     def isolated(self, x: Float[Array, "lanes nq"], goal: Aims) -> Bool[Array, " lanes"]:
-        """Return False: whether solutions by tasks are isolated is not known."""
-        del goal
-        return jnp.zeros(len(x), bool)
+        """Return whether a solution is isolated: every motion of the joints changes a goal that is an equality."""
+        matrix = jax.vmap(self._equalities)(x, goal)
+        if matrix.shape[1] < self.robot.nv:
+            return jnp.zeros(len(x), bool)
+        return positive_pivot(jnp.moveaxis(matrix, 0, -1)) > (ISOLATED * _RADIAN) ** 2
+
+    def _equalities(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, "m nv"]:
+        """Return the Jacobian of the goals that are equalities, a radian in units of ``_RADIAN``."""
+        rows = {name: own for name, own in self.errors(q, goal)[0].items() if own.is_equality}
+        scales = [np.where(position_rows(self.tasks[name], len(own.error)), 1.0, _RADIAN) for name, own in rows.items()]
+        parts = [
+            jnp.where(own.weight > 0.0, scale, 0.0).astype(q.dtype)[:, None] * own.jacobian
+            for own, scale in zip(rows.values(), scales, strict=True)
+        ]
+        return jnp.concatenate([jnp.zeros((0, self.robot.nv), q.dtype), *parts])
 
     def unwound(self, q: Float[Array, "*lanes nq"]) -> Float[Array, "*lanes nq"]:
         """Return the same poses, each joint turned as near to the first configuration as its limits allow."""
@@ -271,9 +258,18 @@ def damped(scheme: Scheme, factor: float) -> Scheme:
     return scheme.replace(curvature_damping=factor * scheme.curvature_damping)  # pyright: ignore
 
 
+def _faded(task: Task, gain: Array) -> Task:
+    """Return a preference that vanishes with the gain.
+
+    Its weight fades too: rows that ask for no motion at full weight would damp the last steps to a solution.
+    """
+    given = {"gain": gain, "weight": gain * task.weight}
+    return task.replace(**{name: value for name, value in given.items() if name in task.replaceable})
+
+
 def is_goal(task: Task) -> bool:
     """Return whether a task has to be met for a configuration to be a solution."""
-    return task.hard or isinstance(task, GOALS)
+    return task.hard or task.is_goal
 
 
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ..robot._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
+from ..robot.loading._mjmodel import LEAST_MASS
 from . import _kernels
 from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
@@ -281,6 +282,11 @@ def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbod
     mass, tree = robot.body_mass, robot.tree
     if subtree is None:
         own = tree.is_own
+        if not isinstance(mass, Tracer) and not np.asarray(mass)[..., own].sum() > LEAST_MASS * len(own):
+            raise OsikValueError(
+                "the robot has no mass, so it has no centre of mass, momentum or kinetic energy: "
+                "give a link of its file an inertial"
+            )
         return mass if own[1:].all() else jnp.where(own, mass, 0.0)
     below = tree.descendants[tree.frame_bodies[tree.frame(subtree)]]
     if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:

@@ -70,6 +70,11 @@ class PositionBarrier(Limit):
         self.gain = as_scalar(gain, "gain", dtype)
         self._check()
 
+    def sought(self, robot: Robot) -> Limit:
+        """Return the limit with a gain of 1."""
+        del robot
+        return self.replace(gain=1.0)
+
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:

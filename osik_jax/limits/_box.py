@@ -57,6 +57,14 @@ class Limit(MadeForRobot, Replaceable):
         del robot, kinematics, q, dt
         return None
 
+    def sought(self, robot: Robot) -> Limit | None:
+        """Return the limit as ``inverse_kinematics`` uses it, whose steps go as far as its bounds in 1 s.
+
+        None: it bounds velocities and no configurations.
+        """
+        del robot
+        return None
+
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """Return the limit for the next step, given this step's ``velocity``; itself if it has no memory.
 

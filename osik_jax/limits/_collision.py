@@ -133,6 +133,11 @@ class CollisionAvoidanceLimit(Limit):
         """Return signed distances [m] of all ``pairs``, negative where they overlap."""
         return _distances(self, robot, kinematics)
 
+    def sought(self, robot: Robot) -> Limit:
+        """Return the limit with a gain of 1."""
+        del robot
+        return self.replace(gain=1.0)
+
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows:

@@ -113,6 +113,11 @@ class ConfigurationLimit(Limit):
         matrix = matrix.at[np.arange(count)[:, None], np.array(balls.dofs)].set(balls.axis)
         return LimitRows(matrix, jnp.full(count, -jnp.inf, matrix.dtype), balls.outward)
 
+    def sought(self, robot: Robot) -> Limit:
+        """Return the limit with a gain of 1 and return in one step."""
+        del robot
+        return self.replace(gain=jnp.ones_like(self.gain), return_speed=jnp.full_like(self.upper, jnp.inf))
+
     def _balls(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> BallRates | None:
         gain = jnp.broadcast_to(self.gain, self.upper.shape)
         q = jnp.asarray(q, jnp.result_type(jnp.asarray(q), self.upper))

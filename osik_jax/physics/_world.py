@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
+from ..kinematics._forward import body_masses
 from ..robot import Robot
 from ..robot._feet import with_corners
 from ..robot._own_masses import own_masses
@@ -106,12 +107,13 @@ def build_world(
     Raises:
         KeyError: no such frame or joint; the message lists those that exist.
         ValueError: a floating robot without contact points, a joint without a servo, a joint that no servo can turn
-            (ball), a locked joint that is free or ball, or a number out of range.
+            (ball), a locked joint that is free or ball, a robot without masses, or a number out of range.
     """
     if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf):
         raise OsikValueError(
             f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
         )
+    body_masses(robot)  # raises if there is no mass
     points = _contact_points(robot, feet)
     drives = choose_servos(robot, servos or {})
     home = _home(robot)

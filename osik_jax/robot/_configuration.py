@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Num
 
-from .._errors import OsikValueError
+from .._errors import OsikTypeError, OsikValueError
 from ._model import RobotModel
 from ._tree import BALL, FREE, QPOS_WIDTH, check_shape
 
@@ -27,10 +28,20 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
             raise OsikValueError(
                 f"joint {name!r} is free or ball: set its entries of q, from joint_qpos_index({name!r})"
             )
+        if not isinstance(value, Tracer) and not _is_number(value):
+            raise OsikTypeError(f"the value of joint {name!r} is {value!r}; it is one number, in radians or metres")
         full = robot.tree.full_qpos_address[joint]
         index = robot.joint_qpos_index(name)
         q = q.at[index].set((value - robot.qpos_offset[full]) / coefficient[full])
     return q
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # lists of unequal lengths
+        return False
+    return array.ndim == 0 and array.dtype.kind in "iuf"
 
 
 def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"] | Sequence[float], name: str) -> None:

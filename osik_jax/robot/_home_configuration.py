@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
@@ -17,6 +16,7 @@ from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
+from .loading._mjmodel import keyframe_home, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""
@@ -34,7 +34,7 @@ def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
         ValueError: a wrong length, not finite, or a quaternion of zeros.
 
     Warns:
-        OsikWarning: a joint is outside its range; its value is kept.
+        OsikWarning: a joint is outside its range; its value is kept, but for a keyframe's.
     """
     if isinstance(home, str) or _is_integer(home):
         q: Any = _keyframe(robot, home)
@@ -62,16 +62,15 @@ def _as_array(home: Any, dtype: Any) -> Array:
 
 
 def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
-    """Return the independent entries of a keyframe of the MuJoCo model."""
-    model = robot.mj_model
-    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
+    """Return the configuration of a keyframe of the MuJoCo model, within the robot's limits."""
+    names = keyframe_names(robot.mj_model)
     if isinstance(home, str) and home in names:
         number = names.index(home)
-    elif not isinstance(home, str) and 0 <= home < model.nkey:
+    elif not isinstance(home, str) and 0 <= home < len(names):
         number = int(home)
     else:
         raise unknown_name("keyframe", home, tuple(names))
-    return model.key_qpos[number][robot.tree.own_qpos]
+    return keyframe_home(robot, number)
 
 
 def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:

@@ -23,7 +23,7 @@ class LoadNote(NamedTuple):
 
 
 class LoadReport(tuple[LoadNote, ...]):
-    """Elements of a file that constrain motion and that the robot does not keep.
+    """Elements of a file that constrain motion, or give masses, and that the robot does not keep.
 
     A tuple of ``LoadNote``; ``print(robot.load_report)`` shows it as a table.
     """

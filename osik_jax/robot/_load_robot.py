@@ -67,5 +67,6 @@ def load_robot(
         position_limits=position_limits,
         locked_joints=locked_joints,
         root=root,
+        has_home=home is not None,
     )
     return Robot._of(loading.named(name, options), home)

@@ -122,6 +122,7 @@ class Robot(RobotModel):
             collision_meshes=collision_meshes,
             package_dirs=package_dirs,
             root=root,
+            has_home=home is not None,
         )
         return cls._of(loading.from_urdf(urdf, options), home)
 
@@ -175,6 +176,7 @@ class Robot(RobotModel):
             position_limits=position_limits,
             locked_joints=locked_joints,
             root=root,
+            has_home=home is not None,
         )
         return cls._of(loading.from_mjcf(mjcf, options), home)
 
@@ -202,7 +204,7 @@ class Robot(RobotModel):
 
         Raises:
             TypeError: ``model`` is no ``mujoco.MjModel``.
-            ValueError: the model has no moving joint, no moving mass, or a range with lower > upper, or ``home`` does
+            ValueError: the model has no moving joint, or a range with lower > upper, or ``home`` does
                 not fit.
             KeyError: a name in a mapping or ``locked_joints`` does not exist, or ``home`` names no keyframe.
 
@@ -210,7 +212,11 @@ class Robot(RobotModel):
             OsikWarning: a joint cannot move because its range is a single value.
         """
         options = LoadOptions(
-            velocity_limits=velocity_limits, position_limits=position_limits, locked_joints=locked_joints, root=root
+            velocity_limits=velocity_limits,
+            position_limits=position_limits,
+            locked_joints=locked_joints,
+            root=root,
+            has_home=home is not None,
         )
         return cls._of(loading.from_mjmodel(model, options), home)
 
@@ -257,7 +263,8 @@ class Robot(RobotModel):
             ValueError: a wrong length, not finite, or a quaternion of zeros.
 
         Warns:
-            OsikWarning: a joint is outside its range, as a measured one may be; its value is kept.
+            OsikWarning: a joint is outside its range, as a measured one may be; its value is kept. A keyframe's joints
+                are brought to the ends of their ranges, as when the robot is loaded.
         """
         q0 = home_configuration(self, home)
         return eqx.tree_at(lambda robot: robot.q0, self, q0)
@@ -283,7 +290,10 @@ class Robot(RobotModel):
         """Return the robot with longer or heavier links; limits, ``q0`` and ``mj_model`` are unchanged.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
-        geoms move away by the factor, and its geoms grow by it. Masses are scaled by their own factors only, inertias
+        geoms move away by the factor, and its geoms grow by it. All of the way to a child grows, also what is across
+        the link, such as an offset of the shoulder. To change one number, as calibrations do, set it:
+        ``equinox.tree_at(lambda r: r.body_position, robot, robot.body_position.at[k, 2].add(1e-3))``, with k the
+        body's index in ``body_names`` plus 1. Masses are scaled by their own factors only, inertias
         by mass times length squared; drives stay. Factors may be traced:
         ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
 

@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError
 from ..kinematics import Kinematics, centroidal_momentum_matrix
+from ..kinematics._forward import body_masses
 from ..robot import Robot
 from ._com import check_axes
 from ._leaves import as_bounds, as_scalar, as_vector, as_weight, check_bounds
+from ._stay import StayTask
 from ._task import Task, TaskRows, check_priority
 
 
@@ -41,7 +43,7 @@ class AngularMomentumTask(Task):
 
     Raises:
         TypeError: a target and bounds.
-        ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis.
+        ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis, or a robot without masses.
     """
 
     axes: str = eqx.field(static=True)
@@ -65,6 +67,7 @@ class AngularMomentumTask(Task):
             raise OsikTypeError("an AngularMomentumTask has a target or bounds (lower, upper), not both")
         self.axes = check_axes(axes)
         self.priority, self.hard = check_priority(priority), hard
+        body_masses(robot)  # raises if there is no mass
         dtype = robot.q0.dtype
         self.weight = as_weight(weight, self._weight_rows, dtype)
         self.gain = as_scalar(0.0, "gain", dtype)
@@ -82,6 +85,11 @@ class AngularMomentumTask(Task):
             return TaskRows(error, jacobian, self.lower, self.upper, weight, is_equality=False)
         wanted = error if self.target is None else self.target
         return TaskRows(error, jacobian, wanted, wanted, weight, is_equality=True)
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
+        """Return a task for little turning of mass from q0."""
+        del robot
+        return StayTask(self, q0)
 
     @property
     def replaceable(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -57,6 +57,8 @@ class ComTask(Task):
         ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis.
     """
 
+    is_goal: ClassVar[bool] = True
+    sees_places: ClassVar[bool] = True
     axes: str = eqx.field(static=True)
     subtree: str | None = eqx.field(static=True)
     target: Float[Array, " m"] | None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from ..kinematics import Kinematics, frame_jacobian
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
 from ..robot import Robot
+from ..robot._joint_selection import dofs_of
 from ..robot._tree import KinematicTree
 from ..robot.loading._equalities import KINDS, constraint_ends, is_in_tree
 from ..robot.loading._mjmodel import element_names
@@ -71,6 +72,7 @@ class EqualityConstraintTask(Task):
         ValueError: there is none to keep, one is of another kind, or the robot has it as a mimic or locked joint.
     """
 
+    is_goal: ClassVar[bool] = True
     constraints: tuple[Constraint, ...] = eqx.field(static=True)
     anchors: Float[Array, "k 2 3"]
     """Points that must coincide, in both frames of each connect and weld [m]."""
@@ -118,6 +120,11 @@ class EqualityConstraintTask(Task):
         bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         rows = TaskRows.of(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
         return replace(rows, closes_loop=True)
+
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return the entries of v of the joints in joint constraints."""
+        ends = [joint for constraint in self.constraints if constraint.kind == "joint" for joint in constraint.ends]
+        return tuple(dofs_of(robot, [robot.tree.joint_names.index(name) for name in ends]))
 
     @property
     def _weight_rows(self) -> int:

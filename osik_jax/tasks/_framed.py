@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+from typing import ClassVar
 
 from jaxtyping import Array, Float
 
@@ -15,6 +16,9 @@ from ._task import Task, TaskRows
 
 class FramedTask(Task):
     """Base of tasks on frames; tasks of the same structure are evaluated in one batch (``rows_of``)."""
+
+    is_goal: ClassVar[bool] = True
+    sees_places: ClassVar[bool] = True
 
     @property
     @abc.abstractmethod

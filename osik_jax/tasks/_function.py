@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -59,6 +59,7 @@ class FunctionTask(Task):
         ValueError: x is neither a scalar nor (m,), a wrong shape, a negative weight, lower > upper.
     """
 
+    is_goal: ClassVar[bool] = True
     numbers: Any
     structure: Static = eqx.field(static=True)
     target: Float[Array, " m"] | None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import concrete
 from ..robot import Robot
-from ..robot._joint_selection import is_scalar, select_joints
+from ..robot._joint_selection import dofs_of, is_scalar, select_joints
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
@@ -49,6 +49,7 @@ class JointCouplingTask(Task):
         ValueError: no ratio that is not 0, a ball or free joint, a wrong shape, a negative weight, lower > upper.
     """
 
+    is_goal: ClassVar[bool] = True
     joints: tuple[int, ...] = eqx.field(static=True)
     ratios: Float[Array, " k"]
     target: Float[Array, "1"] | None
@@ -101,6 +102,10 @@ class JointCouplingTask(Task):
             feedforward=self.target_velocity,
             curvature=no_curvature,
         )
+
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return the entries of v of the coupled joints."""
+        return tuple(dofs_of(robot, self.joints))
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         if self.target is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Iterable
-from typing import Self
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -18,13 +18,15 @@ from ..robot import Robot
 from ..robot._joint_selection import dofs_of, select_all
 from ._background import background_weight
 from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
+from ._stay import StayTask
 from ._task import Task, TaskRows, check_priority
 
 
 class VelocityTask(Task):
     """Base of tasks on the velocity of dofs: rows of the identity, ``v_i = wanted_i``.
 
-    There is no error that could decay: it is 0, and there is no gain.
+    There is no error that could decay: it is 0, and there is no gain. In ``inverse_kinematics`` the rows ask for no
+    motion from ``q0``.
     """
 
     joints: tuple[int, ...] = eqx.field(static=True)
@@ -56,6 +58,15 @@ class VelocityTask(Task):
             dofs=tuple(dofs),
             is_equality=True,
         )
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
+        """Return a task for joints that stay where they are at q0."""
+        del robot
+        return StayTask(self, q0)
+
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return the entries of v of the chosen joints."""
+        return tuple(dofs_of(robot, self.joints))
 
     @property
     def replaceable(self) -> tuple[str, ...]:
@@ -108,7 +119,7 @@ class FreezeTask(VelocityTask):
     """Task that keeps joints at rest while the rest of the robot moves: ``v_i = 0``.
 
     Meant as a constraint (``hard=True``) or at priority 1; to leave joints out of the problem altogether, load the
-    robot with ``locked_joints``.
+    robot with ``locked_joints``. ``inverse_kinematics`` has to meet it: the joints stay where they are at ``q0``.
 
     Args:
         robot: the robot.
@@ -122,6 +133,8 @@ class FreezeTask(VelocityTask):
         KeyError: no such joint, or it is locked or a mimic follower.
         ValueError: no joints, a negative weight.
     """
+
+    is_goal: ClassVar[bool] = True
 
     def __init__(
         self,

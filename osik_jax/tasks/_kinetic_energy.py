@@ -8,9 +8,11 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from ..kinematics import Kinematics, mass_matrix
+from ..kinematics._forward import body_masses
 from ..numerics._constants import INERTIA_ROUNDOFF
 from ..robot import Robot
 from ._leaves import as_scalar
+from ._stay import StayTask
 from ._task import Task, TaskRows, check_priority
 
 
@@ -32,11 +34,12 @@ class KineticEnergyTask(Task):
         hard: makes it a constraint, see ``Task``: nothing moves.
 
     Raises:
-        ValueError: a negative weight.
+        ValueError: a negative weight, or a robot without masses.
     """
 
     def __init__(self, robot: Robot, *, weight: ArrayLike | Array = 1.0, priority: int = 1, hard: bool = False):
         self.priority, self.hard = check_priority(priority), hard
+        body_masses(robot)  # raises if there is no mass
         self.weight = as_scalar(weight, "weight", robot.q0.dtype)
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
@@ -46,6 +49,11 @@ class KineticEnergyTask(Task):
         root = _root(mass_matrix(robot, kinematics))
         zero = jnp.zeros(robot.nv, root.dtype)
         return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
+        """Return a task for little motion of mass from q0."""
+        del robot
+        return StayTask(self, q0)
 
     @property
     def replaceable(self) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Self
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from ..kinematics import Kinematics
 from ..limits import Limit, limit_box, limit_rows
 from ..robot import Robot
 from ..robot._made_for import check_made_for
+from ._gain import evaluate_gain
 from ._leaves import as_scalar
 from ._task import Task, TaskRows, check_priority
 
@@ -23,7 +25,8 @@ class LimitTask(Task):
     """Inequality task made of a limit: it holds at its priority and gives way to higher ones.
 
     ``lower <= v <= upper``, one row for each dof, and then the limit's own rows, if it has any, at their bounds. There
-    is no error that could decay: it is 0, and there is no gain.
+    is no error that could decay: it is 0, and there is no gain. In ``inverse_kinematics`` a limit on velocities has no
+    effect, as among ``limits``; others (joint ranges, collisions, planes) count there by their violation.
 
     Args:
         robot: the robot.
@@ -76,6 +79,15 @@ class LimitTask(Task):
             is_equality=False,
         )
 
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task | None:
+        """Return a task with the limit's violation as its error; None for a limit on velocities."""
+        del q0
+        limit = self.limit.sought(robot)
+        if limit is None:
+            return None
+        kept = _Kept(robot, limit, weight=self.weight, priority=self.priority, hard=self.hard)  # pyright: ignore[reportArgumentType]
+        return kept.replace(gain=1.0)
+
     def during(self, dt: Float[Array, ""] | float) -> Self:
         """Return the task for a step of dt [s]."""
         return eqx.tree_at(lambda task: task.dt, self, jnp.asarray(dt, self.dt.dtype))
@@ -95,3 +107,22 @@ class LimitTask(Task):
         if jax.tree.structure(value) != jax.tree.structure(self.limit):
             raise OsikValueError(f"limit is a {type(value).__name__} of another structure than the task's")
         return value
+
+
+class _Kept(LimitTask):
+    """Limit task of inverse kinematics: a step may go to a bound, and comes back from beyond it by the gain."""
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Return the rows of the limit, with its violation as what they pull at."""
+        own, gain = super().rows(robot, kinematics, q), evaluate_gain(self.gain, jnp.ones(()))
+        return dataclasses.replace(
+            own,
+            lower=jnp.where(own.lower > 0.0, gain * own.lower, own.lower),
+            upper=jnp.where(own.upper < 0.0, gain * own.upper, own.upper),
+            pull=jnp.maximum(-own.upper, 0.0) - jnp.maximum(own.lower, 0.0),
+        )
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Return the names that ``replace`` accepts."""
+        return ("gain", *super().replaceable)

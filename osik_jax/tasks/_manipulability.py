@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
@@ -66,6 +66,7 @@ class ManipulabilityTask(Task):
         ValueError: fewer dofs than rows, a wrong shape, a negative weight, lower > upper, an unknown option.
     """
 
+    sees_places: ClassVar[bool] = True
     frame: str = eqx.field(static=True)
     kept: tuple[bool, ...] = eqx.field(static=True)
     axes: str = eqx.field(static=True)

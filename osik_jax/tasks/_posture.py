@@ -117,6 +117,10 @@ class PostureTask(Task):
             curvature=no_curvature,
         )
 
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return the entries of v of the chosen joints."""
+        return tuple(dofs_of(robot, self.joints))
+
     @property
     def _weight_rows(self) -> int:
         return len(self.target_velocity)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -142,8 +142,14 @@ class Task(MadeForRobot, Replaceable):
             so, one for each of its rows.
         gain: [1/s], a constant or an ``AdaptiveGain``: the wanted error rate is ``-gain * error``. In a step of dt,
             more than ``1 / dt`` counts as that.
+        is_goal: whether ``inverse_kinematics`` has to meet the task (static). If not, it prefers configurations that
+            meet it. It has to meet hard tasks in any case.
+        sees_places: whether a whole turn of a hinge leaves the task's error as it is, because it depends on the places
+            of bodies alone (static).
     """
 
+    is_goal: ClassVar[bool] = False
+    sees_places: ClassVar[bool] = False
     weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
@@ -169,6 +175,23 @@ class Task(MadeForRobot, Replaceable):
         """Return the task for the next step, given this step's ``velocity``; the task itself if it has no memory."""
         del velocity
         return self
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task | None:
+        """Return the task as ``inverse_kinematics`` uses it, or None if it says nothing about a configuration.
+
+        Here: the same task with a gain of 1 and a target at rest.
+
+        Args:
+            robot: the robot.
+            q0: configuration that a task on velocities is about. (nq,)
+        """
+        del robot, q0
+        still = {"gain": 1.0, "target_velocity": 0.0}
+        return self.replace(**{name: value for name, value in still.items() if name in self.replaceable})
+
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return the entries of v of the joints whose whole turns may change the error."""
+        return () if self.sees_places else tuple(range(robot.nv))
 
     def at(self, robot: Robot, q: Float[Array, " nq"]) -> Self:
         """Return the task with its target at configuration q, so that its error there is 0.

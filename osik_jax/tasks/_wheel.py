@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
@@ -17,7 +19,7 @@ from ._leaves import as_vector, as_weight, check_not_negative
 from ._plane import PlaneTask, as_normal, as_offset
 from ._pointing import as_direction, unit
 from ._rotation import dot
-from ._task import DEFAULT_GAIN, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 
 class WheelTask(PlaneTask):
@@ -111,6 +113,11 @@ class WheelTask(PlaneTask):
             return pose_curvature(dot(pull, directions), jnp.zeros(3, pull.dtype), moves)
 
         return TaskRows.of(error, dot(directions, touching), gain=self.gain, weight=weight, curvature=bound)
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task | None:
+        """Return the task with its height alone: slipping is a matter of velocities."""
+        height = jnp.asarray(np.eye(self._weight_rows)[-1], self.weight.dtype)
+        return eqx.tree_at(lambda task: task.weight, super().sought(robot, q0), self.weight * height)
 
     @property
     def _weight_rows(self) -> int:

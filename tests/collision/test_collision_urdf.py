@@ -203,12 +203,12 @@ def test_meshes_are_read_when_a_limit_needs_them(meshed):
     """With the same distances as meshes that MuJoCo has read, for longer links too."""
     late, early = (osik.Robot.from_urdf(meshed, floating_base=False, collision_meshes=read) for read in (False, True))
     assert (late.mj_model.ngeom, early.mj_model.ngeom) == (0, 3)
-    assert early.tree.geom_names == late.tree.geom_names == ("geom0", "geom1", "geom2")
+    assert early.tree.geom_names == late.tree.geom_names == ("a:0", "b:0", "c:0")
     q = np.array([0.4, -1.2])
     for change in (lambda r: r, lambda r: r.scaled(length={"c": 1.5})):
         one, other = change(late), change(early)
         limits = osik.CollisionAvoidanceLimit(one), osik.CollisionAvoidanceLimit(other)
-        assert limits[0].pairs == limits[1].pairs == (("geom0", "geom2"),)
+        assert limits[0].pairs == limits[1].pairs == (("a:0", "c:0"),)
         got, want = (distances(*both, q) for both in zip(limits, (one, other), strict=True))
         np.testing.assert_allclose(got, want, atol=1e-6)  # MuJoCo's vertices have single precision
 
@@ -220,7 +220,7 @@ def test_a_mesh_that_is_missing_is_told_and_left_out(meshed):
     late = osik.Robot.from_urdf(meshed, floating_base=False)
     with pytest.warns(osik.OsikWarning, match=r"1 collision meshes cannot be read.*of a\): no file 'gone.obj'"):
         limit = osik.CollisionAvoidanceLimit(late)
-    assert named(limit) == pair_set("geom2 d_rod")
+    assert named(limit) == pair_set("c:0 d_rod")
     meshed.write_text(text.replace("ball.obj", "gone.obj"))
     late = osik.Robot.from_urdf(meshed, floating_base=False)
     refuses(ValueError, r"no collision mesh of the robot can be read.*gone.obj", osik.CollisionAvoidanceLimit, late)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pinocchio as pin
 import pytest
 from refusals import refuses
 from urdfs import INERTIAL
@@ -111,6 +112,36 @@ def urdf(limit: str = 'lower="-1" upper="1" velocity="2"', *, joint: str = "", m
       <joint name="b" type="revolute"><parent link="l1"/><child link="l2"/><origin xyz="1 0 0"/><axis xyz="0 1 0"/>
         <limit lower="-1" upper="1" velocity="2"/></joint>
       <joint name="t" type="fixed"><parent link="l2"/><child link="tip"/><origin xyz="1 0 0"/></joint>{more}</robot>"""
+
+
+def test_balanced_moments_of_inertia_are_named_with_their_change():
+    """MuJoCo uses the mean of moments that no body has; the masses are the file's."""
+    flat = '<inertial><mass value="3.5"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="4"/></inertial>'
+    text = urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{flat}')
+    robot, told = loaded(Robot.from_urdf, text, floating_base=False)
+    (note,) = robot.load_report
+    assert (note.element, note.name) == ("inertia", "l1") and "1 1 4" in note.done and "50 %" in note.done
+    assert told == [] and robot.body_mass[robot.body_names.index("l1") + 1] == 3.5
+    model = pin.buildModelFromXML(text.replace("velocity=", 'effort="1" velocity='))
+    np.testing.assert_allclose(sorted(np.linalg.eigvalsh(model.inertias[1].inertia)), [1.0, 1.0, 4.0], atol=1e-12)
+
+
+def test_a_file_without_masses_is_kinematics_alone():
+    bare = urdf().replace(INERTIAL, "")
+    robot, told = loaded(Robot.from_urdf, bare, floating_base=False)
+    assert notes(robot) == {("inertial", "l1; l2; tip")}
+    assert "nothing that moves has a mass" in told[0]
+    whole = Robot.from_urdf(urdf(), floating_base=False)
+    q = whole.configuration({"a": 0.3})
+    for frame in ("l2", "tip"):
+        ours, theirs = (osik.forward_kinematics(one, q).frame_pose(one, frame)[0] for one in (robot, whole))
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    assert osik.inverse_kinematics(robot, {"l2": ours}, seeds=4, restarts=0).q.shape == (robot.nq,)
+    for task in (osik.ComTask, osik.KineticEnergyTask, osik.AngularMomentumTask):
+        refuses(ValueError, "the robot has no mass, so it has no centre of mass", task, robot)
+    kinematics = osik.forward_kinematics(robot, q)
+    for function in (osik.center_of_mass, osik.centroidal_momentum_matrix):
+        refuses(ValueError, "the robot has no mass", function, robot, kinematics)
 
 
 SAFETY = '<safety_controller k_velocity="1" k_position="1" soft_lower_limit="{}" soft_upper_limit="{}"/>'

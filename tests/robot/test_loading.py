@@ -420,15 +420,36 @@ def tied(*equalities: str) -> str:
         (bodies("<body><geom size='1'/></body>"), {"floating_base": True}, r"with joints: \(none\)"),
         (bodies(BODY.format("a"), BODY.format("b")), {"floating_base": True}, r"with joints: a, b"),
         (
-            tied("joint1='hip' joint2='knee'", "joint1='knee' joint2='hip'"),
+            tied("joint1='hip' joint2='knee'", "joint1='knee' joint2='hip' polycoef='0.1 1 0 0 0'"),
             {},
-            r"mimic each other in a circle: hip, knee",
+            r"contradict each other: one says knee = 1 hip .*, which the others do not allow",
         ),
-        (tied("joint1='hip' joint2='knee'", "joint1='hip'"), {}, r"'hip' is tied by more than one joint equality"),
+        (tied("joint1='hip'", "joint1='hip' polycoef='0.1 0 0 0 0'"), {}, r"'hip' is held at 0 and at 0\.1 by two"),
     ],
 )
 def test_broken_mjcf_is_refused_by_name(text: str, options: dict, message: str):
     refuses(ValueError, f"(?s){message}", Robot.from_mjcf, text, **options)
+
+
+@pytest.mark.parametrize(
+    "equalities",
+    [
+        ("joint1='ja' joint2='jb' polycoef='0.1 2 0 0 0'", "joint1='ja' joint2='jb' polycoef='0.1 2 0 0 0'"),
+        ("joint1='ja' joint2='jb' polycoef='0.1 2 0 0 0'", "joint1='jb' joint2='ja' polycoef='-0.05 0.5 0 0 0'"),
+        ("joint1='ja' joint2='jb' polycoef='0.1 2 0 0 0'", "joint1='ja' joint2='jc' polycoef='0 -1 0 0 0'"),
+        ("joint1='ja' polycoef='0.1 0 0 0 0'", "joint1='ja' joint2='jb' polycoef='0 2 0 0 0'"),
+    ],
+    ids=["twice", "both ways", "two leaders", "a leader that is held"],
+)
+def test_several_equalities_on_a_joint_hold_in_mujoco(equalities: tuple[str, ...], rng):
+    ties = "".join(f"<joint {equality}/>" for equality in equalities)
+    text = bodies(*map(BODY.format, "abc")).replace("</mujoco>", f"<equality>{ties}</equality></mujoco>")
+    robot = Robot.from_mjcf(text)
+    data = mujoco.MjData(robot.mj_model)
+    for q in np.asarray(robot.q0) + rng.uniform(-0.2, 0.2, (3, robot.nq)):
+        data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
+        mujoco.mj_forward(robot.mj_model, data)
+        assert data.ne == 2 and np.abs(data.efc_pos[:2]).max() < 1e-9
 
 
 def test_unknown_names_in_velocity_limits():
@@ -442,6 +463,28 @@ def test_unnamed_elements_get_names_of_their_own():
     robot = Robot.from_mjcf(bodies(body))
     assert robot.tree.body_names == ("world", "body2", "body2_")
     assert robot.joint_names == ("joint1", "joint1_")
+
+
+def test_shapes_without_a_name_are_called_by_their_link():
+    """In the pairs of a limit, too; a shape that has this very name keeps it."""
+    inner = (
+        '<body name="fore" pos="3 0 0"><joint/><geom size="1"/><geom name="fore:1" size="1"/><geom size="1"/></body>'
+    )
+    robot = Robot.from_mjcf(bodies(f'<body name="upper"><joint/><geom size="1"/>{inner}</body>'))
+    assert robot.tree.geom_names == ("upper:0", "fore:0", "fore:1", "fore:2")
+    limit = osik.CollisionAvoidanceLimit(robot, pairs=[("upper", "fore:2")])
+    assert limit.pairs == (("upper:0", "fore:2"),)
+    box = '<collision><geometry><box size="1 1 1"/></geometry></collision>'
+    table = osik.CollisionShape.sphere(0.1, [9.0, 9.0, 9.0])
+    arm = Robot.from_urdf(urdf(link("a"), link("b", INERTIAL + 2 * box), joint("j", "a", "b")), floating_base=False)
+    limit = osik.CollisionAvoidanceLimit(arm, shapes={"table": table}, pairs=[("table", "b")])
+    assert {name for pair in limit.pairs for name in pair} == {"table", "b:0", "b:1"}
+
+
+@pytest.mark.parametrize("value", ["x", None, [0.1], True, 1j])
+def test_a_value_of_a_joint_is_one_number(value):
+    robot = Robot.from_urdf(ARM, floating_base=False)
+    refuses(TypeError, "the value of joint 'a' is .*; it is one number", robot.configuration, {"a": value})
 
 
 def test_a_site_called_like_its_body_gets_a_prefix():

@@ -197,10 +197,28 @@ class TestHome:
     def test_wrong_homes_are_refused(self, home, error, words):
         refuses(error, words, osik.Robot.from_mjcf, mjcf("keyframes"), home=home)
 
-    @pytest.mark.parametrize(("home", "value"), [("broken", 2.5), ({"hinge": 2.0}, 2.0)])
-    def test_a_home_outside_is_kept_with_a_warning(self, home, value):
-        with pytest.warns(osik.OsikWarning, match=rf"hinge is {value:g}, its range is \[-1.0"):
-            assert osik.Robot.from_mjcf(mjcf("keyframes"), home=home).q0[7] == value
+    def test_a_home_outside_is_kept_with_a_warning(self):
+        with pytest.warns(osik.OsikWarning, match=r"hinge is 2, its range is \[-1.0"):
+            assert osik.Robot.from_mjcf(mjcf("keyframes"), home={"hinge": 2.0}).q0[7] == 2.0
+
+    @pytest.mark.parametrize("home", ["broken", 2])
+    def test_a_keyframe_outside_is_brought_inside_at_each_door(self, home):
+        words = r"keyframe 'broken': hinge is 2\.5 there, outside its range, and 1\.047 in q0"
+        with pytest.warns(osik.OsikWarning, match=words):
+            robot = osik.Robot.from_mjcf(mjcf("keyframes"), home=home)
+        assert robot.q0[7] == robot.position_upper[6] and not robot.load_report
+        with pytest.warns(osik.OsikWarning, match=words):
+            assert osik.Robot.from_mjcf(mjcf("keyframes")).with_home(home).q0[7] == robot.q0[7]
+
+    @pytest.mark.parametrize("home", [None, "first", {"hinge": 0.5}])
+    def test_a_note_on_a_keyframe_is_on_that_of_q0(self, home):
+        text = mjcf("keyframes").replace('"0 0 1  1 0 0 0  0  1', '"0 0 1  1 0 0 0  -1.3  1')
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always")
+            robot = osik.Robot.from_mjcf(text, home=home)
+        said = "hinge is -1.3 there, outside its range, and -1.047 in q0"
+        assert sum(said in str(one.message) for one in given) == (home in (None, "first"))
+        assert [note.done for note in robot.load_report] == ([said] if home is None else [])
 
     def test_no_keyframes_at_all(self):
         refuses(KeyError, r"keyframes: \(none\)", osik.Robot.from_urdf, ARM, floating_base=False, home="stand")

@@ -138,7 +138,7 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="where the robot comes from is not known"):
         session(source=None).save(tmp_path / "session.json")
     hull = osik.CollisionShape.convex(np.random.default_rng(0).normal(size=(9, 3)), frame="l_wrist")
-    kept = osik.CollisionAvoidanceLimit(ROBOT, shapes={"stone": hull}, pairs=[("stone", "geom0")])
+    kept = osik.CollisionAvoidanceLimit(ROBOT, shapes={"stone": hull}, pairs=[("stone", "torso:0")])
     with pytest.raises(ValueError, match="cannot hold the shape 'stone'"):
         session(limits=(kept,)).to_json()
 

@@ -83,14 +83,21 @@ def equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int,
     """Return the followers, linear in another joint, and the constant joints of the active joint equality constraints.
 
     Those of a higher degree are left out.
+
+    Raises:
+        ValueError: a joint is held at two values.
     """
-    followers, constants = [], {}
+    followers: list[Follower] = []
+    constants: dict[int, np.ndarray] = {}
     for e in np.flatnonzero((model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & model.eq_active0.astype(bool)):
         joint, leader = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
         constant, multiplier, *higher = (float(x) for x in model.eq_data[e][:5])
         reference = float(model.qpos0[model.jnt_qposadr[joint]])
         if leader < 0 or not (multiplier or any(higher)):
-            constants[joint] = np.array([reference + constant])
+            value = np.array([reference + constant])
+            if abs(constants.setdefault(joint, value) - value).max() > _LOCK_TOLERANCE:
+                name, (first,), (second,) = model.joint(joint).name, constants[joint], value
+                raise OsikValueError(f"joint {name!r} is held at {first:g} and at {second:g} by two joint equalities")
         elif not any(higher):
             start = float(model.qpos0[model.jnt_qposadr[leader]])
             followers.append(Follower(joint, leader, multiplier, reference + constant - multiplier * start))
@@ -106,16 +113,15 @@ def resolve_followers(
     """Return the followers of independent joints, chains followed to their end, and the values of all locked joints.
 
     A follower whose leader is locked is locked where the leader puts it.
+
+    Raises:
+        ValueError: relations contradict each other, or a joint cannot be locked where it is asked to be.
     """
-    table: dict[int, Follower] = {}
-    for relation in relations:
-        if relation.joint in table or relation.joint in constants:
-            raise OsikValueError(f"joint {names[relation.joint]!r} is tied by more than one joint equality")
-        table[relation.joint] = relation
+    table, constants = _independent(names, relations, constants)
     locked = {joint: lock.value for joint, lock in asked.items() if joint not in table} | dict(constants)
     followers = []
     for joint in sorted(table):
-        follower = _end_of_chain(names, table, joint)
+        follower = _end_of_chain(table, joint)
         if follower.leader in locked:
             locked[joint] = follower.multiplier * locked[follower.leader] + follower.offset
             _check_lock(names, follower, asked.get(joint), locked[joint])
@@ -128,14 +134,42 @@ def resolve_followers(
     return followers, locked
 
 
-def _end_of_chain(names: tuple[str, ...], table: Mapping[int, Follower], joint: int) -> Follower:
-    """Return the follower in terms of an independent leader."""
-    _, leader, multiplier, offset = table[joint]
-    seen = [joint]
+def _independent(
+    names: tuple[str, ...], relations: Sequence[Follower], constants: Mapping[int, np.ndarray]
+) -> tuple[dict[int, Follower], dict[int, np.ndarray]]:
+    """Return followers without circles, at most one for each joint, and all constant joints.
+
+    A joint with several relations ties their leaders to each other.
+    """
+    table: dict[int, Follower] = {}
+    held = dict(constants)
+    for relation in relations:
+        own, other = _end_of_chain(table, relation.joint), _end_of_chain(table, relation.leader)
+        multiplier = relation.multiplier * other.multiplier / own.multiplier
+        offset = (relation.multiplier * other.offset + relation.offset - own.offset) / own.multiplier
+        if own.leader != other.leader and own.leader not in held:
+            table[own.leader] = Follower(own.leader, other.leader, multiplier, offset)
+        elif own.leader != other.leader and other.leader not in held:
+            held[other.leader] = (held[own.leader] - offset) / multiplier
+        elif not _agrees(held, own.leader, other.leader, multiplier, offset):
+            raise OsikValueError(
+                f"joint equalities contradict each other: one says {names[relation.joint]} = {relation.multiplier:g} "
+                f"{names[relation.leader]} {relation.offset:+g}, which the others do not allow; deactivate one"
+            )
+    return table, held
+
+
+def _agrees(held: Mapping[int, np.ndarray], joint: int, leader: int, multiplier: float, offset: float) -> bool:
+    """Return whether ``q_joint = multiplier * q_leader + offset`` holds already."""
+    if joint == leader and joint not in held:
+        return max(abs(multiplier - 1.0), abs(offset)) <= _LOCK_TOLERANCE
+    return abs(float(held[joint][0] - multiplier * held[leader][0]) - offset) <= _LOCK_TOLERANCE
+
+
+def _end_of_chain(table: Mapping[int, Follower], joint: int) -> Follower:
+    """Return the joint in terms of an independent leader: itself, if it follows none."""
+    leader, multiplier, offset = joint, 1.0, 0.0
     while leader in table:
-        if leader in seen:
-            raise OsikValueError(f"joints mimic each other in a circle: {', '.join(names[j] for j in seen)}")
-        seen.append(leader)
         _, leader, m, o = table[leader]
         multiplier, offset = multiplier * m, multiplier * o + offset
     return Follower(joint, leader, multiplier, offset)

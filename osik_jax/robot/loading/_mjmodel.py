@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikTypeError, OsikValueError, warn
@@ -42,7 +43,11 @@ EQUALITY_END_PREFIX = "equality_end/"
 LEAST_INERTIA = 2e-15
 """Mass [kg] and moments [kg m^2] of moving bodies that have none: MuJoCo asks for more than 1e-15."""
 
-_MASSLESS = 1e-14
+
+INERTIA = "inertia"
+"""Element of notes on moments of inertia."""
+
+LEAST_MASS = 1e-14
 """Mass per body [kg] that counts as none: MuJoCo itself demands 1e-15 of every moving body."""
 
 _ONE_VALUE = 1e-10
@@ -97,7 +102,6 @@ def from_mjmodel(
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
-    geom_names = element_names(model, "geom")
     mesh_places = [_mesh_place(placement[body_names.index(named.mesh.link)], named.mesh) for named in meshes]
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
@@ -107,7 +111,7 @@ def from_mjmodel(
         joint_bodies=tuple(placement[b].body for b in model.jnt_bodyid),
         frame_names=tuple(frames),
         frame_bodies=tuple(frame.body for frame in frames.values()),
-        geom_names=(*geom_names, *_free_names(geom_names, meshes)),
+        geom_names=_geom_names(model, body_names, meshes),
         geom_types=(*map(int, model.geom_type), *[int(mujoco.mjtGeom.mjGEOM_MESH)] * len(meshes)),
         geom_bodies=(*(placement[b].body for b in model.geom_bodyid), *(place.body for place in mesh_places)),
         followers=tuple(follower[:3] for follower in followers),
@@ -126,7 +130,9 @@ def from_mjmodel(
     _warn_of_frozen(tree, lower, upper, ranges)
     home = model.key_qpos[0] if model.nkey else model.qpos0
     q0 = _home(home, tree, lower, upper)
-    found = [*notes, *model_notes(model, names, low, high, speeds), *_home_notes(model, tree, home, q0)]
+    found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names, low, high, speeds)]
+    if model.nkey and not options.has_home:
+        found += _home_notes(tree, keyframe_names(model)[0], home, q0)
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
     _warn_of_report(report)
     arrays = dict(
@@ -149,9 +155,9 @@ def from_mjmodel(
     return RobotModel(tree=tree, holder=holder, **{k: _float_array(v) for k, v in arrays.items()})
 
 
-def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "geom", "equality"]) -> tuple[str, ...]:
+def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "equality"]) -> tuple[str, ...]:
     """Return the names of a model's elements; one without a name is called by its kind and number."""
-    count = dict(body=model.nbody, joint=model.njnt, geom=model.ngeom, equality=model.neq)[kind]
+    count = dict(body=model.nbody, joint=model.njnt, equality=model.neq)[kind]
     given = [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) for k in range(count)]
     return tuple(name or free_name(f"{kind}{k}", given) for k, name in enumerate(given))
 
@@ -195,10 +201,6 @@ def _float_array(value: ArrayLike) -> Any:
 def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str, ...]) -> None:
     if model.njnt == 0:
         raise OsikValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(body_names)}")
-    moving = model.body_weldid != 0
-    if not model.body_mass[moving].sum() > _MASSLESS * model.nbody:
-        moving_names = (name for name, moves in zip(body_names, moving, strict=True) if moves)
-        raise OsikValueError(f"nothing that moves has a mass; give one of these an inertial: {', '.join(moving_names)}")
     for joint, name in enumerate(names):
         low, high = model.jnt_range[joint]
         if low > high:  # which MuJoCo may take for "no limit"
@@ -284,12 +286,20 @@ def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
     return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation)
 
 
-def _free_names(taken: Sequence[str], meshes: Sequence[NamedMesh]) -> list[str]:
-    """Return the names of the collision meshes; one without a name is called by its number, as in ``element_names``."""
+def _geom_names(model: mujoco.MjModel, body_names: Sequence[str], meshes: Sequence[NamedMesh]) -> tuple[str, ...]:
+    """Return the names of the geoms, then of the collision meshes that the model does not hold.
+
+    One without a name is called by its link and its number among the link's shapes: ``forearm_link:0``.
+    """
+    given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) for g in range(model.ngeom)]
+    given += [placed.name for placed in meshes]
+    links = [*(body_names[b] for b in model.geom_bodyid), *(placed.mesh.link for placed in meshes)]
+    numbers = [links[:k].count(link) for k, link in enumerate(links)]
     out: list[str] = []
-    for index, placed in enumerate(meshes, len(taken)):
-        out.append(free_name(placed.name or f"geom{index}", (*taken, *out)))
-    return out
+    for name, link, index in zip(given, links, numbers, strict=True):
+        taken = out if name else [*given, *out]
+        out.append(free_name(name or f"{link}:{index}", taken))
+    return tuple(out)
 
 
 def _geom_arrays(
@@ -411,24 +421,55 @@ def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, g
         )
 
 
+def _mass_notes(model: mujoco.MjModel, body_names: tuple[str, ...]) -> Iterator[LoadNote]:
+    """Yield a note if no body that moves has a mass."""
+    moving = model.body_weldid != 0
+    if not model.body_mass[moving].sum() > LEAST_MASS * model.nbody:
+        names = [name for name, moves in zip(body_names, moving, strict=True) if moves]
+        done = "nothing that moves has a mass: there is no centre of mass, momentum or kinetic energy"
+        yield LoadNote("inertial", first_of(names), done)
+
+
 def _warn_of_report(report: LoadReport) -> None:
     """Give one warning for everything that the file asks for and the robot does not keep."""
-    if report:
-        shown = first_of([str(note) for note in report], _NOTES_SHOWN)
+    moving = [str(note) for note in report if note.element != INERTIA]  # which changes no motion
+    if moving:
+        shown = first_of(moving, _NOTES_SHOWN)
         warn(f"the robot does not keep all that its file asks for (print(robot.load_report)): {shown}")
 
 
-def _home_notes(model: mujoco.MjModel, tree: KinematicTree, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:
-    """Yield notes on joints that the first keyframe has outside their range."""
-    if not model.nkey:
-        return
-    key = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, 0) or "0"
+def keyframe_names(model: mujoco.MjModel) -> list[str]:
+    """Return the names of the keyframes; one without a name is called by its number."""
+    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
+
+
+def _home_notes(tree: KinematicTree, key: str, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:
+    """Yield notes on the joints that a keyframe has outside their range."""
     changed = np.abs(qpos[tree.own_qpos] - q0) > _KEY_ROUNDING
     for joint, start in tree.qpos_address.items():
         kind = tree.joint_types[joint]
         if kind != FREE and changed[start : start + QPOS_WIDTH[kind]].any():
-            name = tree.joint_names[joint]
-            yield LoadNote("keyframe", key, f"{name} is outside its range there, and at its end in q0")
+            there, here = (_shown(own, start, QPOS_WIDTH[kind]) for own in (qpos[tree.own_qpos], q0))
+            done = f"{tree.joint_names[joint]} is {there} there, outside its range, and {here} in q0"
+            yield LoadNote("keyframe", key, done)
+
+
+def _shown(q: np.ndarray, start: int, width: int) -> str:
+    """Return the entries of a joint as text."""
+    return " ".join(f"{value:.4g}" for value in q[start : start + width])
+
+
+def keyframe_home(robot: RobotModel, number: int) -> np.ndarray:
+    """Return the configuration of a keyframe, joints brought inside their limits; warn of those that were outside."""
+    model, tree = robot.mj_model, robot.tree
+    qpos = model.key_qpos[number]
+    if isinstance(robot.position_lower, Tracer):
+        return qpos[tree.own_qpos]
+    q0 = _home(qpos, tree, np.asarray(robot.position_lower), np.asarray(robot.position_upper))
+    notes = list(_home_notes(tree, keyframe_names(model)[number], qpos, q0))
+    if notes:
+        warn(first_of([str(note) for note in notes], _NOTES_SHOWN))
+    return q0
 
 
 def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -18,7 +18,8 @@ class LoadOptions(NamedTuple):
     """The keywords of ``load_robot`` and of ``Robot``'s constructors, which say what each means.
 
     A new keyword is a field here, and one in the signature of those who offer it; readers take what they honour and
-    hand on the whole. ``home`` is no field: it is looked at when there is a robot.
+    hand on the whole. ``home`` is no field, because it is looked at when there is a robot. ``has_home`` says whether
+    one is given, so that nothing is said of the keyframe that it replaces.
     """
 
     floating_base: bool | None = None
@@ -28,6 +29,7 @@ class LoadOptions(NamedTuple):
     collision_meshes: bool = False
     package_dirs: Iterable[str | os.PathLike[str]] = ()
     root: str | Sequence[str] | None = None
+    has_home: bool = False
 
     def checked(self) -> LoadOptions:
         """Return these options; raise TypeError unless ``floating_base`` is True, False or None."""

@@ -19,6 +19,7 @@ from .._model import RobotModel
 from .._tree import UnreadMesh
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
+    INERTIA,
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
     NamedMesh,
@@ -43,6 +44,8 @@ GEOMS = {
     "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
 }
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
+_BALANCED = 1e-6
+"""Relative change of a link's moments of inertia from which a note tells of it: less is roundoff."""
 _Compiled = tuple[mujoco.MjModel, list[LoadNote]]
 
 
@@ -63,6 +66,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
             unread = tuple(_unread_meshes(description, packages, source.path))
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
+    notes += _inertia_notes(description, model)
     notes = [*urdf_notes(root, {joint.name: joint for joint in read.joints}), *read.notes, *notes]
     floating = [joint.name for joint in description.joints if joint.kind == "floating"]
     one_sided = {
@@ -73,6 +77,20 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
     return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread)
+
+
+def _inertia_notes(urdf: Urdf, model: mujoco.MjModel) -> Iterator[LoadNote]:
+    """Yield notes on the links that move and whose moments of inertia MuJoCo has balanced."""
+    for name, link in urdf.links.items():
+        moments, used = np.linalg.eigvalsh(link.inertia), np.sort(model.body(name).inertia)
+        change = np.abs(used - moments).max()
+        if model.body_weldid[model.body(name).id] and change > _BALANCED * max(moments[-1], LEAST_INERTIA / _BALANCED):
+            shown, now = (" ".join(f"{value:.4g}" for value in own) for own in (moments, used))
+            done = (
+                f"the moments {shown} kg m^2 are those of no body, the largest being more than the sum of the others: "
+                f"{now} are used, {100.0 * change / moments[-1]:.2g} % of the largest away; masses are kept"
+            )
+            yield LoadNote(INERTIA, name, done)
 
 
 def _with_base(urdf: Urdf, floating_base: bool | None, label: str) -> Urdf:

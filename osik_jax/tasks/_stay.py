@@ -1,0 +1,50 @@
+"""Task on velocities as inverse kinematics reads it."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..kinematics import Kinematics, difference
+from ..robot import Robot
+from ._curvature import no_curvature
+from ._gain import as_gain
+from ._task import Task, TaskRows
+
+
+class StayTask(Task):
+    """Task that asks for the motion from a configuration to be 0 along another task's rows: ``J difference(q0, q)``.
+
+    What the other task asks of a velocity is asked of the whole motion, with its rows, weights and priority.
+    """
+
+    moving: Task
+    start: Float[Array, " nq"]
+
+    def __init__(self, moving: Task, start: Float[Array, " nq"]):
+        self.moving, self.start = moving, start
+        self.weight, self.priority, self.hard = moving.weight, moving.priority, moving.hard
+        self.gain = as_gain(1.0, moving.weight.dtype)
+
+    @property
+    def is_goal(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Return whether the other task is a goal."""
+        return self.moving.is_goal
+
+    def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
+        """Return those of the other task."""
+        return self.moving.counted_dofs(robot)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Return the rows of the other task, whose error is the motion along them."""
+        own = self.moving.rows(robot, kinematics, q)
+        away = difference(robot, self.start, q)
+        moved = away[jnp.array(own.dofs)] if own.dofs else jnp.matmul(own.jacobian, away, precision="highest")
+        return TaskRows.of(
+            moved,
+            own.jacobian,
+            gain=self.gain,
+            weight=jnp.broadcast_to(self.weight, moved.shape),
+            dofs=own.dofs,
+            curvature=no_curvature,
+        )
