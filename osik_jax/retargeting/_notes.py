@@ -40,6 +40,7 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
             f"segments are {angle:.1f} deg off, and in {100.0 * limited:.0f} % of the frames a joint is at its largest "
             "speed: slow down the clip, or check the speed limits in the robot's file"
         )
+    out += _posture(figures)
     found = [(figures[group][name], most, text) for (group, name), (most, text) in _BOUNDS.items()]
     out += [
         f"a bound gave way: {text.format(value)}" for value, most, text in found if value is not None and value > most
@@ -47,7 +48,6 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
     margin = figures["balance"]["com_margin_mm_min"]
     if balance is not None and margin is not None and margin < 0.0:
         out.append(f"a bound gave way: the centre of mass is {-margin:.1f} mm outside the feet")
-    out += _posture(figures)
     share = figures["feet"]["contact_share"]
     if share is not None and share < _LEAST_STANDING:
         out.append(

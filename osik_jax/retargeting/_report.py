@@ -152,7 +152,7 @@ def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
 
 
 def _balance(
-    corners: Float[np.ndarray, "F 8 3"], center: Float[np.ndarray, "F 3"], contact: Bool[np.ndarray, "F 4"]
+    corners: Float[np.ndarray, "F corners 3"], center: Float[np.ndarray, "F 3"], contact: Bool[np.ndarray, "F 4"]
 ) -> dict[str, Any]:
     margins = []
     both = contact[:, :2].any(1) & contact[:, 2:].any(1) & (corners.shape[1] > 0)

@@ -81,6 +81,6 @@ def test_a_report_has_the_trunk_and_tells_what_leans_and_rests(nao, walk, monkey
 def test_a_joint_that_rests_at_its_end_is_told(nao, walk):
     figures = report(Retargeter(nao, max_iterations=1).retarget(walk))
     figures["joints"]["at_end_share"] = {"LKneePitch": 0.51, "HeadYaw": 0.5, "RElbowYaw": 1.0}
-    assert notes(figures)[-1] == (
+    assert notes(figures)[0] == (
         "joints rest at an end of their range: RElbowYaw (100 % of the frames), LKneePitch (51 % of the frames)"
     )
