@@ -79,7 +79,8 @@ template <class Team> class QPCertificate {
       Real longest = 0;
       for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) {
         longest = larger(longest, Real(fabs(row[j])));
-        if (!Method::IS_SINGLE && found.sign * fabs(row[j]) > Real(GRADIENT_TOL) * EPS * (SCALE[j] + ROW_TERMS[j])) holds = false;
+        const Real roundoff = Real(GRADIENT_TOL) * EPS * (SCALE[j] + ROW_TERMS[j]);
+        holds = holds && (Method::IS_SINGLE || !(found.sign * fabs(row[j]) > roundoff));
       }
       dual.most(found.one_side ? found.sign * longest : Real(0));
       primal.most(larger(larger(found.gap, Real(0)), y[q] != 0 ? found.off : Real(0)) / (found.scale > 0 ? found.scale : Real(1)));

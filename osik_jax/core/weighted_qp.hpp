@@ -370,7 +370,7 @@ OSIK_UNROLL_4
     });
     if (t.count(0, IS_SINGLE ? n : N, [&](int i) { return LABEL[i] != INACTIVE; })) find_gradient_roundoff();
   }
-  // of the multiplier of a variable on its bound: that of its gradient's terms; of a row: the least change that shows in one
+  // of multipliers: of a variable on its bound that of its gradient's terms, of a row the least that shows in a gradient
   OSIK_CALL void find_gradient_roundoff() {
     t.each(0, k, [&](int i) { TERMS[i] = i < m ? fabs(TARGET[i]) + t.own_size_on(B + i * ld, X, n) : fabs(Z[i]); });
     t.columns(0, n, [&](auto c) {
@@ -386,7 +386,8 @@ OSIK_UNROLL_4
     t.each(n, N, [&](int i) {
       const Real* row = B + (m + i - n) * ld;
       for (int j = 0; j < n; ++j)
-        if (MULTIPLIER_ROUNDOFF[i] * fabs(row[j]) > MULTIPLIER_ROUNDOFF[j]) MULTIPLIER_ROUNDOFF[i] = MULTIPLIER_ROUNDOFF[j] / fabs(row[j]);
+        if (MULTIPLIER_ROUNDOFF[i] * fabs(row[j]) > MULTIPLIER_ROUNDOFF[j])
+          MULTIPLIER_ROUNDOFF[i] = MULTIPLIER_ROUNDOFF[j] / fabs(row[j]);
     });
   }
 

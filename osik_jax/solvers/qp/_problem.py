@@ -125,8 +125,8 @@ def multiplier_roundoff(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) ->
     """Return the roundoff of the multipliers.
 
     For the box it is the roundoff of the gradient. For a row it is the smallest multiplier that changes an entry of the
-    gradient by its roundoff. A tolerance relative to the curvature is too large: with a weak damping beside heavy tasks,
-    a smaller multiplier of the wrong sign moves x by as much as x itself.
+    gradient by its roundoff. A tolerance relative to the curvature is too large: with a weak damping beside heavy
+    tasks, a smaller multiplier of the wrong sign moves x by as much as x itself.
     """
     scale = BOUND_MULTIPLIER[x.dtype] * float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
     size = jnp.abs(qp.rows)
