@@ -77,7 +77,11 @@ template <class Team> class QPCertificate {
                                length, y[q], Real(0), Real(0));
       holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
       Real longest = 0;
-      for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) longest = larger(longest, Real(fabs(row[j])));
+      for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) {
+        longest = larger(longest, Real(fabs(row[j])));
+        const Real roundoff = Real(GRADIENT_TOL) * EPS * (SCALE[j] + ROW_TERMS[j]);
+        holds = holds && (Method::IS_SINGLE || !(found.sign * fabs(row[j]) > roundoff));
+      }
       dual.most(found.one_side ? found.sign * longest : Real(0));
       primal.most(larger(larger(found.gap, Real(0)), y[q] != 0 ? found.off : Real(0)) / (found.scale > 0 ? found.scale : Real(1)));
     });

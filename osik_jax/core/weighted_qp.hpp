@@ -368,9 +368,10 @@ OSIK_UNROLL_4
       VALUE[i] = value, VALUE_ROUNDOFF[i] = VIOLATION * tolerance * scale;
       if (i >= n) MULTIPLIER_ROUNDOFF[i] = tolerance * scale / square(larger(per_root, Team::SMALLEST_ROOT));
     });
-    if (t.count(0, n, [&](int j) { return LABEL[j] != INACTIVE; })) find_bound_roundoff();
+    if (t.count(0, IS_SINGLE ? n : N, [&](int i) { return LABEL[i] != INACTIVE; })) find_gradient_roundoff();
   }
-  OSIK_CALL void find_bound_roundoff() {  // of the multiplier of a variable on its bound: that of its gradient's terms
+  // of multipliers: of a variable on its bound that of its gradient's terms, of a row the least that shows in a gradient
+  OSIK_CALL void find_gradient_roundoff() {
     t.each(0, k, [&](int i) { TERMS[i] = i < m ? fabs(TARGET[i]) + t.own_size_on(B + i * ld, X, n) : fabs(Z[i]); });
     t.columns(0, n, [&](auto c) {
       auto size = c.load(X).size();
@@ -381,6 +382,13 @@ OSIK_UNROLL_4
       c.store(SOLVED, size);
     });
     t.each(0, n, [&](int j) { MULTIPLIER_ROUNDOFF[j] = RELEASE * EPS * SOLVED[j]; });
+    if (IS_SINGLE) return;
+    t.each(n, N, [&](int i) {
+      const Real* row = B + (m + i - n) * ld;
+      for (int j = 0; j < n; ++j)
+        if (MULTIPLIER_ROUNDOFF[i] * fabs(row[j]) > MULTIPLIER_ROUNDOFF[j])
+          MULTIPLIER_ROUNDOFF[i] = MULTIPLIER_ROUNDOFF[j] / fabs(row[j]);
+    });
   }
 
   // ---- labels

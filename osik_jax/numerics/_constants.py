@@ -214,7 +214,8 @@ KERNEL_PIVOT = 1e2
 BOUND_MULTIPLIER = {jnp.dtype("float64"): 1.0, jnp.dtype("float32"): 0.03}
 """Multiplier of the wrong sign in units of machine epsilon times the gradient's terms, above which a variable leaves
 its bound. A tolerance relative to the cost's curvature would be too large: a weak task such as a posture pulls with
-less. In single precision the sum of all terms would be too, as their roundoff mostly cancels.
+less. In single precision the sum of all terms would be too, as their roundoff mostly cancels. A row leaves its bound if
+its multiplier exceeds this in an entry of the gradient (double precision).
 """
 VIOLATION_TOL = 10.0
 """Violation in units of roundoff, in single precision, below which a bound holds."""

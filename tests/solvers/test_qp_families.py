@@ -1,5 +1,7 @@
 """Hundreds of hard QPs a family: known optimum, optimality recomputed in NumPy, daqp, quadprog and SciPy beside it."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -154,6 +156,63 @@ def test_whole_body_least_squares(family, rng):
         np.testing.assert_allclose(x, p.x, atol=1e-9)
     for i in range(0, COUNT, 20):
         np.testing.assert_allclose(x[i], by_bounded_least_squares(p, i), atol=1e-9)
+
+
+@partial(jax.jit, static_argnames="backend")
+def from_random_labels(p, rows, low, high, warm_start, *, backend):
+    """Weak damping beside heavy tasks: the weakest curvature is 1e-12 of the strongest."""
+
+    def one(A, b, w, lower, upper, *rest):
+        *rows, warm_start = rest
+        options = dict(damping=WHOLE_BODY_DAMPING, warm_start=warm_start, backend=backend)
+        return solve_least_squares_qp(A, b, w, lower, upper, *rows, **options)
+
+    return jax.vmap(one)(*p, rows, low, high, warm_start)
+
+
+def wrong_multipliers(p, rows, s):
+    """Largest multiplier of the wrong sign, in units of the gradient's terms that it is part of, and these terms."""
+    x, y, active = (np.asarray(a) for a in (s.x, s.row_multipliers, s.active))
+    slope = np.einsum("bmn,bm->bn", p.A, p.weight * (np.einsum("bmn,bn->bm", p.A, x) - p.b)) + WHOLE_BODY_DAMPING * x
+    terms = np.abs(p.b) + np.einsum("bmn,bn->bm", np.abs(p.A), np.abs(x))
+    terms = np.einsum("bmn,bm->bn", np.abs(p.A), p.weight * terms) + WHOLE_BODY_DAMPING * np.abs(x)
+    terms += np.einsum("bpn,bp->bn", np.abs(rows), np.abs(y)) + np.finfo(float).tiny
+    multiplier = (slope - np.einsum("bpn,bp->bn", rows, y)) / terms
+    of_rows = y * np.max(np.abs(rows) / terms[:, None], 2)
+    signed = active * np.concatenate([multiplier, of_rows], 1)  # -1 at a lower bound, where it is positive
+    return np.max(np.where(np.abs(active) == 1, signed, 0.0), 1), terms.max(1, keepdims=True)
+
+
+@pytest.mark.variants(
+    slow=["core-inf", "core-1e10", "jax-inf"], release=["jax-1e3", "jax-1e12", "core-1e3", "core-1e12"]
+)
+@pytest.mark.parametrize("far", ["inf", "1e3", "1e10", "1e12"])
+@pytest.mark.parametrize("backend", ["jax", "core"])
+def test_a_random_warm_start_does_not_change_the_answer(backend, far, rng):
+    """Bounds that are far away are in many of the working sets that are tried first."""
+    count, rows_count = 200, 6
+    p = redundant(rng, count)
+    n, far = p.A.shape[2], float(far)
+    p = p._replace(lower=np.maximum(p.lower, -far), upper=np.minimum(p.upper, far))
+    inside = np.asarray(batched_least_squares(*p[:5]).x)
+    rows = rng.normal(size=(count, rows_count, n)) * (rng.random((count, rows_count, n)) < 0.4)
+    low = np.einsum("bpn,bn->bp", rows, inside) - rng.uniform(-0.02, 0.3, (count, rows_count))
+    high = np.where(rng.random(low.shape) < 0.5, far, low + rng.uniform(0.1, 0.5, low.shape))
+    for bounds in ((low, high), (np.full_like(low, -far), np.full_like(low, far))):
+        given = p[:5], rows, *bounds
+        labels = rng.integers(-1, 2, (2, count, n + rows_count))
+        cold, *warm = (from_random_labels(*given, w, backend=backend) for w in (0 * labels[0], *labels))
+        values = np.einsum("bpn,bn->bp", rows, np.asarray(cold.x))
+        for s in (cold, *warm):
+            assert (np.asarray(s.status) == Status.SOLVED).all()
+            wrong, terms = wrong_multipliers(p, rows, s)
+            assert wrong.max() < 1e-15
+            # what the rounding of the gradient leaves open, at the curvature of the damping
+            off = np.abs(np.asarray(s.x) - cold.x) * WHOLE_BODY_DAMPING / terms
+            assert off.max() < 1e-15
+        assert (np.maximum(bounds[0] - values, values - bounds[1]) < 1e-9).all()
+    for i in range(0, count, 40):  # rows that no bound is near to
+        np.testing.assert_allclose(cold.x[i], by_bounded_least_squares(p, i), atol=1e-8)
 
 
 def spoiled(p: QPs, argument: int, bad: float) -> QPs:

@@ -24,7 +24,6 @@ from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import (
     AT_LOWER,
     AT_UPPER,
-    BOUND_MULTIPLIER,
     EQUALITY,
     GRADIENT_TOL,
     INACTIVE,
@@ -39,7 +38,7 @@ from . import _core, _cuda
 from ._candidate import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
-from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, unpack
+from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, multiplier_roundoff, unpack
 from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
@@ -179,6 +178,7 @@ def _as_result(
         done=is_certified,
         optimal=is_certified,
         infeasible_ends=zeros,
+        cold=zeros.astype(bool),
         used_newton=zeros.astype(bool),
         infeasible=zeros.astype(bool),
         compliance=qp.compliance,
@@ -198,8 +198,9 @@ def _is_certified(qp: QP, result: SearchResult, tolerance: Float[Array, ""]) -> 
     scales = constraint_scales(qp, qp.cost.diagonal(), x, y)
     # of a robot at rest x itself is roundoff, and so are the scales
     gradient_roundoff = float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
-    release = jnp.concatenate([BOUND_MULTIPLIER[x.dtype] * gradient_roundoff, jnp.zeros_like(y)])
-    multiplier = jnp.maximum(SIGN_TOL * tolerance * scales.multiplier, release)
+    multiplier, smallest = SIGN_TOL * tolerance * scales.multiplier, multiplier_roundoff(qp, x, y)
+    in_box, of_rows = jnp.maximum(multiplier[:n], smallest[:n]), GRADIENT_TOL * smallest[n:]
+    multiplier = jnp.concatenate([in_box, jnp.minimum(multiplier[n:], of_rows)])
     roundoff = Roundoff(VALUE_TOL * tolerance * scales.value, multiplier)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)
     # an active constraint: x_i = bound, or c'x + compliance y = bound (a soft row is missed by -compliance y)

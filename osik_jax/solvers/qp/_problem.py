@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, INACTIVE, ROW_MULTIPLIER, ZERO_TOL
+from ...numerics._constants import AT_LOWER, AT_UPPER, BOUND_MULTIPLIER, INACTIVE, ROW_MULTIPLIER, ZERO_TOL
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import largest_of_each, relative_kkt_residual
@@ -119,6 +119,19 @@ def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
 def gradient_scale(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
     """Return the sums of the absolute terms of the Lagrangian's gradient, which scale its roundoff."""
     return qp.cost.gradient_scale(x) + apply(jnp.abs(qp.rows).T, jnp.abs(y))
+
+
+def multiplier_roundoff(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n_and_p"]:
+    """Return the roundoff of the multipliers.
+
+    For the box it is the roundoff of the gradient. For a row it is the smallest multiplier that changes an entry of the
+    gradient by its roundoff. A tolerance relative to the curvature is too large: with a weak damping beside heavy
+    tasks, a smaller multiplier of the wrong sign moves x by as much as x itself.
+    """
+    scale = BOUND_MULTIPLIER[x.dtype] * float(jnp.finfo(x.dtype).eps) * gradient_scale(qp, x, y)
+    size = jnp.abs(qp.rows)
+    of_rows = jnp.where(size > 0.0, scale / jnp.where(size > 0.0, size, 1.0), jnp.inf)
+    return jnp.concatenate([scale, jnp.min(of_rows, 1, initial=jnp.inf)])
 
 
 class Scales(NamedTuple):

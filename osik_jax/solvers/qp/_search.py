@@ -31,7 +31,7 @@ from ...numerics._constants import (
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
 from ._kkt_solve import KKTFactor, factorize, solve_on_active_set
-from ._problem import QP, constraint_scales, kkt_residual
+from ._problem import QP, constraint_scales, kkt_residual, multiplier_roundoff
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
 from ._tableau import find_active_set
@@ -49,6 +49,7 @@ class SearchResult(NamedTuple):
     done: Bool[Array, ""]
     optimal: Bool[Array, ""]
     infeasible_ends: Int[Array, ""]  # of the dual method
+    cold: Bool[Array, ""]  # the search began with no active bound, or does so again
     used_newton: Bool[Array, ""]  # projected Newton took over from the dual method
     infeasible: Bool[Array, ""]  # proven: no point of the box satisfies the hard rows; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
@@ -69,6 +70,7 @@ def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B
         done=no,
         optimal=no,
         infeasible_ends=zeros,
+        cold=jax.vmap(lambda one, start: jnp.all(usable_guess(one, 0 * start) == usable_guess(one, start)))(qp, guess),
         used_newton=no,
         infeasible=no,
         compliance=qp.compliance,
@@ -130,6 +132,9 @@ def _search_rounds(
 ) -> SearchResult:
     """Factor, check and search in rounds until all problems are done; projected Newton takes over on failure.
 
+    Where weak dampings are beside heavy rows, the tableau of an active set that is far off may have no correct digit.
+    So a search that fails from a guess begins again with no active bound before projected Newton takes over.
+
     After projected Newton there is one more round, so that its answer is the exact minimiser on its active set, if
     there are digits enough for that.
     """
@@ -139,16 +144,26 @@ def _search_rounds(
 
     def is_running(state: tuple[SearchResult, Array]) -> Bool[Array, ""]:
         result, rounds = state
-        return (rounds <= MAX_ROUNDS) & ~jnp.all(result.done)
+        return (rounds <= 2 * MAX_ROUNDS) & ~jnp.all(result.done)
 
     def body(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
         result, rounds = state
         result = choose(~result.done, _round(qp, hessian, result, tolerance, max_iterations, by_pivots), result)
-        gives_up = (result.infeasible_ends >= MAX_INFEASIBLE) | (rounds + 1 >= MAX_ROUNDS)
+        gives_up = (result.infeasible_ends >= MAX_INFEASIBLE) | ((rounds + 1) % MAX_ROUNDS == 0)
         failed = ~(result.done | result.used_newton) & gives_up
-        return with_a_few(qp, result, ~failed, newton), rounds + 1
+        restarts = failed & ~result.cold & by_pivots
+        result = choose(restarts, _begun_again(qp, result), result)
+        return with_a_few(qp, result, ~failed | restarts, newton), rounds + 1
 
     return jax.lax.while_loop(is_running, body, (start, jnp.asarray(0)))[0]
+
+
+def _begun_again(qp: QP, result: SearchResult) -> SearchResult:
+    """Return the iterate with no active bound; the counts of changes and factorisations go on."""
+    no = jnp.zeros_like(result.redundant)
+    inactive = jax.vmap(usable_guess)(qp, no.astype(jnp.int32))
+    ends = jnp.zeros_like(result.infeasible_ends)
+    return result._replace(active=inactive, redundant=no, infeasible_ends=ends, cold=jnp.ones_like(result.cold))
 
 
 def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: int, by_pivots: bool) -> SearchResult:
@@ -228,9 +243,12 @@ def _minimize(
     factor = jax.vmap(factorize)(qp, hessian, result.active)
     x, y = solve_on_active_set(qp, factor, result.active)
     scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
-    roundoff = Roundoff(*(tolerance[:, None] * a for a in scales))
+    value, multiplier = (tolerance[:, None] * a for a in scales)
+    significant = jax.vmap(multiplier_roundoff)(qp, x, y)
+    roundoff = Roundoff(value, jnp.minimum(multiplier, significant))
     optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
-    relaxed = Roundoff(*(RELAXED[hessian.dtype] * a for a in roundoff))
+    relaxed = RELAXED[hessian.dtype]
+    relaxed = Roundoff(relaxed * value, jnp.minimum(relaxed * multiplier, significant))
     nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
     return _Minimizers(factor, x, y, roundoff, optimal, nearly_optimal)
 
