@@ -58,7 +58,7 @@ def packed_step(
     inputs = [["q", *places[numbered[1]][1:], False]]
     for name, leaf in zip(leaf_names(targets), jax.tree.leaves(targets), strict=True):
         inputs.append([name, *places[leaf][1:], name.endswith(".target[1]")])
-    *scalars, quaternions = manifold(robot)
+    *scalars, quaternions = manifold(robot.tree)
     return {
         "version": VERSION,
         "dt": dt,

@@ -20,6 +20,7 @@ from ..execution._backends import Backend, takes
 from ..execution._computed import by_kernel
 from ..execution._platform import cuda_is_default
 from ..robot import Robot
+from ..robot._configuration import check_configuration
 from ..robot._made_for import check_robot
 from ..robot._tree import BALL, FREE, HINGE, SLIDE, KinematicTree
 from ..robot.loading._mjmodel import LEAST_MASS
@@ -64,8 +65,7 @@ class Kinematics(eqx.Module):
         Raises:
             KeyError: no such frame.
         """
-        positions, rotations = self.frame_poses(robot, (name,))
-        return positions[0], rotations[0]
+        return _one(_poses_of(robot, self, (name,)))
 
     def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Return positions and rotations of several frames.
@@ -73,11 +73,30 @@ class Kinematics(eqx.Module):
         Raises:
             KeyError: no such frame.
         """
-        ids = np.array([robot.tree.frame(name) for name in names], int)
-        bodies = np.asarray(robot.tree.frame_bodies, int)[ids]
-        rotations = self.body_rotation[bodies]
-        positions = self.body_position[bodies] + rotate(rotations, robot.frame_position[ids])
-        return positions, compose(rotations, robot.frame_rotation[ids])
+        return _poses_of(robot, self, names)
+
+
+@jax.jit
+def _one(arrays: Any) -> Any:
+    """Return the first of each array's rows."""
+    return jax.tree.map(lambda a: a[0], arrays)
+
+
+# functions in place of methods: Equinox copies its object at each call of a method
+def _poses_of(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> tuple[Array, Array]:
+    frames = tuple(robot.tree.frame(name) for name in names)
+    poses, fixed = (kinematics.body_position, kinematics.body_rotation), (robot.frame_position, robot.frame_rotation)
+    return _frame_poses(robot.tree, frames, *poses, *fixed)
+
+
+@partial(jax.jit, static_argnums=(0, 1), inline=True)
+def _frame_poses(
+    tree: KinematicTree, frames: tuple[int, ...], position: Array, rotation: Array, offset: Array, turn: Array
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+    ids = np.array(frames, int)
+    bodies = np.asarray(tree.frame_bodies, int)[ids]
+    rotations = rotation[bodies]
+    return position[bodies] + rotate(rotations, offset[ids]), compose(rotations, turn[ids])
 
 
 def check_kinematics(robot: Robot, kinematics: Any) -> None:
@@ -110,7 +129,7 @@ def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
             stack of robots.
     """
     check_robot(robot, "forward_kinematics(robot, q)")
-    robot.check_configuration(q)
+    check_configuration(robot, q, "q")
     return _forward_kinematics(robot, jnp.asarray(q))
 
 
@@ -136,7 +155,7 @@ def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kin
     """
     if not takes(backend, "core", fits=True) or (cuda_is_default() and not _cuda.installed()):
         return forward_kinematics(robot, q)
-    robot.check_configuration(q)
+    check_configuration(robot, q, "q")
     return Kinematics(*_bodies(robot, q), backend=backend)
 
 
@@ -154,7 +173,7 @@ def frame_jacobian(robot: Robot, kinematics: Kinematics, name: str | Sequence[st
         ValueError: it is a batch, or has other numbers of bodies or dofs than the robot.
     """
     if isinstance(name, str):
-        return frame_jacobian(robot, kinematics, (name,))[0]
+        return _one(frame_jacobian(robot, kinematics, (name,)))
     check_kinematics(robot, kinematics)
     return _frame_jacobians(robot, kinematics, tuple(robot.tree.frame(one) for one in name))
 
@@ -195,8 +214,13 @@ def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = N
         ValueError: the subtree has no mass, or the scene has several trees that may be the robot.
     """
     check_kinematics(robot, kinematics)
-    mass, moment = _body_moments(robot, kinematics, body_masses(robot, subtree))
-    return jnp.sum(moment, 0) / jnp.sum(mass)
+    mass = body_masses(robot, subtree)
+    return _center(mass, robot.body_com, kinematics.body_position, kinematics.body_rotation)
+
+
+@partial(jax.jit, inline=True)
+def _center(mass: Array, center: Array, position: Array, rotation: Array) -> Float[Array, "3"]:
+    return jnp.sum(mass[:, None] * (position + rotate(rotation, center)), 0) / jnp.sum(mass)
 
 
 def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3 nv"]:
@@ -206,7 +230,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
         KeyError, ValueError: as in ``center_of_mass``.
     """
     check_kinematics(robot, kinematics)
-    return _center_and_jacobian(_with_masses(robot, subtree), kinematics)[1]
+    return _com_jacobian(_with_masses(robot, subtree), kinematics)
 
 
 def moving_center(
@@ -238,6 +262,11 @@ def _center_and_jacobian(robot: Robot, kinematics: Kinematics) -> tuple[Float[Ar
     columns = mass_below * kinematics.dof_linear.T + cross(kinematics.dof_angular.T, arm, along=-2)
     center = jnp.sum(moment, 0) / jnp.sum(mass)
     return center, independent_columns(robot.tree, columns / jnp.sum(mass))
+
+
+@jax.jit
+def _com_jacobian(robot: Robot, kinematics: Kinematics) -> Float[Array, "3 nv"]:
+    return _center_and_jacobian(robot, kinematics)[1]
 
 
 def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"]) -> Float[Array, "... nv"]:

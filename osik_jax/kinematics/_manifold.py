@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -11,8 +13,9 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
 from ..robot import Robot
+from ..robot._configuration import check_configuration
 from ..robot._made_for import check_robot
-from ..robot._tree import BALL, FREE
+from ..robot._tree import BALL, FREE, KinematicTree
 
 
 def integrate(
@@ -39,13 +42,18 @@ def integrate(
         ValueError: q or v has the wrong length, or (outside jit) q is not finite or holds a quaternion of zeros.
     """
     check_robot(robot, "integrate(robot, q, v)")
-    robot.check_configuration(q)
+    check_configuration(robot, q, "q")
     if np.shape(v) != (robot.nv,):
         raise OsikValueError(f"v has shape {np.shape(v)}, this robot's velocities have shape ({robot.nv},)")
-    q, step = jnp.asarray(q), jnp.asarray(v) * dt
+    return _integrated(robot.tree, jnp.asarray(q), jnp.asarray(v), dt)
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _integrated(tree: KinematicTree, q: Array, v: Array, dt: Array | float) -> Float[Array, " nq"]:
+    step = v * dt
     q = jnp.asarray(q, jnp.result_type(q, step))
-    scalar_q, scalar_v, quaternions = layout(robot)
-    moves = np.zeros(robot.nq, int)
+    scalar_q, scalar_v, quaternions = layout(tree)
+    moves = np.zeros(len(q), int)
     moves[scalar_q] = scalar_v
     added, parts, end = q + step[moves], [], 0  # put together from pieces: fewer operations than scatters
     for at, dof in quaternions:
@@ -66,22 +74,25 @@ def difference(
         ValueError: as in ``integrate``.
     """
     check_robot(robot, "difference(robot, qa, qb)")
-    robot.check_configuration(qa)
-    robot.check_configuration(qb)
-    qa, qb = jnp.asarray(qa), jnp.asarray(qb)
+    check_configuration(robot, qa, "q")
+    check_configuration(robot, qb, "q")
+    return _difference(robot.tree, jnp.asarray(qa), jnp.asarray(qb))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _difference(tree: KinematicTree, qa: Array, qb: Array) -> Float[Array, " nv"]:
     dtype = jnp.result_type(qa, qb, float)
     qa, qb = qa.astype(dtype), qb.astype(dtype)
-    scalar_q, scalar_v, quaternions = layout(robot)
-    out = jnp.zeros(robot.nv, dtype).at[scalar_v].set((qb - qa)[scalar_q])
+    scalar_q, scalar_v, quaternions = layout(tree)
+    out = jnp.zeros(len(scalar_v) + 3 * len(quaternions), dtype).at[scalar_v].set((qb - qa)[scalar_q])
     for at, dof in quaternions:
         a, b = (jaxlie.SO3(x[at : at + 4]).normalize() for x in (qa, qb))
         out = out.at[dof : dof + 3].set((a.inverse() @ b).log())
     return out
 
 
-def layout(robot: Robot) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
+def layout(tree: KinematicTree) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
     """Return the entries of q and v that simply add, and (start in q, start in v) of each quaternion."""
-    tree = robot.tree
     scalar_q, scalar_v, quaternions = [], [], []
     for joint, at in tree.qpos_address.items():
         kind, dof = tree.joint_types[joint], tree.dof_address[joint]

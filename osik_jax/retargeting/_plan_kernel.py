@@ -69,7 +69,7 @@ def _structure(body: Body) -> np.ndarray:
     places = np.array([tree.frame_bodies[tree.frame(name)] for name in body.frames])
     columns, _ = dof_columns(tree)
     scalar, index = scalar_layout(body.robot)
-    scalar_q, scalar_v, quaternions = layout(body.robot)
+    scalar_q, scalar_v, quaternions = layout(body.robot.tree)
     counts = dict(
         bodies=len(tree.body_parents),
         joints=len(tree.joint_types),
