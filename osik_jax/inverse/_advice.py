@@ -78,7 +78,9 @@ def _jacobians(robot: Robot, frame: str) -> tuple[Float[Array, "samples 6 n"], F
     kinematics = chain_kinematics(chain, x.T)
     matrix = jnp.moveaxis(jacobian(chain, kinematics)[0], -1, 0)
     # lengths in units of the longest lever make rows of position and orientation comparable
-    size = jnp.maximum(jnp.max(jnp.abs(matrix[:, :3])), jnp.finfo(x.dtype).tiny)
+    longest = jnp.max(jnp.abs(matrix[:, :3]))
+    # levers of a chain without length are rounding, which is not to look like motion
+    size = jnp.where(longest > _SINGULAR, longest, 1.0)
     world = jnp.concatenate([matrix[:, :3] / size, matrix[:, 3:]], 1)
     turn = jnp.moveaxis(kinematics.rotation[0], -1, 0)
     own = jnp.concatenate([jnp.einsum("lij,lik->ljk", turn, part) for part in (world[:, :3], world[:, 3:])], 1)
