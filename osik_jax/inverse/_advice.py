@@ -103,7 +103,9 @@ def _jacobians(
     kinematics = chain_kinematics(chain, x.T)
     matrix = jnp.moveaxis(jacobian(chain, kinematics), -1, 0)
     # lengths in units of the longest lever make rows of position and orientation comparable
-    size = jnp.maximum(jnp.max(jnp.abs(matrix[:, :, :3])), jnp.finfo(x.dtype).tiny)
+    longest = jnp.max(jnp.abs(matrix[:, :, :3]))
+    # levers of a chain without length are rounding, which is not to look like motion
+    size = jnp.where(longest > _SINGULAR, longest, 1.0)
     parts = matrix[:, :, :3] / size, matrix[:, :, 3:]
     turn = jnp.moveaxis(kinematics.rotation, -1, 0)
     world = jnp.concatenate(parts, 2)

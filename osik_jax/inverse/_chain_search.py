@@ -107,13 +107,13 @@ class ChainSearch(eqx.Module):
             points = jnp.where((seed == 0)[:, None], self.first, points)
         return jnp.clip(points, self.lower, self.upper)
 
-    def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
+    def advance(self, x: Float[Array, "lanes n"], goal: Goal, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
         if self.by_core and _library.installed():
             return jax.vmap(partial(_by_kernel, steps=steps), (None, 0, 0))(self, x, goal)
         return self.advance_plain(x, goal, steps)
 
-    def advance_plain(self, x: Float[Array, "lanes n"], goal: Goal, steps: int) -> tuple[Array, Array, Errors]:
+    def advance_plain(self, x: Float[Array, "lanes n"], goal: Goal, steps: Any) -> tuple[Array, Array, Errors]:
         """Return what ``advance`` does, by plain JAX."""
         turned = lanes_last(goal)
 

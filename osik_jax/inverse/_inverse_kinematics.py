@@ -71,8 +71,9 @@ def inverse_kinematics(
     Called with numbers, it runs as long as it has to. Where one of its arguments is traced, so inside ``jit``, ``vmap``
     or ``grad``, it takes ``seeds`` searches of ``steps`` steps each: a pure function of a limited amount of work. ``q``
     then is differentiable with respect to poses, the robot's numbers and limits, by the implicit function theorem: of
-    the motions that keep the frames on their targets the shortest, joints at a limit staying there. Other results are
-    constants.
+    the motions that keep the frames on their targets the shortest, joints at a limit staying there. Of poses out of
+    reach it is the motion of the least error, and ``position_error`` and ``orientation_error`` have derivatives too.
+    Other results are constants.
 
     Args:
         robot: the robot.
@@ -82,7 +83,7 @@ def inverse_kinematics(
             its gain does not matter, nor do target velocities. Tasks on poses (frames, centre of mass, contacts, axes
             and the like), joints of a ``FreezeTask`` and hard tasks have to be met (``Task.is_goal``); others
             (postures) are preferences, which fade out on the way. Tasks on velocities ask for no motion from ``q0``.
-        targets: of tasks, by name, what ``replace(target=...)`` takes with one more axis in front, for many targets.
+        targets: of tasks, by name, what ``replace(target=...)`` takes; with one more axis in front, many targets.
         scheme: for tasks, as in ``solve``.
         limits: beside the robot's joint limits, as in ``solve``; ``osik_jax.no_limits``: none. With a
             ``CollisionAvoidanceLimit`` or ``PositionBarrier``, steps are those of the scheme. Limits on speeds and
@@ -95,9 +96,11 @@ def inverse_kinematics(
         position_tolerance: largest distance of a frame from its target [m]; of tasks, of the rows in metres.
         orientation_tolerance: largest angle [rad]; of tasks, of the rows in radians.
         nearest: take all ``seeds`` searches, which start around ``q0`` (or ``robot.q0``), and return the solution that
-            is nearest to it of those that they find.
+            is nearest to it of those that they find. Where they find none, the call without ``nearest`` follows, and
+            its solution then moves towards ``q0`` as far as the frames allow.
         all: take all ``seeds`` searches and return all their solutions that differ, too: ``solutions``, ``count`` and
-            ``branches``, the number that differ by more than whole turns.
+            ``branches``, the number that differ by more than whole turns. Where they find none, the call without
+            ``all`` follows.
         steps: that one search may take (static).
         restarts: how often as many searches again are started for targets that are not found.
         closest: whether targets that are not found get the configuration with the least error (static). False is
@@ -144,9 +147,8 @@ def inverse_kinematics(
         results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
         found, outcomes, isolated = results
         if not traced:
-            more = once * (1 + restarts), steps
-            options = dict(route=route, warm=q0 is not None, near=nearest)
-            found = searched_on(robot, problem.goals, settings, found, *more, **options)
+            on = partial(searched_on, route=route, warm=q0 is not None, near=nearest)
+            found = on(robot, problem.goals, settings, found, once * (1 + restarts), steps)
         found = with_all(found, outcomes, isolated, _coordinates(robot, route, settings)) if all else found
     else:
         found = searched(robot, problem.goals, settings, once * (1 + restarts), steps, **start)

@@ -52,7 +52,7 @@ class Search(Protocol):
         """Return the starts of the searches with these indices."""
         ...
 
-    def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: int) -> tuple[Array, Array, Errors]:
+    def advance(self, x: Float[Array, "lanes n"], goal: Any, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
         ...
 

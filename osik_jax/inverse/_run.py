@@ -89,12 +89,12 @@ def searched_on(
     near: bool,
 ) -> InverseKinematicsSolution:
     """Return ``found``; for targets that it has not met, what ``searched`` finds, moved home where ``near``."""
-    left = ~found.converged & (found.beyond_reach <= 0.0)
+    left = ~np.asarray(found.converged) & (np.asarray(found.beyond_reach) <= 0.0)
     if not left.any():
         return found
     new = searched(robot, goals, settings, seeds, steps, route=route, warm=warm, go_on=False, wanted=left)
     new = dataclasses.replace(new, steps=found.steps + new.steps)
-    left &= new.converged
+    left &= np.asarray(new.converged)
     if near and route.starts_anew and left.any():
 
         def walk(*args: Any) -> InverseKinematicsSolution:
@@ -102,7 +102,7 @@ def searched_on(
 
         home = only(left, walk, goals, new.q, new.seed, new.steps)
         far, away = (np.linalg.norm(a.q - np.asarray(settings.home), axis=1) for a in (home, new))
-        new = _with(new, home.converged & (far < away), home)
+        new = _with(new, np.asarray(home.converged) & (far < away), home)
     return _with(found, left, new)
 
 

@@ -107,7 +107,7 @@ class TaskSearch(eqx.Module):
         ratio = jnp.where(seed == 0, 0.0, ratio)[:, None]
         return jnp.clip(self.first + ratio * (points - self.first), self.lower, self.upper)
 
-    def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: int) -> tuple[Array, Array, Errors]:
+    def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
 
         def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:

@@ -143,9 +143,9 @@ def test_nearest_finds_what_the_plain_call_finds(rng):
     robot = osik.load_robot("arm7", position_limits={f"joint{i}": (-2.8, 2.8) for i in range(1, 8)})
     position, rotation = random_poses(robot, "hand", 64, rng)
 
-    def find(position, rotation, **options):
-        options = dict(q0=np.full(7, 4.0), seeds=8) | options
-        return osik.inverse_kinematics(robot, {"hand": (position, rotation)}, **options)
+    def find(position, rotation, nearest=False):
+        start = jnp.full(7, 4.0)
+        return osik.inverse_kinematics(robot, {"hand": (position, rotation)}, q0=start, seeds=8, nearest=nearest)
 
     near, plain = find(position, rotation, nearest=True), find(position, rotation)
     assert np.asarray(plain.converged).all() and np.asarray(near.converged).all()
