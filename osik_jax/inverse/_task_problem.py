@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
@@ -145,12 +146,13 @@ def read_tasks(robot: Robot, given: Mapping[str, Any], home: Array) -> dict[str,
         ValueError: a task for another robot, or none that has to be met.
     """
     check_tasks(given, robot)
-    if not any(is_goal(task) for task in given.values()):
+    sought = {name: task.sought(robot, home) for name, task in given.items()}
+    tasks = {name: task for name, task in sought.items() if task is not None}
+    if not any(is_goal(task) for task in tasks.values()):
         raise OsikValueError(
             "no task says where anything has to be: give a FrameTask, a ComTask or another task on a pose"
         )
-    sought = {name: task.sought(robot, home) for name, task in given.items()}
-    return _in_background({name: task for name, task in sought.items() if task is not None})
+    return _in_background(tasks)
 
 
 def _in_background(tasks: dict[str, Task]) -> dict[str, Task]:
@@ -160,8 +162,13 @@ def _in_background(tasks: dict[str, Task]) -> dict[str, Task]:
     beside = {name: task for name, task in tasks.items() if not is_goal(task) and task.priority <= lowest}
     if not beside:
         return tasks
-    heaviest, light = (jnp.max(jnp.stack([jnp.max(task.weight) for task in own])) for own in (beside.values(), goals))
-    share = jnp.minimum(1.0, _BACKGROUND * light / jnp.where(heaviest > 0.0, heaviest, 1.0))
+    weights = [[task.weight for task in own] for own in (beside.values(), goals)]
+    # by NumPy unless traced, because JAX's dispatch costs more
+    numbers: Any = jnp if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(weights)) else np
+    heaviest, light = (numbers.max(numbers.stack([numbers.max(weight) for weight in own])) for own in weights)
+    share = numbers.minimum(1.0, _BACKGROUND * light / numbers.where(heaviest > 0.0, heaviest, 1.0))
+    if numbers is np and share >= 1.0:
+        return tasks
     return {**tasks, **{name: task.replace(weight=share * task.weight) for name, task in beside.items()}}
 
 

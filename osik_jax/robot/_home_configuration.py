@@ -16,7 +16,7 @@ from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
 from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
-from .loading._mjmodel import keyframe_home, keyframe_names
+from .loading._keyframes import keyframe_home, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""

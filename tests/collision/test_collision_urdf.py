@@ -220,7 +220,7 @@ def test_a_mesh_that_is_missing_is_told_and_left_out(meshed):
     late = osik.Robot.from_urdf(meshed, floating_base=False)
     with pytest.warns(osik.OsikWarning, match=r"1 collision meshes cannot be read.*of a\): no file 'gone.obj'"):
         limit = osik.CollisionAvoidanceLimit(late)
-    assert named(limit) == pair_set("c:0 d_rod")
+    assert named(limit) == pair_set("b:0 d_rod")
     meshed.write_text(text.replace("ball.obj", "gone.obj"))
     late = osik.Robot.from_urdf(meshed, floating_base=False)
     refuses(ValueError, r"no collision mesh of the robot can be read.*gone.obj", osik.CollisionAvoidanceLimit, late)

@@ -8,15 +8,13 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.core import Tracer
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikTypeError, OsikValueError, warn
-from .._balls import with_balls_inside
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
 from .._plausible import first_of, warn_of_fast_joints
-from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree, ModelHolder, UnreadMesh
+from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
     as_mapping,
@@ -27,6 +25,7 @@ from ._followers import (
     qpos_offset,
     resolve_followers,
 )
+from ._keyframes import home_notes, inside, keyframe_names
 from ._model_notes import model_notes
 from ._options import LoadOptions, PositionLimits
 from ._robots import robot_trees
@@ -56,9 +55,6 @@ _ONE_VALUE = 1e-10
 
 _NOTES_SHOWN = 8
 """Number of lines of the load report in the warning."""
-
-_KEY_ROUNDING = 1e-3
-"""Distance by which a keyframe's joint may be outside its range [rad or m]: files are rounded."""
 
 
 class Placement(NamedTuple):
@@ -129,10 +125,10 @@ def from_mjmodel(
     lower, upper = _position_limits(tree, followers, low, high)
     _warn_of_frozen(tree, lower, upper, ranges)
     home = model.key_qpos[0] if model.nkey else model.qpos0
-    q0 = _home(home, tree, lower, upper)
+    q0 = inside(home, tree, lower, upper)
     found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names, low, high, speeds)]
     if model.nkey and not options.has_home:
-        found += _home_notes(tree, keyframe_names(model)[0], home, q0)
+        found += home_notes(tree, keyframe_names(model)[0], home, q0)
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
     _warn_of_report(report)
     arrays = dict(
@@ -436,47 +432,3 @@ def _warn_of_report(report: LoadReport) -> None:
     if moving:
         shown = first_of(moving, _NOTES_SHOWN)
         warn(f"the robot does not keep all that its file asks for (print(robot.load_report)): {shown}")
-
-
-def keyframe_names(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the keyframes; one without a name is called by its number."""
-    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, k) or str(k) for k in range(model.nkey)]
-
-
-def _home_notes(tree: KinematicTree, key: str, qpos: np.ndarray, q0: np.ndarray) -> Iterator[LoadNote]:
-    """Yield notes on the joints that a keyframe has outside their range."""
-    changed = np.abs(qpos[tree.own_qpos] - q0) > _KEY_ROUNDING
-    for joint, start in tree.qpos_address.items():
-        kind = tree.joint_types[joint]
-        if kind != FREE and changed[start : start + QPOS_WIDTH[kind]].any():
-            there, here = (_shown(own, start, QPOS_WIDTH[kind]) for own in (qpos[tree.own_qpos], q0))
-            done = f"{tree.joint_names[joint]} is {there} there, outside its range, and {here} in q0"
-            yield LoadNote("keyframe", key, done)
-
-
-def _shown(q: np.ndarray, start: int, width: int) -> str:
-    """Return the entries of a joint as text."""
-    return " ".join(f"{value:.4g}" for value in q[start : start + width])
-
-
-def keyframe_home(robot: RobotModel, number: int) -> np.ndarray:
-    """Return the configuration of a keyframe, joints brought inside their limits; warn of those that were outside."""
-    model, tree = robot.mj_model, robot.tree
-    qpos = model.key_qpos[number]
-    if isinstance(robot.position_lower, Tracer):
-        return qpos[tree.own_qpos]
-    q0 = _home(qpos, tree, np.asarray(robot.position_lower), np.asarray(robot.position_upper))
-    notes = list(_home_notes(tree, keyframe_names(model)[number], qpos, q0))
-    if notes:
-        warn(first_of([str(note) for note in notes], _NOTES_SHOWN))
-    return q0
-
-
-def _home(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the independent entries of a full qpos, joints brought inside their limits."""
-    q = qpos[tree.own_qpos]
-    for joint, start in tree.qpos_address.items():
-        if tree.joint_types[joint] in (HINGE, SLIDE):
-            dof = tree.dof_address[joint]
-            q[start] = np.clip(q[start], lower[dof], upper[dof])
-    return np.asarray(with_balls_inside(tree, jnp.asarray(q), jnp.asarray(upper)))
