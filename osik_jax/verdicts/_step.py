@@ -223,9 +223,11 @@ def _in_the_way(
 ) -> Array:
     """Return whether a task stops a goal: it comes first and its active rows feel the force, or it pulls against it."""
     rows, rank = problem.rows[name], dict(problem.priorities)
-    hard = name in problem.hard
-    if hard or (goal not in problem.hard and not isinstance(scheme, WeightedQP) and rank[name] < rank[goal]):
+    strict, hard = not isinstance(scheme, WeightedQP), goal in problem.hard
+    if name in problem.hard or (strict and not hard and rank[name] < rank[goal]):
         return _stopping(jnp.where(rows.weight[:, None] > 0.0, rows.jacobian, 0.0), rows.lower, rows.upper, v, force)
+    if hard or (strict and rank[name] > rank[goal]):
+        return jnp.zeros((), bool)
     against = (rows.jacobian.T @ (rows.weight * slack[name])) @ force
     return against < -_PUSHED * jnp.sum(force**2)
 

@@ -39,12 +39,14 @@ def verdict(
 
 
 def test_a_joint_at_its_limit_is_named(planar: osik.Robot) -> None:
-    found = verdict(planar, {"hand": reach(planar, place(1.3, 0.0))})
-    assert found.last is not None and found.last.joints == ("lift",) and found.met_from["hand"] is None
+    tasks = {"hand": reach(planar, place(1.3, 0.0)), "posture": osik.PostureTask(planar, priority=2)}
+    found = verdict(planar, tasks)  # the posture comes last and stops nothing
+    assert found.last is not None and found.last.joints == ("lift",) and found.last.tasks == ()
+    assert found.met_from["hand"] is None
     assert "lift is at its upper limit" in str(found) and "120 of 120 targets missed" in str(found)
     # the nearest point with lift = 1 has the elbow towards the target
     from_elbow = place(1.3, 0.0)[:2] - 0.4 * np.array([np.cos(1.0), np.sin(1.0)])
-    np.testing.assert_allclose(found.errors["hand"][-1], [np.linalg.norm(from_elbow) - 0.3, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found.errors["hand"][-1], np.array([np.linalg.norm(from_elbow) - 0.3, 0.0]), atol=1e-6)
 
 
 def test_a_target_that_is_met_says_from_when(planar: osik.Robot) -> None:
