@@ -55,7 +55,7 @@ def program(folder: Path, *flags: str) -> Path:
     (folder / "program.cpp").write_text(PROGRAM)
     files = (SOURCES / "controller.cpp", folder / "program.cpp")
     subprocess.run(
-        [COMPILER, *_build._FLAGS, "-O0", *flags, f"-I{SOURCES}", *files, "-o", folder / "program"], check=True
+        [COMPILER or "c++", *_build._FLAGS, "-O0", *flags, f"-I{SOURCES}", *files, "-o", folder / "program"], check=True
     )
     return folder / "program"
 
