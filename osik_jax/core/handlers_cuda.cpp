@@ -3,13 +3,16 @@
 // Neither CUDA's headers nor nvcc are needed: the driver and NVRTC are loaded while the program runs, and the functions
 // in use are declared here (CUDA driver API and NVRTC reference).
 #include <dlfcn.h>
+#include <unistd.h>
 
 #include <cstdint>
 #include <cstdio>
+#include <cstring>
 #include <fstream>
 #include <iterator>
 #include <map>
 #include <mutex>
+#include <random>
 #include <string>
 #include <string_view>
 #include <type_traits>
@@ -76,12 +79,40 @@ const Cuda& cuda() {
 
 std::string code_of(const char* what, int code) { return std::string(what) + " failed with code " + std::to_string(code); }
 
+uint64_t mark_of(const std::vector<char>& image) {  // FNV-1a
+  uint64_t mark = 0xcbf29ce484222325u;
+  for (const char byte : image) mark = (mark ^ uint8_t(byte)) * 0x100000001b3u;
+  return mark;
+}
+
+// A compiled text on disk, which ends with its mark; empty where there is none, or it is damaged.
+std::vector<char> cached(const std::string& path) {
+  std::ifstream file(path, std::ios::binary);
+  std::vector<char> image{std::istreambuf_iterator<char>(file), {}};
+  uint64_t mark = 0;
+  if (image.size() < sizeof mark) return {};
+  std::memcpy(&mark, image.data() + image.size() - sizeof mark, sizeof mark);
+  image.resize(image.size() - sizeof mark);
+  return mark == mark_of(image) ? image : std::vector<char>();
+}
+
+// Write it under its name when it is whole. A disk that is full, or a folder that cannot be written, is no error.
+void keep(const std::string& path, const std::vector<char>& image) {
+  // of this process alone, here and on other machines that share the folder
+  const std::string part = path + "." + std::to_string(getpid()) + "-" + std::to_string(std::random_device{}()) + ".part";
+  std::ofstream file(part, std::ios::binary);
+  const uint64_t mark = mark_of(image);
+  file.write(image.data(), std::streamsize(image.size()));
+  file.write(reinterpret_cast<const char*>(&mark), sizeof mark);
+  file.close();  // which may be what meets a full disk
+  if (!file || std::rename(part.c_str(), path.c_str())) std::remove(part.c_str());
+}
+
 // The compiled text, from the cache on disk if it is there. Returns an error's message, empty for none.
 std::string compiled(std::string_view source, const std::string& key, const std::string& architecture,
                      std::vector<char>& image) {
   const std::string path = cache_folder.empty() ? "" : cache_folder + "/" + key + "_" + architecture + ".cubin";
-  if (std::ifstream file(path, std::ios::binary); file)
-    image.assign(std::istreambuf_iterator<char>(file), std::istreambuf_iterator<char>());
+  if (!path.empty()) image = cached(path);
   if (!image.empty()) return "";
   const Cuda& c = cuda();
   Handle program = nullptr;
@@ -103,11 +134,7 @@ std::string compiled(std::string_view source, const std::string& key, const std:
     c.cubin(program, image.data());
   }
   c.destroy(&program);
-  if (error.empty() && !path.empty()) {  // renamed when it is whole; a folder that cannot be written is no error
-    const std::string part = path + "." + std::to_string(reinterpret_cast<uintptr_t>(&image)) + ".part";
-    std::ofstream(part, std::ios::binary).write(image.data(), std::streamsize(image.size()));
-    std::rename(part.c_str(), path.c_str());
-  }
+  if (error.empty() && !path.empty()) keep(path, image);
   return error;
 }
 

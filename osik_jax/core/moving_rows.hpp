@@ -2,6 +2,7 @@
 // for a pack of them (lanes.hpp).
 #pragma once
 #include <algorithm>
+#include <stdexcept>
 #include <type_traits>
 #include <vector>
 
@@ -27,7 +28,9 @@ struct StepSizes {
 struct StepLayout {
   struct Task {
     int kind, m, first, out, level, bounded, diagonal;  // out: of its slack and error; diagonal: equality of single dofs
-    const int *leaves, *options;                        // gain, weight, target velocity, bounds, then those of its kind
+    const int* leaves;                                  // gain, weight, target velocity, bounds, then those of its kind
+    int count;                                          // of the options
+    const int* options;
   };
   struct Place {  // of a leaf
     int array, offset, size;
@@ -47,9 +50,15 @@ struct StepLayout {
   const int *row_counts, *level_of_hard, *row_of_hard;
 
   StepLayout(const int* given, int count) : numbers(given, given + count) {
-    const int* at = numbers.data();
-    auto take = [&](int n) { return (at += n) - n; };
-    s = *reinterpret_cast<const StepSizes*>(take(sizeof(StepSizes) / sizeof(int)));
+    const int *at = numbers.data(), *end = at + count;
+    auto take = [&](int n) {
+      if (n < 0 || n > end - at) throw std::runtime_error("the layout of a step is too short");
+      return (at += n) - n;
+    };
+    constexpr int SIZES = sizeof(StepSizes) / sizeof(int);
+    s = *reinterpret_cast<const StepSizes*>(take(SIZES));
+    for (int k = 0; k < SIZES - 1; ++k)  // all but the limit on iterations
+      if (numbers[k] < 0 || numbers[k] > count) throw std::runtime_error("the layout of a step has wrong sizes");
     places = reinterpret_cast<const Place*>(take(3 * s.leaves));
     of_step = take(STEP_LEAVES), of_robot = take(ROBOT_LEAVES), limits = take(5 * s.limits);
     parents = take(s.bodies), types = take(s.joints), owners = take(s.joints), source = take(s.nq), column = take(s.dofs);
@@ -57,7 +66,7 @@ struct StepLayout {
     row_counts = take(s.L), level_of_hard = take(s.h), row_of_hard = take(s.h > s.nv ? s.h - s.nv : 0);
     for (int k = 0; k < s.tasks; ++k) {
       const int *o = take(8), *leaves = take(9);
-      tasks.push_back({o[0], o[1], o[2], o[3], o[4], o[5], o[6], leaves, take(o[7])});
+      tasks.push_back({o[0], o[1], o[2], o[3], o[4], o[5], o[6], leaves, o[7], take(o[7])});
     }
   }
   bool has(const int* given, int count) const {

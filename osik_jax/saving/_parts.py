@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import enum
 import importlib
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -122,19 +123,23 @@ def _made(cls: Any, fields: dict[str, Any]) -> Any:
 
 
 def _name(cls: type, where: str) -> str:
-    """Return the import path of a class of osik_jax; raise for other classes."""
+    """Return the name of a class of osik_jax, the public one where it has one; raise for other classes.
+
+    Modules are private and may change their places: a public name stays.
+    """
     if not cls.__module__.startswith(_PACKAGE):
         raise OsikValueError(
             f"{where} is a {cls.__name__}, which is no class of osik_jax: a file cannot hold it. Make it again after "
             "loading, and add it to the tasks or limits"
         )
-    return f"{cls.__module__}.{cls.__qualname__}"
+    public = getattr(sys.modules[_PACKAGE[:-1]], cls.__name__, None) is cls
+    return f"{_PACKAGE}{cls.__name__}" if public else f"{cls.__module__}.{cls.__qualname__}"
 
 
 def _class(name: str) -> Any:
     module, _, own = name.rpartition(".")
     found = None
-    if module.startswith(_PACKAGE):
+    if f"{module}.".startswith(_PACKAGE):
         with contextlib.suppress(ImportError):
             found = getattr(importlib.import_module(module), own, None)
     if not isinstance(found, type) or not (dataclasses.is_dataclass(found) or issubclass(found, tuple | enum.Enum)):

@@ -222,6 +222,17 @@ def test_other_files_and_classes_are_refused(tmp_path, arm):
     refuses(ValueError, "'os.system' is no class of this version", osik.load_controller, path)
 
 
+def test_a_file_has_public_names_of_classes_and_older_names_are_read(saved, arm, tmp_path):
+    content = json.loads(saved)
+    written = [one["class"] for one in (content["scheme"], *(task for _, task in content["tasks"]))]
+    assert written == ["osik_jax.HierarchicalQP", "osik_jax.FrameTask", "osik_jax.PostureTask"]
+    older = edited(content).replace("osik_jax.FrameTask", "osik_jax.tasks._frame.FrameTask")
+    older = older.replace("osik_jax.HierarchicalQP", "osik_jax.schemes._hierarchical.HierarchicalQP")
+    (path := tmp_path / "c.json").write_text(older)
+    found = osik.load_controller(path)
+    assert type(found.tasks["hand"]) is osik.FrameTask and type(found.scheme) is osik.HierarchicalQP
+
+
 def edited(content: dict[str, Any]) -> str:
     """Return the text of a file that was edited by hand: without its last two entries."""
     return json.dumps({name: value for name, value in content.items() if name not in ("core", "checksum")})

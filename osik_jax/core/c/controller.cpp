@@ -9,6 +9,7 @@
 
 #include "../manifold.hpp"
 #include "../step.hpp"
+#include "layout_check.hpp"
 #include "section.hpp"
 
 using namespace osik;
@@ -84,22 +85,34 @@ struct osik_controller {
   explicit osik_controller(const Json& section) {
     numbers = section["numbers"].numbers<double>(), constants = section["constants"].numbers<double>();
     names[OSIK_Q] = section["q"].texts(), names[OSIK_VELOCITY] = section["velocity"].texts();
+    layout = section["layout"].numbers<int>(), dt = section["dt"].number;
+    const StepLayout laid_out(layout.data(), int(layout.size()));
+    sizes = laid_out.s;
+    LayoutCheck(laid_out, numbers.size(), constants.size());
+    require(dt > 0 && dt <= LARGEST_DOUBLE, "dt");
+    require(int(names[OSIK_Q].size()) == sizes.given && int(names[OSIK_VELOCITY].size()) == sizes.nv, "names");
     for (const Json& one : section["inputs"].items) {
       const auto place = one.numbers<int>();
       const Input input{one.items.at(0).text, place.at(1), place.at(2), place.at(3) != 0};
       const int vector = inputs.empty() ? OSIK_Q : OSIK_TARGETS;
+      require(input.first >= 0 && input.count > 0 && size_t(input.first) + input.count <= numbers.size(), "inputs");
+      require((!input.is_rotation || input.count == 9) && (vector == OSIK_TARGETS || input.count == sizes.given), "inputs");
       inputs.push_back(input);
       if (vector == OSIK_TARGETS) names[vector].insert(names[vector].end(), input.count, input.name);
       for (int i = 0; i < input.count; ++i) initial[vector].push_back(numbers.at(input.first + i));
     }
-    layout = section["layout"].numbers<int>(), dt = section["dt"].number;
+    require(!inputs.empty(), "inputs");
     std::vector<int> counts;
     for (const Json& part : section["manifold"].items) {
       counts.push_back(int(part.items.size()));
       for (int entry : part.numbers<int>()) manifold.push_back(entry);
     }
-    along = {counts.at(0), counts.at(2), manifold.data(), manifold.data() + 2 * counts.at(0)};
-    std::memcpy(&sizes, layout.data(), sizeof sizes);
+    require(counts.size() == 4 && counts[0] == counts[1] && counts[2] == counts[3], "manifold");
+    along = {counts[0], counts[2], manifold.data(), manifold.data() + 2 * counts[0]};
+    require_within(along.scalar, counts[0], 0, sizes.given, "manifold");
+    require_within(along.scalar + counts[0], counts[0], 0, sizes.nv, "manifold");
+    require_within(along.quaternion, counts[2], 0, sizes.given - 3, "manifold");
+    require_within(along.quaternion + counts[2], counts[2], 0, sizes.nv - 2, "manifold");
     step = std::make_unique<Step>(layout.data(), int(layout.size()));
     // status, iterations and factorizations, then labels of the active set
     integers.resize(3 + sizes.labels());

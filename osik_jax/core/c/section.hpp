@@ -1,7 +1,7 @@
 // Reader of the section "core" of a controller's file: one line of JSON, written by control/_packed_step.py.
 //
-// It is no reader for JSON in general, so that the library needs nothing but a compiler. A checksum has been compared
-// before, so what it reads is what Python wrote.
+// It is no reader for JSON in general, so that the library needs nothing but a compiler. What the numbers mean is checked
+// after (layout_check.hpp).
 #pragma once
 #include <cmath>
 #include <cstdio>
@@ -10,6 +10,7 @@
 #include <sstream>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -33,7 +34,12 @@ struct Json {
   }
   template <class T> std::vector<T> numbers() const {
     std::vector<T> all;
-    for (const Json& item : items) all.push_back(T(item.number));
+    for (const Json& item : items) {
+      if constexpr (std::is_integral_v<T>)
+        if (!(std::fabs(item.number) < 2147483648.0) || item.number != T(item.number))
+          throw std::runtime_error("its section \"core\" has a number that is no integer");
+      all.push_back(T(item.number));
+    }
     return all;
   }
   std::vector<std::string> texts() const {
@@ -49,15 +55,16 @@ class JsonReader {
 
  public:
   explicit JsonReader(const char* text) : at(text) { stream.imbue(std::locale::classic()); }  // 0.5, wherever we are
-  Json value() {
+  Json value(int depth = 0) {
     Json found;
+    if (depth > 4) fail();  // deeper than Python writes: each level takes space of the stack
     skip();
     if (*at == '"') found.text = text();
     else if (*at == '[' || *at == '{') {
       const bool is_object = *at++ == '{';
       for (char end = is_object ? '}' : ']'; !take(end); take(',')) {
         if (is_object) found.keys.push_back(text()), expect(':');
-        found.items.push_back(value());
+        found.items.push_back(value(depth + 1));
       }
     } else found.number = number();
     return found;
