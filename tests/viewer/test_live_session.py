@@ -14,9 +14,10 @@ import pytest
 
 import osik_jax as osik
 from osik_jax.control import _checks
+from osik_jax.robot._hands import find_hands
 from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
-from osik_jax.viewer.live._default import default_session, find_hands
+from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._session import Session
 from osik_jax.viewer.live._source import RobotSource
