@@ -46,7 +46,7 @@ class Ros2:
     """Largest difference of a joint from the recorded command for exit code 0, with --replay [rad or m]."""
 
     def run(self) -> int:
-        """Run the command; return the exit code: 1 where a replay does not reproduce its commands."""
+        """Run the command; return the exit code: 1 if a replay does not reproduce its commands, 130 after Ctrl-C."""
         with told():
             from ..interop.ros2 import Controller, Settings, dds
             from ..interop.ros2._settings import read_settings
@@ -71,14 +71,19 @@ class Ros2:
         return 0 if found.difference <= self.tolerance else 1
 
     def _lead(self, dds: ModuleType, controller: Controller) -> int:
-        stop = threading.Event()
+        stop, received = threading.Event(), set[int]()
+
+        def end(number: int, _: object) -> None:
+            received.add(number)
+            stop.set()
+
         with contextlib.ExitStack() as stack:
             bag = None if self.record is None else stack.enter_context(dds.BagWriter(self.record))
             node = dds.Node(
                 controller, dds.Endpoints(self.domain, self.loopback or None), None if bag is None else bag.add
             )
             for number in (signal.SIGINT, signal.SIGTERM):
-                stack.callback(signal.signal, number, signal.signal(number, lambda *_: stop.set()))
+                stack.callback(signal.signal, number, signal.signal(number, end))
             if self.duration is not None:
                 timer = threading.Timer(self.duration, stop.set)
                 stack.callback(timer.cancel)
@@ -86,4 +91,4 @@ class Ros2:
             print(f"osik ros2: {1.0 / controller.dt:g} Hz, targets of {', '.join(controller.frames)}", flush=True)
             node.run(stop)
         print(f"osik ros2: {node.periods} periods, {node.missed} missed")
-        return 0
+        return 130 if signal.SIGINT in received else 0

@@ -54,6 +54,10 @@ def test_the_viewer_knows_maps_and_maps_no_viewer() -> None:
     assert "reachability" in edges["viewer"] and "viewer" not in edges["reachability"]
 
 
+def test_controllers_in_other_programs_need_no_viewer() -> None:
+    assert "viewer" not in graph()["interop"]
+
+
 def test_every_form_of_import_is_seen() -> None:
     source = """
 from ..solvers.qp._problem import QP

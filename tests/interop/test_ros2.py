@@ -112,6 +112,10 @@ class TestNames:
         output = run.tick()
         assert output.phase == "moving" and output.level == 1 and "unknown joints: gripper_finger" in output.message
         assert "gripper_finger" not in output.command.names
+        del run.joints["gripper_finger"]
+        assert "gripper_finger" in run.ticks(190).message
+        output = run.ticks(15)  # a second after its last message
+        assert output.level == 0 and output.message == "moving" and not run.memory.unknown
 
     @pytest.mark.release
     def test_followers_are_known(self, nao):

@@ -163,7 +163,7 @@ def session(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_robot_in_another_process_follows_targets_by_name(session, arm):
-    assert session.exit_code == 0
+    assert session.exit_code == 130  # it was interrupted
     assert session.commands[-1].joint_names == [f"joint{number}" for number in range(1, 8)]
     assert session.states[-1].name == [f"joint{number}" for number in range(7, 0, -1)]
     last = dict(zip(session.states[-1].name, session.states[-1].position, strict=True))

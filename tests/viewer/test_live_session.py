@@ -15,9 +15,10 @@ from small_files import files_of_at_most
 
 import osik_jax as osik
 from osik_jax.control import _checks
+from osik_jax.robot._hands import find_hands
 from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
-from osik_jax.viewer.live._default import default_session, find_hands
+from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._session import Session
 from osik_jax.viewer.live._source import RobotSource

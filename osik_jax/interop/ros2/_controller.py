@@ -20,7 +20,7 @@ Phase = Literal["waiting", "moving", "holding"]
 OK, WARN, ERROR = 0, 1, 2
 _NEVER = np.iinfo(np.int64).min // 2
 _SHOWN_NS = 1_000_000_000
-"""Time for which a refused message is told [ns]."""
+"""Time for which a refused message, or a name that no joint has, is told [ns]."""
 
 
 class Received(NamedTuple):
@@ -76,7 +76,7 @@ class Memory:
         devices: pose of each held device, and when it was received.
         pressed: whether the clutch of a frame is pressed.
         clutches: of each frame.
-        unknown: names that came and that no joint has.
+        unknown: names that no joint has, and when each came last [ns].
         refused: number of refused messages, the time of the last one and the reason.
         phase: see ``Output``.
         q: the commanded configuration; None before the start. (nq,)
@@ -91,7 +91,7 @@ class Memory:
     devices: Mapping[str, tuple[int, Any]] = dataclasses.field(default_factory=dict)
     pressed: Mapping[str, bool] = dataclasses.field(default_factory=dict)
     clutches: Mapping[str, Clutch] = dataclasses.field(default_factory=dict)
-    unknown: frozenset[str] = frozenset()
+    unknown: Mapping[str, int] = dataclasses.field(default_factory=dict)
     refused: tuple[int, int, str] = (0, _NEVER, "")
     phase: Phase = "waiting"
     q: Any = None
@@ -205,7 +205,8 @@ class Controller:
 
     def _take_state(self, memory: Memory, item: Received, stamp: int) -> Memory:
         places, positions, unknown = self.joints.read(item.message)
-        memory = dataclasses.replace(memory, unknown=memory.unknown | set(unknown))
+        told = {name: at for name, at in memory.unknown.items() if item.time_ns - at <= _SHOWN_NS}
+        memory = dataclasses.replace(memory, unknown=told | dict.fromkeys(unknown, item.time_ns))
         if (stamp <= memory.stamps_ns[""][places]).any():
             raise Refused("a joint state is not newer than the last one")
         measured, times, stamps = memory.measured.copy(), memory.measured_ns.copy(), memory.stamps_ns[""].copy()
@@ -265,8 +266,9 @@ class Controller:
         count, refused_ns, reason = memory.refused
         if now_ns - refused_ns <= _SHOWN_NS:
             level, message = max(level, WARN), f"{message}; refused: {reason}"
-        if memory.unknown:
-            level, message = max(level, WARN), f"{message}; unknown joints: {', '.join(sorted(memory.unknown))}"
+        unknown = sorted(name for name, at in memory.unknown.items() if now_ns - at <= _SHOWN_NS)
+        if unknown:
+            level, message = max(level, WARN), f"{message}; unknown joints: {', '.join(unknown)}"
         values = {"phase": memory.phase, "refused messages": str(count), "last refusal": reason}
         command = None
         if memory.q is not None:

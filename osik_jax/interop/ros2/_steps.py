@@ -19,13 +19,13 @@ from ...limits._own import keeps_own
 from ...numerics._guarded import clipped
 from ...robot import Robot
 from ...robot._feet import guess_feet
+from ...robot._hands import find_hands
 from ...robot._joint_selection import scalar_layout
 from ...saving import load_controller
 from ...schemes import Scheme, WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, Task
 from ...tasks._background import background_weight
 from ...tasks._targets import Pose
-from ...viewer.live._default import find_hands
 from ._settings import Settings
 
 _GAIN = 5.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -10,14 +9,13 @@ from jaxtyping import Array, Float
 
 from ...kinematics import forward_kinematics
 from ...robot import Robot
+from ...robot._hands import find_hands
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task
 from ...tasks._background import angle_scale
 from ._session import Session
 from ._source import RobotSource
 
-_HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*(index|middle|thumb|finger))", r"wrist")
-_SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|right)(_|$)|right|^R(?=[A-Z])"}
 # gain of the default tasks [1/s]
 _GAIN = 15.0
 WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
@@ -73,33 +71,3 @@ def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
     task = FrameTask(robot, waist, weight=WEIGHTS["waist"], gain=_GAIN, priority=3).at(robot, q)
     com = ComTask(robot, weight=WEIGHTS["com"], gain=_GAIN, priority=3).at(robot, q)
     return {waist: task, "centre of mass": com}
-
-
-def find_hands(robot: Robot) -> tuple[str, ...]:
-    """Return one frame of the left and one of the right hand.
-
-    Where no names tell sides, return one frame that is named like a hand, else the tip of the robot.
-
-    Of several frames of one kind, the one that most joints move.
-    """
-    tree = robot.tree
-    depth = [0] * len(tree.body_parents)
-    for body, parent in enumerate(tree.body_parents[1:], 1):
-        depth[body] = depth[parent] + 1
-    moving = [(name, depth[body]) for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body]
-    sided = [hand for side in _SIDES.values() if (hand := _named([f for f in moving if re.search(side, f[0])]))]
-    if len(set(sided)) == len(_SIDES):
-        return tuple(sided)
-    hand = _named(moving)
-    if hand is None and not robot.floating_base:
-        hand = max(moving, key=lambda frame: frame[1])[0]
-    return () if hand is None else (hand,)
-
-
-def _named(frames: Sequence[tuple[str, int]]) -> str | None:
-    """Return the deepest of the frames that are named like a hand."""
-    for pattern in _HANDS:
-        found = [frame for frame in frames if re.search(pattern, frame[0], re.IGNORECASE)]
-        if found:
-            return max(found, key=lambda frame: frame[1])[0]
-    return None

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Self
 
 from ..._errors import missing_extra
 from ._priority import DRAWING, be_nice
+from ._visitors import guard
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -93,6 +94,7 @@ def open_server(host: str, port: int, title: str) -> ViserServer:
     if server.get_port() != free:
         server.stop()
         raise OSError(f"port {free} of {host} is in use: choose another")
+    guard(server)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium", brand_color=_BLUE)
     return server
 

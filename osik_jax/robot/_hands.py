@@ -1,0 +1,41 @@
+"""Frames of a robot that are named like hands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from ._robot import Robot
+
+_HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*(index|middle|thumb|finger))", r"wrist")
+_SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|right)(_|$)|right|^R(?=[A-Z])"}
+
+
+def find_hands(robot: Robot) -> tuple[str, ...]:
+    """Return one frame of the left and one of the right hand.
+
+    Where no names tell sides, return one frame that is named like a hand, else the tip of the robot.
+
+    Of several frames of one kind, the one that most joints move.
+    """
+    tree = robot.tree
+    depth = [0] * len(tree.body_parents)
+    for body, parent in enumerate(tree.body_parents[1:], 1):
+        depth[body] = depth[parent] + 1
+    moving = [(name, depth[body]) for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body]
+    sided = [hand for side in _SIDES.values() if (hand := _named([f for f in moving if re.search(side, f[0])]))]
+    if len(set(sided)) == len(_SIDES):
+        return tuple(sided)
+    hand = _named(moving)
+    if hand is None and not robot.floating_base:
+        hand = max(moving, key=lambda frame: frame[1])[0]
+    return () if hand is None else (hand,)
+
+
+def _named(frames: Sequence[tuple[str, int]]) -> str | None:
+    """Return the deepest of the frames that are named like a hand."""
+    for pattern in _HANDS:
+        found = [frame for frame in frames if re.search(pattern, frame[0], re.IGNORECASE)]
+        if found:
+            return max(found, key=lambda frame: frame[1])[0]
+    return None

@@ -1,0 +1,87 @@
+"""Which web pages may open a live view's connection, and what happens to messages that cannot be read."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import sys
+from typing import Any
+from urllib.parse import urlsplit
+
+POLICY_VIOLATION = 1008
+"""Close code of a websocket (RFC 6455, 7.4.1)."""
+_LONGEST = 120
+"""Characters of a reason that are printed."""
+
+
+def guard(server: Any) -> None:
+    """Refuse connections of pages of other sites, and drop bad messages with one line on stderr each.
+
+    viser has no option for either. Its websocket server awaits these callbacks before it reads the first message.
+
+    Args:
+        server: a ``viser.ViserServer``.
+    """
+    sockets = server._websock_server
+
+    async def admit(client: Any) -> None:
+        connection = sockets._live_connections[client.client_id]
+        headers = connection.request.headers
+        if is_own_page(headers.get("Origin"), headers.get("Host", ""), sockets._host):
+            connection.recv = _readable(connection.recv, sockets._message_class)
+        else:
+            _tell(f"refused a connection from a page of {headers.get('Origin')}: open {server_url(server)}")
+            await connection.close(POLICY_VIOLATION, "a page of another site")
+
+    def tell_failed(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        _tell(f"dropped a message: {context.get('exception') or context['message']}")
+
+    sockets.on_client_connect(admit)
+    sockets._background_event_loop.set_exception_handler(tell_failed)
+
+
+def server_url(server: Any) -> str:
+    """Return the address of a server's page."""
+    return f"http://{server.get_host()}:{server.get_port()}"
+
+
+def is_own_page(origin: str | None, host: str, listens_at: str) -> bool:
+    """Return whether a connection comes from the server's own page, or from a program that is no browser.
+
+    Args:
+        origin: header ``Origin`` of the request; browsers always send it.
+        host: header ``Host`` of the request: the address that was opened.
+        listens_at: the server's host. One that listens at this machine alone is opened by no other name, so that a
+            foreign name that resolves to this machine (DNS rebinding) is refused.
+    """
+    if origin is None:
+        return True
+    page, opened = urlsplit(origin), urlsplit(f"//{host}")
+    return page.netloc.lower() == host.lower() and (not _is_loopback(listens_at) or _is_loopback(opened.hostname or ""))
+
+
+def _is_loopback(name: str) -> bool:
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return name.lower() == "localhost"
+
+
+def _readable(receive: Any, messages: Any) -> Any:
+    """Return a function that receives the next message that viser can read."""
+
+    async def next_readable() -> bytes:
+        while True:
+            raw = await receive()
+            try:
+                messages.deserialize(raw)
+            except Exception as error:  # whatever a stranger sends
+                _tell(f"dropped a message of {len(raw)} bytes: {type(error).__name__}: {error}")
+            else:
+                return raw
+
+    return next_readable
+
+
+def _tell(text: str) -> None:
+    print(f"osik view: {' '.join(text.split())[:_LONGEST]}", file=sys.stderr, flush=True)

@@ -1,0 +1,89 @@
+"""Pages of other sites and messages that cannot be read, at the server of a live view."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+import viser
+from waiting import until
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin, Subprotocol
+
+from osik_jax.viewer.live._server import close_server, open_server
+from osik_jax.viewer.live._visitors import is_own_page
+
+BAD = {
+    "text": "text",
+    "no msgpack": b"\xff\x00junk",
+    "no message": msgspec.msgpack.encode([1]),
+    "unknown type": msgspec.msgpack.encode({"type": "Nope"}),
+    "no fields": msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage"}),
+    "no numbers": msgspec.msgpack.encode(
+        {"type": "TransformControlsUpdateMessage", "name": "/hand", "wxyz": [1, 0, 0, 0], "position": "abc"}
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Any]:
+    server = open_server("127.0.0.1", 0, "test")
+    yield server
+    close_server(server)
+
+
+def opened(server: Any, origin: str | None) -> ClientConnection:
+    protocol = Subprotocol(f"viser-v{viser.__version__}")
+    page = None if origin is None else Origin(origin)
+    return connect(f"ws://127.0.0.1:{server.get_port()}", subprotocols=[protocol], origin=page, max_size=None)
+
+
+def moved(position: list[float]) -> bytes:
+    fields = {"type": "TransformControlsUpdateMessage", "name": "/hand", "wxyz": [1, 0, 0, 0], "position": position}
+    return msgspec.msgpack.encode(fields)
+
+
+def test_bad_messages_are_dropped_with_a_line_each_and_the_next_one_counts(
+    server: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    handle = server.scene.add_transform_controls("/hand")
+    with opened(server, f"http://127.0.0.1:{server.get_port()}") as page:
+        for message in BAD.values():
+            page.send(message)
+        page.send(moved([1.0, 2.0, 3.0]))
+        assert until(lambda: tuple(handle.position) == (1.0, 2.0, 3.0))
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == len(BAD)
+    assert all(line.startswith("osik view: dropped a message of ") for line in lines)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
+def test_a_page_of_another_site_moves_nothing(server: Any, origin: str, capfd: pytest.CaptureFixture[str]) -> None:
+    handle = server.scene.add_transform_controls("/hand")
+    with opened(server, origin) as page, pytest.raises(ConnectionClosed, match="a page of another site"):
+        page.send(moved([1.0, 2.0, 3.0]))
+        while True:
+            page.recv(timeout=10.0)
+    assert tuple(handle.position) == (0.0, 0.0, 0.0)
+    assert f"osik view: refused a connection from a page of {origin}" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("origin", "host", "listens_at", "own"),
+    [
+        (None, "127.0.0.1:8080", "127.0.0.1", True),
+        ("http://localhost:8080", "localhost:8080", "127.0.0.1", True),
+        ("http://localhost:9000", "localhost:9000", "127.0.0.1", True),  # a forwarded port
+        ("http://[::1]:8080", "[::1]:8080", "::1", True),
+        ("http://robot.lan:8080", "robot.lan:8080", "0.0.0.0", True),
+        ("http://localhost:3000", "localhost:8080", "127.0.0.1", False),
+        ("http://robot.lan.evil.example", "robot.lan:8080", "0.0.0.0", False),
+        ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),  # DNS rebinding
+        ("null", "127.0.0.1:8080", "127.0.0.1", False),
+    ],
+)
+def test_own_pages(origin: str | None, host: str, listens_at: str, own: bool) -> None:
+    assert is_own_page(origin, host, listens_at) is own
