@@ -314,6 +314,7 @@ GIMBAL = (
 )
 
 
+@pytest.mark.variants(slow=["place1-float32"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("place, kind", [((0, 0, 0), "float64"), ((0.3, -2.0, 1.0), "float32")])
 def test_joints_whose_axes_meet_in_the_frame(place, kind):
