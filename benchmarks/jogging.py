@@ -99,6 +99,8 @@ def noise() -> None:
         "`DampingTask`, weight 0.01": dict(extra={"calm": osik.DampingTask(arm, weight=0.01)}),
         "`LowAccelerationTask`, weight 0.03": dict(extra=smoothed(0.03)),
         "`LowAccelerationTask`, weight 0.3": dict(extra=smoothed(0.3)),
+        "gain 30": dict(gain=30.0),
+        "gain 30, `LowAccelerationTask`, weight 0.03": dict(gain=30.0, extra=smoothed(0.03)),
         "`LowAccelerationTask`, priority 2": dict(extra=smoothed(0.3, 2)),
         "`AccelerationLimit` of 5 rad/s²": dict(limits=(osik.AccelerationLimit(arm, {"*": 5.0}),)),
         "`AccelerationLimit` of 1 rad/s²": dict(limits=(osik.AccelerationLimit(arm, {"*": 1.0}),)),
