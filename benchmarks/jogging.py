@@ -24,13 +24,14 @@ HOME = np.array([0.0, -0.5, 0.5, 0.6, 0.2, 0.3])
 def past_the_wrist() -> None:
     """Print the errors of a turn at 0.5 rad/s about x that passes 0.09 rad beside the wrist's singularity."""
     arm, dt, steps = osik.load_robot("ur5"), 0.01, 600
-    q = osik.inverse_kinematics(arm, {"tool0": (PLACE, DOWN)}, q0=START).q
+    q = osik.inverse_kinematics(arm, {"tool0": (PLACE, DOWN)}, q0=jnp.array(START)).q
     poses = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "tool0")))
     p, R = (a[0] for a in poses(q[None]))
     turns = Rotation.from_rotvec(
         np.outer(0.5 * dt * np.arange(1, steps + 1), [1.0, 0.0, 0.0])
     ).as_matrix() @ np.asarray(R)
-    goal, shared = (jnp.tile(p, (steps, 1)), jnp.array(turns)), dict(gain=50.0)
+    goal = jnp.tile(p, (steps, 1)), jnp.array(turns)
+    shared: Any = dict(gain=50.0)
     ranked: Any = {
         name: osik.FrameTask(arm, "tool0", rows=name, priority=rank, **shared).at(arm, q)
         for rank, name in enumerate(("position", "orientation"), 1)
@@ -99,6 +100,8 @@ def noise() -> None:
         "`DampingTask`, weight 0.01": dict(extra={"calm": osik.DampingTask(arm, weight=0.01)}),
         "`LowAccelerationTask`, weight 0.03": dict(extra=smoothed(0.03)),
         "`LowAccelerationTask`, weight 0.3": dict(extra=smoothed(0.3)),
+        "gain 30": dict(gain=30.0),
+        "gain 30, `LowAccelerationTask`, weight 0.03": dict(gain=30.0, extra=smoothed(0.03)),
         "`LowAccelerationTask`, priority 2": dict(extra=smoothed(0.3, 2)),
         "`AccelerationLimit` of 5 rad/s²": dict(limits=(osik.AccelerationLimit(arm, {"*": 5.0}),)),
         "`AccelerationLimit` of 1 rad/s²": dict(limits=(osik.AccelerationLimit(arm, {"*": 1.0}),)),

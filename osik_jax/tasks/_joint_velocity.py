@@ -199,10 +199,10 @@ class LowAccelerationTask(VelocityTask):
     """Task that keeps the joint velocities of the step before: ``v_i = velocity_i``.
 
     At a low weight it makes joint velocities change less from step to step. Noise in targets then moves the joints more
-    slowly, and about as far: a lower gain does more against noise. It does not slow a motion down, so add a
-    ``PostureTask`` or a ``DampingTask``. Beneath tasks that leave its joints no freedom it does nothing, and ``solve``
-    and ``rollout`` warn. ``rollout`` passes the velocity from step to step; with ``solve``, write
-    ``task = task.after(solution.velocity)``.
+    slowly, and joints that the other tasks leave free as far or farther: a lower gain is what helps against noise.
+    It does not slow a motion down, so add a ``PostureTask`` or a ``DampingTask``. Beneath tasks that leave its joints
+    no freedom it does nothing, and ``solve`` and ``rollout`` warn. ``rollout`` passes the velocity from step to step;
+    with ``solve``, write ``task = task.after(solution.velocity)``.
 
     Args:
         robot: the robot.
