@@ -14,8 +14,7 @@ using Team = Serial<double>;
 // ClipGoals, free [F], the numbers of ClipRobot, ClipMethod; and the integers of ClipRobot, which all clips share.
 // Results: q [F, nq], cost [2], iterations.
 void plan(const xla::Call& call) {
-  const int64_t* sizes = call.result(0).dimensions;
-  const int clips = int(sizes[0]), frames = int(sizes[1]), nq = int(sizes[2]);
+  const int clips = call.result_size(0, 0), frames = call.result_size(0, 1), nq = call.result_size(0, 2);
   auto numbers = [&](int k, int clip) {
     return call.in<double>(k) + (call.size(k, 0) == 1 ? 0 : size_t(clip) * call.size(k, 1));
   };

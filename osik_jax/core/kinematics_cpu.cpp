@@ -15,7 +15,7 @@ struct Robots {
   xla::Call call;
   Space space() const { return Space(xla::number(call.frame->attributes, "space")); }
   int size(int k, int axis) const { return call.size(k, axis); }
-  int result_size(int k, int axis) const { return int(call.result(k).dimensions[axis]); }
+  int result_size(int k, int axis) const { return call.result_size(k, axis); }
   const int* integers(int k) const { return call.in<int>(k); }
   In in(int k, int lane) const { return xla::lane_of(call, k, lane); }
   Out out(int k, int lane) const { return call.out<double>(k) + xla::numbers_of_lane(call.result(k)) * lane; }

@@ -13,8 +13,8 @@ void take_steps(const xla::Call& call) {
   thread_local std::unique_ptr<Step> step;  // of the last call: its workspace is ready
   const int *layout = call.in<int>(0), count = call.size(0, 0);
   if (!step || !step->has(layout, count)) step = std::make_unique<Step>(layout, count);
-  const int lanes = int(call.result(0).dimensions[0]), numbers = int(call.result(0).dimensions[1]);
-  const int integers = int(call.result(1).dimensions[1]), given = int(call.frame->arguments.size) - FIRST - 1;
+  const int lanes = call.result_size(0, 0), numbers = call.result_size(0, 1);
+  const int integers = call.result_size(1, 1), given = int(call.frame->arguments.size) - FIRST - 1;
   std::vector<const double*> arrays(given);
   std::vector<size_t> sizes(given), strides(given);
   bool shared_clean = true;
@@ -24,9 +24,8 @@ void take_steps(const xla::Call& call) {
     if (!strides[k]) shared_clean = shared_clean && !has_nan(arrays[k], sizes[k]);
   }
   auto guess = [&](int k, int lane) -> const int* {
-    const xla::Buffer& buffer = call.argument(k);
-    const size_t labels = xla::numbers_of_lane(buffer);
-    return labels ? call.in<int>(k) + (buffer.dimensions[0] > 1 ? labels * lane : 0) : nullptr;
+    const size_t labels = xla::numbers_of_lane(call.argument(k));
+    return labels ? call.in<int>(k) + (call.size(k, 0) > 1 ? labels * lane : 0) : nullptr;
   };
   auto begin_at = [&](int lane) {
     for (int k = 0; k < given; ++k) arrays[k] = call.in<double>(FIRST + k) + strides[k] * lane;

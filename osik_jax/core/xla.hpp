@@ -7,7 +7,9 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <stdexcept>
 #include <string_view>
+#include <type_traits>
 
 namespace osik::xla {
 
@@ -126,14 +128,32 @@ inline int32_t number(const Attributes& a, std::string_view name) {
   return 0;
 }
 
-// The buffers of one call; every buffer has a leading axis of problems unless said otherwise.
+// The buffers of one call; every buffer has a leading axis of problems unless said otherwise. What a kernel asks for that
+// the call does not have is an error: a buffer, an axis, or numbers of another type.
 struct Call {
   CallFrame* frame;
-  const Buffer& argument(int k) const { return *frame->arguments.buffers[k]; }
-  const Buffer& result(int k) const { return *frame->results.buffers[k]; }
-  int size(int k, int axis) const { return int(argument(k).dimensions[axis]); }
-  template <class T> const T* in(int k) const { return static_cast<const T*>(argument(k).data); }
-  template <class T> T* out(int k) const { return static_cast<T*>(result(k).data); }
+  static void require(bool holds, const char* problem) {
+    if (!holds) [[unlikely]] throw std::invalid_argument(problem);
+  }
+  static const Buffer& buffer(const List& all, int k) {
+    require(k < all.size, "the core was called with too few arrays");
+    return *all.buffers[k];
+  }
+  static int length(const Buffer& buffer, int axis) {
+    require(axis < buffer.rank, "the core was called with an array that has too few axes");
+    return int(buffer.dimensions[axis]);
+  }
+  template <class T> static T* data(const Buffer& buffer) {
+    constexpr int32_t INT32 = 4, FLOAT64 = 12;  // of XLA's PrimitiveType
+    require(buffer.dtype == (std::is_same_v<T, double> ? FLOAT64 : INT32), "the core was called with numbers of another type");
+    return static_cast<T*>(buffer.data);
+  }
+  const Buffer& argument(int k) const { return buffer(frame->arguments, k); }
+  const Buffer& result(int k) const { return buffer(frame->results, k); }
+  int size(int k, int axis) const { return length(argument(k), axis); }
+  int result_size(int k, int axis) const { return length(result(k), axis); }
+  template <class T> const T* in(int k) const { return data<T>(argument(k)); }
+  template <class T> T* out(int k) const { return data<T>(result(k)); }
 };
 
 // How many numbers one lane of a buffer has. Its leading axis is that of the lanes, or has length 1 where all share it.
@@ -144,7 +164,7 @@ inline size_t numbers_of_lane(const Buffer& buffer) {
 }
 inline const double* lane_of(const Call& call, int k, int lane) {
   const Buffer& buffer = call.argument(k);
-  return call.in<double>(k) + (buffer.dimensions[0] > 1 ? numbers_of_lane(buffer) * lane : 0);
+  return call.in<double>(k) + (call.size(k, 0) > 1 ? numbers_of_lane(buffer) * lane : 0);
 }
 
 // An error that XLA raises in Python with this message.
@@ -158,7 +178,7 @@ template <void (*solve)(const Call&)> void* handle(CallFrame* frame) {
   if (!is_call(frame)) return nullptr;
   try {
     solve(Call{frame});
-  } catch (const std::exception& problem) {  // no memory
+  } catch (const std::exception& problem) {  // no memory, or arrays of another kind
     return error(frame, problem.what());
   }
   return nullptr;

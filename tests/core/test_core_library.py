@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from core_checks import compile_core, compiler, needs_core, run_tests_with
@@ -62,6 +63,22 @@ def test_a_library_is_built_again_where_its_sources_changed_or_it_cannot_be_load
     for path in (broken, tmp_path / "none.so"):
         monkeypatch.setattr(_build, "library_path", lambda level, path=path: path)
         assert _build.build_if_changed() == "built"
+
+
+@needs_core
+def test_arrays_of_another_type_or_with_too_few_axes_are_an_error():
+    matrix, numbers = np.ones((1, 2, 3)), np.full(1, 1e-9)
+    shapes = [jax.ShapeDtypeStruct(shape, np.float64) for shape in ((1, 2, 3), (1, 4, 2), (1, 2, 2))]
+    call = jax.ffi.ffi_call(_library.register("row_factors"), shapes)
+    assert np.isfinite(call(matrix, numbers, 0.0 * numbers)[0]).all()
+    wrong = {
+        "another type": (matrix.astype(np.float32), numbers, numbers),
+        "too few axes": (matrix[0], numbers, numbers),
+        "too few arrays": (matrix, numbers),
+    }
+    for message, given in wrong.items():
+        with pytest.raises(jax.errors.JaxRuntimeError, match=message):
+            jax.block_until_ready(call(*given))
 
 
 def test_without_the_core_a_warning_says_what_to_do():
