@@ -58,7 +58,7 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
     return one
 
 
-def _refuse_explicit_axes(args: Any) -> None:
+def refuse_explicit_axes(args: Any) -> None:
     """Raise an error if an array is sharded over an explicit axis of a mesh, whose lanes no block can be cut from."""
     for a in jax.tree.leaves(args):
         # axes of type Auto are not part of an array's type
@@ -66,8 +66,8 @@ def _refuse_explicit_axes(args: Any) -> None:
         if axes := [str(axis) for axis in spec if axis is not None]:
             raise OsikTypeError(
                 f"an array is sharded over the explicit mesh axis {', '.join(axes)}; osik_jax takes axes of type Auto. "
-                "Use osik_jax.scaling.sharded, or make the mesh with axis_types=(jax.sharding.AxisType.Auto,), or wrap "
-                "the function in jax.sharding.auto_axes under jax.set_mesh"
+                "Make the mesh with axis_types=(jax.sharding.AxisType.Auto,), or wrap the function in "
+                "jax.sharding.auto_axes under jax.set_mesh, or give arrays without a mesh to osik_jax.scaling.sharded"
             )
 
 
@@ -78,7 +78,7 @@ def lanes_of(args: Any, axes: Any = None) -> int:
         args: a pytree of arrays.
         axes: the axis of lanes of each array; default: the first. Flags count as 0 and 1.
     """
-    _refuse_explicit_axes(args)
+    refuse_explicit_axes(args)
     leaves = jax.tree.leaves(args)
     counts = {a.shape[int(axis)] for a, axis in zip(leaves, jax.tree.leaves(axes) or [0] * len(leaves), strict=True)}
     symbolic = [count for count in counts if is_symbolic(count)]

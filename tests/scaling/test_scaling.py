@@ -98,11 +98,14 @@ def test_explicit_mesh_axes_are_refused_and_what_the_message_advises_works(arm):
         refuses(TypeError, "explicit mesh axis robots", velocities, given)
         refuses(TypeError, "explicit mesh axis robots", jax.jit(velocities), given)
         apart = jax.sharding.auto_axes(velocities, axes="robots", out_sharding=lanes)(given)
-        np.testing.assert_allclose(osik.solve(arm, arm.q0 + 0.1, tasks, dt=0.01).velocity, expected[1], atol=1e-12)
+        alone = osik.solve(arm, arm.q0 + 0.1, tasks, dt=0.01)  # an array without a mesh
+        np.testing.assert_allclose(alone.velocity, expected[1], atol=1e-12)
+    split = scaling.sharded(lambda q: osik.solve(arm, q, tasks, dt=0.01).velocity)
     refuses(TypeError, "explicit mesh axis robots", velocities, given)
+    refuses(TypeError, "explicit mesh axis robots", split, given)
     on_auto = velocities(jax.device_put(q, jax.sharding.NamedSharding(auto, lanes)))
-    for found in (apart, on_auto, scaling.sharded(velocities.__wrapped__)(np.asarray(given))):
-        np.testing.assert_allclose(found, expected, atol=1e-12)
+    for found in (apart, on_auto, split(np.asarray(given))):
+        np.testing.assert_allclose(np.asarray(found), expected, atol=1e-12)
 
 
 TWO_HOSTS = """
