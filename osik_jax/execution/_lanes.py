@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Bool, Int
 
+from .._errors import OsikTypeError
 from ._blocks import BLOCK, first_axes_as_one, in_blocks
 from ._lapack import lanes_in_one
 from ._platform import cpu_is_default, is_symbolic
@@ -57,6 +58,19 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
     return one
 
 
+def refuse_explicit_axes(args: Any) -> None:
+    """Raise an error if an array is sharded over an explicit axis of a mesh, whose lanes no block can be cut from."""
+    for a in jax.tree.leaves(args):
+        # axes of type Auto are not part of an array's type
+        spec = jax.typeof(a).sharding.spec if isinstance(a, jax.Array) else ()
+        if axes := [str(axis) for axis in spec if axis is not None]:
+            raise OsikTypeError(
+                f"an array is sharded over the explicit mesh axis {', '.join(axes)}; osik_jax takes axes of type Auto. "
+                "Make the mesh with axis_types=(jax.sharding.AxisType.Auto,), or wrap the function in "
+                "jax.sharding.auto_axes under jax.set_mesh, or give arrays without a mesh to osik_jax.scaling.sharded"
+            )
+
+
 def lanes_of(args: Any, axes: Any = None) -> int:
     """Return the number of lanes of some arrays; the axis of an array that all lanes share has length 1.
 
@@ -64,6 +78,7 @@ def lanes_of(args: Any, axes: Any = None) -> int:
         args: a pytree of arrays.
         axes: the axis of lanes of each array; default: the first. Flags count as 0 and 1.
     """
+    refuse_explicit_axes(args)
     leaves = jax.tree.leaves(args)
     counts = {a.shape[int(axis)] for a, axis in zip(leaves, jax.tree.leaves(axes) or [0] * len(leaves), strict=True)}
     symbolic = [count for count in counts if is_symbolic(count)]

@@ -14,6 +14,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .._errors import OsikTypeError, OsikValueError
+from ..execution._lanes import refuse_explicit_axes
 
 _SHARED = -1
 """Marker in place of an axis: every device has the whole array."""
@@ -78,6 +79,7 @@ class ShardedFunction:
 
         Raises:
             ValueError: ``in_axes`` does not fit the arguments, lanes differ in number, or there are none.
+            TypeError: an array is sharded over an explicit axis of a mesh.
         """
         leaves, program = self._program(args)
         count = program.count(leaves)
@@ -101,6 +103,7 @@ class ShardedFunction:
 
     def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
         """Return the arrays of the arguments, and the program for their structure."""
+        refuse_explicit_axes(args)
         leaves, structure = jax.tree.flatten(args)
         known = self._known.get(structure)
         if known is None:

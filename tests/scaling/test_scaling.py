@@ -11,6 +11,7 @@ import pytest
 from other_processes import finish, free_port, start
 from refusals import refuses
 
+import osik_jax as osik
 from osik_jax import scaling
 
 EIGHT = """
@@ -80,6 +81,31 @@ def test_gradients_through_eight_devices(eight, what):
 def test_results_stay_on_their_devices(eight):
     assert eight["placed"] == [[2, 7], 8, False]
     assert eight["two"][0] < 1e-12 and eight["two"][1] == 2
+
+
+def test_explicit_mesh_axes_are_refused_and_what_the_message_advises_works(arm):
+    tasks = {"hand": osik.FrameTask(arm, "hand", target=arm.q0[:3], rows="position")}
+    velocities = jax.vmap(lambda q: osik.solve(arm, q, tasks, dt=0.01).velocity)
+    q = arm.q0 + 0.1 * jnp.arange(3.0)[:, None]
+    expected = velocities(q)
+    explicit, auto = (
+        jax.make_mesh((1,), ("robots",), axis_types=(kind,), devices=jax.devices()[:1])
+        for kind in (jax.sharding.AxisType.Explicit, jax.sharding.AxisType.Auto)
+    )
+    lanes = jax.sharding.PartitionSpec("robots")
+    given = jax.device_put(q, jax.sharding.NamedSharding(explicit, lanes))
+    with jax.set_mesh(explicit):
+        refuses(TypeError, "explicit mesh axis robots", velocities, given)
+        refuses(TypeError, "explicit mesh axis robots", jax.jit(velocities), given)
+        apart = jax.sharding.auto_axes(velocities, axes="robots", out_sharding=lanes)(given)
+        alone = osik.solve(arm, arm.q0 + 0.1, tasks, dt=0.01)  # an array without a mesh
+        np.testing.assert_allclose(alone.velocity, expected[1], atol=1e-12)
+    split = scaling.sharded(lambda q: osik.solve(arm, q, tasks, dt=0.01).velocity)
+    refuses(TypeError, "explicit mesh axis robots", velocities, given)
+    refuses(TypeError, "explicit mesh axis robots", split, given)
+    on_auto = velocities(jax.device_put(q, jax.sharding.NamedSharding(auto, lanes)))
+    for found in (apart, on_auto, split(np.asarray(given))):
+        np.testing.assert_allclose(np.asarray(found), expected, atol=1e-12)
 
 
 TWO_HOSTS = """
