@@ -187,16 +187,17 @@ class ChainKinematics(NamedTuple):
     rotation: Float[Array, "frames 3 3 lanes"]
 
 
-def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"]) -> ChainKinematics:
+def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"], *, unrolled: bool = False) -> ChainKinematics:
     """Return forward kinematics of the chain.
 
     Args:
         chain: the chain.
         x: entries ``layout.dofs`` of configurations.
+        unrolled: whether the joints are no loop of the program, for derivatives in reverse.
     """
     layout = chain.layout
     local = _local_poses(chain, x)
-    poses = _world_poses(layout, local)
+    poses = _world_poses(layout, local, unrolled)
     turned = _times(poses[:-1, :, :3], chain.axis[:, :, None, None])[:, :, 0]
     anchor = _times(poses[:-1, :, :3], chain.anchor[:, :, None, None])[:, :, 0] + poses[:-1, :, 3]
     ends = poses[np.array(layout.ends)]
@@ -218,10 +219,15 @@ def _local_poses(chain: Chain, x: Float[Array, "n lanes"]) -> Float[Array, "k 3 
     return jnp.matmul(parts, coefficients, precision="highest").reshape(-1, 3, 4, x.shape[-1])
 
 
-def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"]) -> Float[Array, "k_1 3 4 lanes"]:
+def _world_poses(layout: Layout, local: Float[Array, "k 3 4 lanes"], unrolled: bool) -> Float[Array, "k_1 3 4 lanes"]:
     """Return the pose of each joint's far side in the world, then the world's own."""
     world = jnp.concatenate([jnp.eye(3, dtype=local.dtype), jnp.zeros((3, 1), local.dtype)], -1)
     world = jnp.broadcast_to(world[..., None], local.shape[1:])
+    if unrolled:
+        each: list[Array] = []
+        for own, parent in zip(local, layout.parents, strict=True):
+            each.append(_joined(each[parent] if parent < len(layout.joints) else world, own))
+        return jnp.stack([*each, world])
     # a serial chain carries one pose; a tree has to index the poses of its parents, which is slower
     serial = layout.parents == (len(layout.joints), *range(len(layout.joints) - 1))
     if serial:

@@ -176,7 +176,9 @@ class ChainSearch(eqx.Module):
 
     def rows_at(self, x: Float[Array, " n"], goal: Goal) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
         """Return the error of each used row [m] at x, and its derivative."""
-        error, matrix, _ = self.linearised(x[:, None], Goal(goal.position[..., None], goal.rotation[..., None]))
+        aim = Goal(goal.position[..., None], goal.rotation[..., None])
+        # JAX 0.10 cannot transpose a scan where a cotangent is a symbolic 0
+        error, matrix, _ = self._rows(x[:, None], aim, unrolled=True)
         return error[:, 0], matrix[..., 0]
 
     def sizes(self, error: Float[Array, " m"]) -> Float[Array, "2"]:
@@ -249,10 +251,10 @@ class ChainSearch(eqx.Module):
         return error, matrix, self._errors(linear, angular, jnp.sum(error**2, 0))
 
     def _rows(
-        self, x: Float[Array, "n lanes"], goal: Goal
+        self, x: Float[Array, "n lanes"], goal: Goal, *, unrolled: bool = False
     ) -> tuple[Array, Array, tuple[ChainKinematics, Array, Array]]:
         """Return the error of each used row, its derivative, and the kinematics and errors of the frames."""
-        kinematics = chain_kinematics(self.chain, x)
+        kinematics = chain_kinematics(self.chain, x, unrolled=unrolled)
         linear = kinematics.position - goal.position
         angular = rotation_error(kinematics.rotation, goal.rotation)
         scale = jnp.where(np.arange(6) < 3, 1.0, self.length).astype(x.dtype)

@@ -34,7 +34,6 @@ def errors_at(sizes: Float[Array, "2"], x: Float[Array, " n"], search: Any, goal
 @errors_at.defjvp
 def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
     (sizes, x, search, goal), (_, rate, *rates) = primals, tangents
-    # by the Jacobian, because JAX 0.10 cannot transpose the scan over the joints where a cotangent is a symbolic 0
     error, matrix = search.rows_at(x, goal)
     _, aside = jax.jvp(lambda search, goal: search.rows_at(x, goal)[0], (search, goal), tuple(rates))
     moved = aside + jnp.matmul(matrix, rate, precision="highest")

@@ -1,5 +1,6 @@
 """Inverse kinematics out of reach: the least error, beside SciPy's bounded minimiser on MuJoCo's kinematics."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -228,3 +229,19 @@ def test_errors_of_an_arm_out_of_reach_have_the_derivatives_of_the_answer(arm, f
     for axis in np.eye(3):
         ahead, behind = (both(positions + sign * step * axis)[0][0] for sign in (1.0, -1.0))
         np.testing.assert_allclose(slope @ axis, (ahead - behind) / (2.0 * step), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_link_in_reverse(planar):
+    """Of q alone, whose errors have no cotangent; and of the error out of reach, which loses what the link gains."""
+
+    def find(share, target, start):
+        robot = dataclasses.replace(planar, body_position=share * planar.body_position)
+        found = osik.inverse_kinematics(robot, {"tip": target}, q0=start, seeds=1, steps=40)
+        return found.q, found.position_error
+
+    start, inside, outside = jnp.array([0.1, 1.0]), jnp.array([0.5, 0.3, 0.0]), jnp.array([1.2, 0.3, 0.0])
+    slope = jax.jit(jax.jacrev(lambda share: find(share, inside, start)[0]))(1.0)
+    by = jax.jit(lambda share: find(share, inside, start)[0])
+    np.testing.assert_allclose(slope, (by(1.0 + 1e-5) - by(1.0 - 1e-5)) / 2e-5, atol=1e-5)
+    assert jax.jit(jax.grad(lambda share: find(share, outside, start)[1]))(1.0) == pytest.approx(-0.5, abs=1e-6)
