@@ -20,9 +20,10 @@ class Solution(eqx.Module):
             ``explain_step`` and ``explain_rollout`` say how near they are, and what stops the robot.
         iterations: changes of the active set, all levels together.
         factorizations: systems factored, all levels together; 1 in ``WeightedQP`` where the warm start was right.
-        kkt_residual: largest violation of the optimality conditions (of the first level for ``NullSpace``), of
-            ``WeightedQP`` relative to the forces that the tasks exert: comparable between problems, at most 1e-9
-            (1e-5 in float32) where SOLVED. The largest finite number where the status is NUMERICAL_ERROR.
+        kkt_residual: largest violation of the optimality conditions, relative to the size of their terms: at most 1e-9
+            (1e-5 in float32) where SOLVED. For ``NullSpace`` it is the largest entry of the gradient of the first
+            priority's squared error, in the units of its weighted rows. Damping leaves a gradient, so SOLVED does not
+            bound it. The largest finite number where the status is NUMERICAL_ERROR.
         box_violation: how far v leaves its box [rad/s or m/s], 0 but for ``NullSpace``; or, where that is more, how far
             it leaves the rows of limits that are no box, in their units: rounding, but for ``NullSpace`` and where the
             status is INFEASIBLE.

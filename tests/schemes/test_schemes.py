@@ -462,3 +462,20 @@ def test_a_joint_that_its_limits_hold_leaves_the_null_space_to_the_others(method
     solution = osik.solve(robot, robot.q0, tasks, scheme=osik.NullSpace(method=method, backend=backend))
     assert solution.status == osik.Status.SOLVED
     np.testing.assert_allclose(solution.velocity[1:], 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["saturated", "classical"])
+def test_damping_alone_leaves_a_residual_of_the_first_priority(method):
+    """Out of reach, SOLVED and as exact as in reach; ``kkt_residual`` is not relative for this scheme."""
+    arm = osik.load_robot("arm7")
+    far = {"hand": osik.FrameTask(arm, "hand", target=jnp.array([2.0, 0.0, 1.0]), rows="position")}
+    q = arm.q0 + 0.3 * jax.random.normal(jax.random.key(0), (8, arm.nq))
+
+    @jax.jit
+    def solved(damping, curvature_damping):
+        scheme = osik.NullSpace(method=method, damping=damping, curvature_damping=curvature_damping)
+        return jax.vmap(lambda q: osik.solve(arm, q, far, scheme=scheme, dt=0.01))(q)
+
+    exact, damped = solved(0.0, 0.0), solved(1e-3, 1.0)
+    assert not np.any(exact.status) and not np.any(damped.status)
+    assert np.max(exact.kkt_residual) < 1e-12 < 1e-4 < np.max(damped.kkt_residual)
