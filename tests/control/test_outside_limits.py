@@ -103,12 +103,21 @@ def test_a_soft_limit_is_bounded_too(arm):
     np.testing.assert_allclose(answer.velocity, [-0.5, -0.5, -0.25], atol=1e-4)
 
 
-@pytest.mark.parametrize("home", [OUT, {"b": 1.0}, "outside", 1], ids=["array", "mapping", "keyframe", "its number"])
+@pytest.mark.parametrize("home", [OUT, {"b": 1.0}], ids=["array", "mapping"])
 def test_a_home_outside_is_kept_with_a_warning(arm, home):
     with pytest.warns(osik.OsikWarning, match=r"b is (1|0\.884398), its range is \[-1\.5708, 0\.785398\]"):
         moved = arm.with_home(home)
     np.testing.assert_allclose(moved.q0, OUT if isinstance(home, np.ndarray) else [0.0, 1.0, 0.0])
     with pytest.warns(osik.OsikWarning, match="kept as given"):
+        np.testing.assert_allclose(osik.Robot.from_mjcf(ARM, home=home, floating_base=False).q0, moved.q0)
+
+
+@pytest.mark.parametrize("home", ["outside", 1], ids=["keyframe", "its number"])
+def test_a_keyframe_outside_is_brought_inside_with_a_warning(arm, home):
+    with pytest.warns(osik.OsikWarning, match="b is 1 there, outside its range, and 0.7854 in q0"):
+        moved = arm.with_home(home)
+    np.testing.assert_allclose(moved.q0, [0.0, np.pi / 4, 0.0])
+    with pytest.warns(osik.OsikWarning, match="b is 1 there"):
         np.testing.assert_allclose(osik.Robot.from_mjcf(ARM, home=home, floating_base=False).q0, moved.q0)
 
 

@@ -341,13 +341,13 @@ def test_one_target_of_tasks_is_one_answer(arm):
     """As the task's own target, and beside many of another task."""
     pose = np.array([0.4, 0.1, 0.4]), np.diag([1.0, -1.0, -1.0])
     tasks = {"tool": osik.FrameTask(arm, "hand", rows=(True,) * 5 + (False,)), "elbow": osik.ComTask(arm)}
-    one = read_problem(arm, tasks, {"tool": pose, "elbow": np.array([0.1, 0.0, 0.3])}, None, None)
+    one = read_problem(arm, tasks, {"tool": pose, "elbow": np.array([0.1, 0.0, 0.3])}, None, None, arm.q0)
     assert not one.many and one.goals.targets["elbow"].shape == (1, 3)
     np.testing.assert_allclose(one.goals.targets["tool"][1][0], pose[1])
-    both = read_problem(arm, tasks, {"elbow": np.full((4, 3), 0.1), "tool": pose}, None, None)
+    both = read_problem(arm, tasks, {"elbow": np.full((4, 3), 0.1), "tool": pose}, None, None, arm.q0)
     assert both.many and both.goals.targets["tool"][1].shape == (4, 3, 3)
     message = r"targets\['tool'\]: got an array of shape \(2, 2\).*many have one more axis in front"
-    refuses(ValueError, message, read_problem, arm, tasks, {"tool": np.zeros((2, 2))}, None, None)
+    refuses(ValueError, message, read_problem, arm, tasks, {"tool": np.zeros((2, 2))}, None, None, arm.q0)
 
 
 class TestMistakes:
