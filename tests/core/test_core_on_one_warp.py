@@ -98,10 +98,10 @@ def test_weights_far_apart_stay_in_the_kernel(robot, tmp_path, rng):
     damping = np.maximum(damping, least_damping(A, weight))
     center = np.pad(p.b[:, m:] / 0.05, ((0, 0), (6, 0)))
     bound = np.pad(10.0 ** rng.uniform(-2, 1, (count, n - 6)), ((0, 0), (6, 0)), constant_values=np.inf)
-    none = np.zeros((count, 0, n))
-    given = A, b, weight, damping, center, none, none[..., 0], -bound, bound
+    none, free = np.zeros((count, 0, n)), np.zeros((count, 0))
+    given = A, b, weight, damping, center, none, free, -bound, bound
     found = one_warp.solve(tmp_path, given, np.zeros((count, n), int), 1e-7, np.float32)
-    expected = answers(A, b, weight, -bound, bound, none, *3 * [none[..., 0]], damping, center)
+    expected = answers(A, b, weight, -bound, bound, none, free, free, free, damping, center)
     assert (expected.status == Status.SOLVED).all() and (np.asarray(expected.active) != INACTIVE).any(1).mean() > 0.5
     assert (found.report[:, 0] == CERTIFIED).mean() >= 0.99
     root = np.sqrt(np.einsum("bm,bmn->bn", weight, A**2) + damping)  # in which a variable's error costs alike

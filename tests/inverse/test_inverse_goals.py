@@ -1,5 +1,7 @@
 """Which tasks inverse kinematics has to meet, what its answers say about turns, bases and reach; by closed forms."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,11 +29,11 @@ def planar():
     return osik.Robot.from_mjcf(PLANAR.format(free=""))
 
 
-def tip(robot, place=REACH, **options):
+def tip(robot, place: Any = REACH, **options):
     return osik.FrameTask(robot, "tip", rows="position", target=place, **options)
 
 
-def found(robot, tasks, **options):
+def found(robot, tasks, **options) -> Any:
     return osik.inverse_kinematics(robot, tasks, **{"seeds": 8, "restarts": 1, "closest": False, **options})
 
 
