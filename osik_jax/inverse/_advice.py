@@ -59,6 +59,8 @@ def _rank(robot: Robot, rows: Mapping[str, tuple[bool, ...]]) -> int:
 
 
 def _line(robot: Robot, frame: str, asked: tuple[bool, ...], ways: int) -> str:
+    if not ways:
+        return f"no joint moves {frame} along a row that it asks for, so no other target has a solution"
     kept, axes = _rows_to_keep(robot, frame, asked, ways)
     free, joints = sum(asked) - sum(kept), len(chain_layout(robot.tree, (frame,)).dofs)
     carried = f"{joints} joints carry it" if joints > 1 else "1 joint carries it"

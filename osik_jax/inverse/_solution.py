@@ -103,7 +103,8 @@ class InverseKinematicsSolution(eqx.Module):
             return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line", *reasons]
         if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
             one, other = self.pairs[int(pick(self.nearest_pair))]
-            reasons.append(f"{one} and {other} are {float(pick(self.clearance)):+.3g} m from as near as they may be")
+            gap = round(float(pick(self.clearance)), 6) + 0.0
+            reasons.append(f"{one} and {other} are {gap:+.3g} m from as near as they may be")
         reasons += self.advice
         return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
 

@@ -320,7 +320,7 @@ BELOW_OTHERS = 2.0
 """Factor on a priority's curvature damping if other priorities are above it: their rows bend too, and balance the part
 that it cannot meet.
 """
-SINGLE_DAMPING = 2.0
+SINGLE_DAMPING = 4.0
 """Least damping of a kernel in single precision, in units of epsilon times the largest weight times squared row norm; a
 weaker damping would be lost in the Hessian's roundoff.
 """

@@ -34,7 +34,7 @@ class WeightedQP(Scheme):
 
     Attributes:
         damping: damping of the velocity, in the units of weight times J^2; > 0. In float32 on a GPU with kernels, the
-            diagonal term of a dof, its damping and its posture together, is at least 2 epsilon times the largest weight
+            diagonal term of a dof, its damping and its posture together, is at least 4 epsilon times the largest weight
             times row norm squared.
         curvature_damping: kappa, the factor of the damping for the second-order terms that the linear model omits; 0
             for none. It vanishes where the tasks are met (``TaskRows.curvature``). For a dof that its damping and

@@ -240,7 +240,8 @@ def _reasons(robot: Robot, measured: _Measured, limits: Sequence[Limit], goal: s
         f"{names[i]} is at its {('lower', 'upper')[upper]} {_bound(limits[int(measured.tightest[upper, i])])}"
         for i, upper in ((i, int(stops.joints[i] > 0)) for i in dofs)
     ]
-    lines += [f"{one} and {other} are {gap:+.3g} m from as near as they may be" for (one, other), gap in pairs.items()]
+    for (one, other), gap in pairs.items():
+        lines.append(f"{one} and {other} are {round(gap, 6) + 0.0:+.3g} m from as near as they may be")
     lines += [
         f"a {type(limit).__name__} stops it"
         for limit, stopping in zip(limits, stops.limits, strict=True)

@@ -106,7 +106,7 @@ def test_weights_far_apart_stay_in_the_kernel(robot, tmp_path, rng):
     assert (found.report[:, 0] == CERTIFIED).mean() >= 0.99
     root = np.sqrt(np.einsum("bm,bmn->bn", weight, A**2) + damping)  # in which a variable's error costs alike
     miss = np.abs(root * (found.x - expected.x)).max(1) / np.abs(root * expected.x).max(1)
-    assert miss[found.report[:, 0] == CERTIFIED].max() < 1e-5
+    assert miss[found.report[:, 0] == CERTIFIED].max() < 5e-5
 
 
 def least_damping(A, weight):

@@ -83,7 +83,14 @@ def test_wrists_stay_where_they_hold_the_box(nao):
     figures = report(result)
     assert figures["touches"]["off_mm_max"] < 1.0 and report(loose)["touches"]["off_mm_max"] is None
     assert figures["joints"]["beyond_range_max"] == 0.0 and figures["joints"]["jump_frames"] == 0
-    assert figures["feet"]["slip_mm_max"] < 0.5 and not figures["notes"]
+    assert figures["feet"]["slip_mm_max"] < 0.5
+    # the box is wide and far for a NAO: it leans towards it, with its shoulders at their ends
+    leans, rest = figures["notes"]
+    assert (
+        "the trunk leans" in leans
+        and "RShoulderRoll" in rest
+        and figures["tracking"]["trunk_angle_deg"]["pelvis"] < 30.0
+    )
     # a batch with clips that hold something and clips that do not gives the same
     other = retargeter.retarget_all([dataclasses.replace(motion, touches=()), motion], progress=False)
     np.testing.assert_allclose(other[1].q, result.q, atol=1e-6)
