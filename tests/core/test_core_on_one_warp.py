@@ -104,9 +104,19 @@ def test_weights_far_apart_stay_in_the_kernel(robot, tmp_path, rng):
     expected = answers(A, b, weight, -bound, bound, none, free, free, free, damping, center)
     assert (expected.status == Status.SOLVED).all() and (np.asarray(expected.active) != INACTIVE).any(1).mean() > 0.5
     assert (found.report[:, 0] == CERTIFIED).mean() >= 0.99
-    root = np.sqrt(np.einsum("bm,bmn->bn", weight, A**2) + damping)  # in which a variable's error costs alike
-    miss = np.abs(root * (found.x - expected.x)).max(1) / np.abs(root * expected.x).max(1)
-    assert miss[found.report[:, 0] == CERTIFIED].max() < 5e-5
+    certified = found.report[:, 0] == CERTIFIED
+    costs = [
+        cost_of(given, x)[certified] for x in (found.x.astype(float), np.asarray(expected.x), np.zeros((count, n)))
+    ]
+    # not the answers: a bound whose multiplier is rounding in single precision may be active in one of them alone
+    assert np.abs((costs[0] - costs[1]) / costs[2]).max() < 1e-6
+
+
+def cost_of(given, x):
+    """The cost of a batch of answers, in double precision."""
+    A, b, weight, damping, center = given[:5]
+    missed = np.einsum("bmn,bn->bm", A, x) - b
+    return (weight * missed**2).sum(1) + (damping * (x - center) ** 2).sum(1)
 
 
 def least_damping(A, weight):
