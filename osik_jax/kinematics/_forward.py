@@ -220,7 +220,7 @@ def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = N
 
 @partial(jax.jit, inline=True)
 def _center(mass: Array, center: Array, position: Array, rotation: Array) -> Float[Array, "3"]:
-    return jnp.sum(mass[:, None] * (position + rotate(rotation, center)), 0) / jnp.sum(mass)
+    return jnp.sum(_moments(mass, center, position, rotation), 0) / jnp.sum(mass)
 
 
 def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3 nv"]:
@@ -255,7 +255,8 @@ def _with_masses(robot: Robot, subtree: str | None) -> Robot:
 
 def _center_and_jacobian(robot: Robot, kinematics: Kinematics) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
     """Return the centre of all masses, and its Jacobian."""
-    mass, moment = _body_moments(robot, kinematics, robot.body_mass)
+    mass, poses = robot.body_mass, (kinematics.body_position, kinematics.body_rotation)
+    moment = _moments(mass, robot.body_com, *poses)
     carried = jnp.asarray(robot.tree.moves, mass.dtype)
     mass_below, moment_below = (jnp.matmul(a.T, carried, precision="highest") for a in (mass, moment))
     arm = moment_below - mass_below * kinematics.dof_anchor.T
@@ -294,12 +295,9 @@ def _motion_axes(
     return linear, angular
 
 
-def _body_moments(
-    robot: Robot, kinematics: Kinematics, mass: Float[Array, " nbody"]
-) -> tuple[Float[Array, " nbody"], Float[Array, "nbody 3"]]:
-    """Return the given masses, and mass times centre of mass of each body."""
-    centers = kinematics.body_position + rotate(kinematics.body_rotation, robot.body_com)
-    return mass, mass[:, None] * centers
+def _moments(mass: Array, center: Array, position: Array, rotation: Array) -> Float[Array, "nbody 3"]:
+    """Return each body's mass times its centre of mass in the world [kg m]."""
+    return mass[:, None] * (position + rotate(rotation, center))
 
 
 def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbody"]:

@@ -1,4 +1,4 @@
-"""How well a rollout met its targets, in words."""
+"""Verdict on a rollout: which targets it met, and what stops it at the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stops a control step, in words."""
+"""Verdict on a control step: the joints, shapes and tasks that stop it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class StepVerdict(NamedTuple):
 
 
 class _Stops(NamedTuple):
-    """What stops one goal.
+    """Joints, limits and tasks that stop one goal.
 
     Attributes:
         joints: -1 or 1 where a dof's lower or upper bound does, else 0. (nv,)
