@@ -52,7 +52,7 @@ def with_all(
         good = score[target] <= 1.0
         near = unwound(x[target][good], own.first, own.lower, own.upper, own.turns)  # pyright: ignore
         solved = np.concatenate([q[target, own.entries][None], near])
-        # a solution that a further search has found takes the last start's place, whose neighbours are as near
+        # a further search has none of these starts: it found the only solution, so its separation does not matter
         at = np.append(np.minimum(found.seed[target], rows - 1), np.flatnonzero(good))
         kept = _distinct(solved, separation[target][at], own.turns)[:rows]
         distinct, alone[target, : len(kept)] = solved[kept], np.asarray(isolated)[target][at[kept]]

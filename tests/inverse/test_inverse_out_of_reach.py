@@ -233,7 +233,7 @@ def test_errors_of_an_arm_out_of_reach_have_the_derivatives_of_the_answer(arm, f
 
 @pytest.mark.slow
 def test_derivatives_by_a_link_in_reverse(planar):
-    """Of q alone, whose errors have no cotangent; and of the error out of reach, which loses what the link gains."""
+    """Derivatives of q alone, without a cotangent of the errors; and of the error, which falls as the link grows."""
 
     def find(share, target, start):
         robot = dataclasses.replace(planar, body_position=share * planar.body_position)
