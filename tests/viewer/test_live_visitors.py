@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
+from osik_jax.viewer.live import _visitors
 from osik_jax.viewer.live._server import close_server, open_server
 from osik_jax.viewer.live._visitors import is_own_page
 
@@ -61,7 +63,12 @@ def test_bad_messages_are_dropped_with_a_line_each_and_the_next_one_counts(
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1"])
-def test_a_page_of_another_site_moves_nothing(server: Any, origin: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_page_of_another_site_moves_nothing(
+    server: Any, origin: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tell = _visitors._tell
+    # The page's message arrives before the refusal, and waits to be read.
+    monkeypatch.setattr(_visitors, "_tell", lambda text: (time.sleep(0.2), tell(text)))
     handle = server.scene.add_transform_controls("/hand")
     with opened(server, origin) as page, pytest.raises(ConnectionClosed, match="a page of another site"):
         page.send(moved([1.0, 2.0, 3.0]))

@@ -31,6 +31,7 @@ def guard(server: Any) -> None:
             connection.recv = _readable(connection.recv, sockets._message_class)
         else:
             _tell(f"refused a connection from a page of {headers.get('Origin')}: open {server_url(server)}")
+            connection.recv = _nothing_of(connection)
             await connection.close(POLICY_VIOLATION, "a page of another site")
 
     def tell_failed(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
@@ -65,6 +66,16 @@ def _is_loopback(name: str) -> bool:
         return ipaddress.ip_address(name).is_loopback
     except ValueError:
         return name.lower() == "localhost"
+
+
+def _nothing_of(connection: Any) -> Any:
+    """Return a function that ends a closed connection's reader; ``recv`` would first hand out what had arrived."""
+
+    async def end() -> bytes:
+        await connection.wait_closed()
+        raise connection.protocol.close_exc
+
+    return end
 
 
 def _readable(receive: Any, messages: Any) -> Any:
