@@ -9,6 +9,7 @@ from .batching import batched as batched
 from .batching import stack as stack
 from .collision import CollisionShape as CollisionShape
 from .control import Clutch as Clutch
+from .control import Controller as Controller
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
 from .control import build_problem as build_problem

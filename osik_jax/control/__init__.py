@@ -1,6 +1,7 @@
 """One control step, and closed loops of many steps."""
 
 from ._clutch import Clutch as Clutch
+from ._controller import Controller as Controller
 from ._rollout import rollout as rollout
 from ._solution import Solution as Solution
 from ._solution import Trajectory as Trajectory

@@ -28,12 +28,14 @@ from ..schemes._default import priorities
 from ..tasks import DampingTask, LowAccelerationTask, Task, TaskRows
 from ..tasks._rows import rows_of
 
-_DIVERGES = 2.0
-"""An error e becomes (1 - gain dt) e in a step."""
+LARGEST_GAIN = 2.0
+"""Largest gain times dt that nothing is said of: an error e becomes (1 - gain dt) e in a step."""
 _SPAN = 1e-3
 """Singular value of rows of length 1 below which they leave a direction free, and what then counts as 0."""
 CALMING = (LowAccelerationTask, DampingTask)
 """Tasks that are asked to calm a motion, which they cannot beneath tasks that leave no freedom."""
+_SHORT = 1e-8
+"""Squared length of a quaternion below which it is looked at again."""
 _DEGREES = 6.5
 """Configurations without larger numbers are not looked at for degrees: those would be less than a turn in radians."""
 
@@ -125,11 +127,32 @@ def checked_start(robot: Robot, q0: Any) -> Array:
     return q0
 
 
-def warn_of_degrees(robot: Robot, q: Array) -> None:
+def warn_of_degrees(robot: Robot, q: Array | np.ndarray) -> None:
     """Warn of joint positions that look like degrees; cheaper than ``checked_start``, for use in each step."""
     seen = concrete(q)
     if seen is not None and np.abs(seen).max() > _DEGREES:
         warn_of_far_joints(robot, seen, "q")
+
+
+def plain_configuration(robot: Robot, q: Any) -> np.ndarray | None:
+    """Return a checked concrete q in double precision, with the warning of degrees; None if it is not of that kind.
+
+    Raises:
+        TypeError, ValueError: as ``checked_configuration``.
+    """
+    if isinstance(q, Tracer):
+        return None
+    values = np.asarray(q) if isinstance(q, jax.Array | np.ndarray) else None
+    tree = robot.tree
+    if values is None or values.dtype != np.float64 or values.shape != (tree.nq,):
+        values = np.asarray(checked_configuration(robot, q))
+    if not (
+        np.abs(values).max() <= _DEGREES
+        and all(values[a : a + 4] @ values[a : a + 4] > _SHORT for a in tree.quaternions)
+    ):
+        checked_configuration(robot, values)
+        warn_of_degrees(robot, values)
+    return values if values.dtype == np.float64 else None
 
 
 def checked_configuration(robot: Robot, q: Any) -> Array:
@@ -164,12 +187,14 @@ def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
     large = [float(getattr(gain, "maximum", gain)) for gain in gains if not _is_traced(gain)]
     if _is_traced(dt) or len(large) < len(gains):
         return
-    named = [f"{name} (gain {gain:g})" for name, gain in zip(tasks, large, strict=True) if gain * float(dt) > _DIVERGES]
+    named = [
+        f"{name} (gain {gain:g})" for name, gain in zip(tasks, large, strict=True) if gain * float(dt) > LARGEST_GAIN
+    ]
     if not named:
         _accepted_gains = seen
         return
     warn(
-        f"gain times dt is above {_DIVERGES:g}; a gain counts as 1 / dt at most in a step of {float(dt):g} s: "
+        f"gain times dt is above {LARGEST_GAIN:g}; a gain counts as 1 / dt at most in a step of {float(dt):g} s: "
         f"{', '.join(named)}. Gains are in 1/s, dt is in seconds"
     )
 

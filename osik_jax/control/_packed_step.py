@@ -1,9 +1,9 @@
-"""A control step as numbers that JSON holds, from which the core computes it without Python (``core/c``)."""
+"""A control step as numbers from which the core computes it without XLA: in this process, or in a file (``core/c``)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,7 +23,60 @@ number. It grows when either changes.
 """
 
 
-def packed_step(
+class PackedStep(NamedTuple):
+    """All numbers of a step in double precision, and where they are.
+
+    Attributes:
+        numbers: all leaves of the step's arguments, one after another.
+        places: of each leaf: first number and count.
+        numbered: the step's arguments with the number of each leaf in its place.
+        rows: sizes and indices of the step's rows.
+        layout: what ``Step`` in ``core/step.hpp`` reads.
+        constants: what ``StepData`` has under this name.
+    """
+
+    numbers: np.ndarray
+    places: list[tuple[int, int]]
+    numbered: tuple[Any, ...]
+    rows: Layout
+    layout: np.ndarray
+    constants: np.ndarray
+
+    def place(self, leaf: int) -> slice:
+        """Return where the numbers of a leaf are."""
+        first, count = self.places[leaf]
+        return slice(first, first + count)
+
+
+def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit]) -> str | None:
+    """Return the first part of a step that the core does not have, in words; None if it has all."""
+    missing = unknown_part(robot, tasks, scheme, bounds)
+    if any(isinstance(limit, AccelerationLimit) for limit in bounds):  # the core takes it as a box, made in JAX
+        missing = missing or "the limit AccelerationLimit"
+    return missing
+
+
+def pack(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float) -> PackedStep:
+    """Return the step of tasks, scheme and all limits, of which the core has every part."""
+    tasks = dict(sorted(tasks.items()))  # as in a program of JAX, so that roundoff is the same
+    given = robot, robot.q0, tasks, scheme, tuple(bounds), dt, None
+    leaves, tree = jax.tree.flatten(given)
+    leaves = [np.asarray(leaf, np.float64).ravel() for leaf in leaves]
+    sizes = [len(leaf) for leaf in leaves]
+    firsts = (np.cumsum(sizes) - sizes).tolist()
+    numbered, rows = jax.tree.unflatten(tree, range(len(leaves))), Layout(robot, tasks, scheme)
+    of_one_array = {i: (0, first, size) for i, (first, size) in enumerate(zip(firsts, sizes, strict=True))}
+    return PackedStep(
+        np.concatenate(leaves),
+        list(zip(firsts, sizes, strict=True)),
+        numbered,
+        rows,
+        rows.integers(of_one_array, numbered, -1),
+        rows.constants(np.dtype(np.float64)),
+    )
+
+
+def packed_section(
     robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit], dt: float
 ) -> dict[str, Any]:
     """Return what ``osik_load`` in ``core/c`` reads: names, and all numbers of a step in double precision.
@@ -37,27 +90,19 @@ def packed_step(
 
     Returns:
         ``version``, and ``missing`` alone if the core lacks a part: which one. Else ``dt``; names of the entries of
-        ``q`` and ``velocity``; ``numbers``: all leaves of the arguments of a step, one after another; ``inputs``: name,
-        first number, count and whether it is a rotation matrix, of q and of each target; ``manifold``: entries of q and
-        of v that add, first entries of quaternions in q and of their rotations in v; ``layout`` and ``constants``: what
-        ``Step`` in ``core/step.hpp`` takes.
+        ``q`` and ``velocity``; ``numbers``, ``layout`` and ``constants`` of ``PackedStep``; ``inputs``: name, first
+        number, count and whether it is a rotation matrix, of q and of each target; ``manifold``: entries of q and of v
+        that add, first entries of quaternions in q and of their rotations in v.
     """
     bounds = with_own_limits(robot, limits)
-    missing = unknown_part(robot, tasks, scheme, bounds)
-    if any(isinstance(limit, AccelerationLimit) for limit in bounds):  # the core takes it as a box, made in JAX
-        missing = missing or "the limit AccelerationLimit"
+    missing = missing_part(robot, tasks, scheme, bounds)
     if missing is not None:
         return {"version": VERSION, "missing": missing}
-    given = robot, robot.q0, dict(tasks), scheme, bounds, dt, None
-    leaves, tree = jax.tree.flatten(given)
-    leaves = [np.asarray(leaf, np.float64).ravel() for leaf in leaves]
-    ends = np.cumsum([len(leaf) for leaf in leaves])
-    places = {i: (0, int(end) - len(leaf), len(leaf)) for i, (leaf, end) in enumerate(zip(leaves, ends, strict=True))}
-    numbered, step = jax.tree.unflatten(tree, range(len(leaves))), Layout(robot, tasks, scheme)
-    targets = {name: {"target": getattr(task, "target", None)} for name, task in numbered[2].items()}
-    inputs = [["q", *places[numbered[1]][1:], False]]
+    step = pack(robot, tasks, scheme, bounds, dt)
+    targets = {name: {"target": getattr(task, "target", None)} for name, task in step.numbered[2].items()}
+    inputs = [["q", *step.places[step.numbered[1]], False]]
     for name, leaf in zip(leaf_names(targets), jax.tree.leaves(targets), strict=True):
-        inputs.append([name, *places[leaf][1:], name.endswith(".target[1]")])
+        inputs.append([name, *step.places[leaf], name.endswith(".target[1]")])
     *scalars, quaternions = manifold(robot.tree)
     return {
         "version": VERSION,
@@ -65,8 +110,8 @@ def packed_step(
         "q": configuration_units(robot)[0],
         "velocity": velocity_units(robot)[0],
         "inputs": inputs,
-        "numbers": np.concatenate(leaves).tolist(),
+        "numbers": step.numbers.tolist(),
         "manifold": [*(part.tolist() for part in scalars), *([place[k] for place in quaternions] for k in (0, 1))],
-        "layout": step.integers(places, numbered, -1).tolist(),
-        "constants": step.constants(np.dtype(np.float64)).tolist(),
+        "layout": step.layout.tolist(),
+        "constants": step.constants.tolist(),
     }

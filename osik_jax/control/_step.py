@@ -41,6 +41,7 @@ from ._checks import (
     warn_of_large_gains,
 )
 from ._compiled_step import compiled, is_compiled
+from ._plain_step import keep_step, kept_step
 from ._solution import Solution
 
 Tasks = Mapping[str, Task]
@@ -96,17 +97,24 @@ def solve(
             that differ while ``scheme`` is a ``WeightedQP``, which ignores them, and a ``LowAccelerationTask`` or
             ``DampingTask`` beneath tasks that leave its joints no freedom.
     """
-    check_setting("solve(robot, q, tasks)", robot, scheme, dt)
-    limits = checked_limits(robot, limits)
-    check_tasks(tasks, robot)
+    plain = kept_step(robot, tasks, scheme, limits)
+    if plain is None or not plain.has_checked(tasks, dt):
+        check_setting("solve(robot, q, tasks)", robot, scheme, dt)
+        checked_limits(robot, limits)
+        check_tasks(tasks, robot)
+        warn_of_large_gains(tasks, dt)
+        warn_of_ignored_priorities(scheme, tasks)
+        warn_of_idle_tasks(robot, checked_configuration(robot, q), tasks, scheme)
+        plain = keep_step(robot, q, tasks, scheme, limits, dt)
     check_target_names(tasks, targets)
     check_warm_start(warm_start)
+    found = None if plain is None else plain.solution(robot, q, tasks, targets, dt, warm_start)
+    if found is not None:
+        return found
     q = checked_configuration(robot, q)
     warn_of_degrees(robot, q)
-    warn_of_large_gains(tasks, dt)
-    warn_of_ignored_priorities(scheme, tasks)
-    warn_of_idle_tasks(robot, q, tasks, scheme)
-    solution = step(robot, q, aim(dict(tasks), targets), scheme, limits, in_type_of(dt, q), warm_start)
+    aimed, bounds = aim(dict(tasks), targets), checked_limits(robot, limits)
+    solution = step(robot, q, aimed, scheme, bounds, in_type_of(dt, q), warm_start)
     watch_memory_maps("solve", step)
     return solution
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikTypeError, OsikValueError
 from ..core import _cuda
@@ -118,7 +118,7 @@ def check_kinematics(robot: Robot, kinematics: Any) -> None:
         )
 
 
-def forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
+def forward_kinematics(robot: Robot, q: Num[ArrayLike, " nq"] | Sequence[float]) -> Kinematics:
     """Return the poses of all bodies and motion axes of all dofs at configuration q, compiled on first use.
 
     Quaternions are normalised first.

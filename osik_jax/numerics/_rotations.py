@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikValueError
@@ -22,11 +24,14 @@ _ITERATIONS = 4
 
 
 def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str], Array]:
-    """Decorate a function so that concrete arguments are evaluated during tracing and stay constants."""
+    """Decorate a function so that concrete arguments are evaluated during tracing and stay constants.
+
+    Of NumPy's arrays it returns NumPy's.
+    """
 
     @wraps(function)
     def evaluated(given: Array, what: str) -> Array:
-        if concrete(given) is None:
+        if isinstance(given, np.ndarray | Tracer):
             return function(given, what)
         with jax.ensure_compile_time_eval():
             return function(given, what)
@@ -42,19 +47,24 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
         ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
             length becomes NaN.
     """
-    quaternion, valid = _unit_quaternion(given)
+    quaternion, valid = _computed(_unit_quaternion, given)
     _refuse(valid, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
     return quaternion
 
 
-# compiled as one program, like _nearest_rotation: on a GPU, operations run one by one take milliseconds
-@jax.jit
-def _unit_quaternion(given: Float[Array, "*B 4"]) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
-    squared = jnp.sum(given**2, -1, keepdims=True)
+def _computed(function: Callable[[Array, Any], tuple[Array, Array]], given: Array) -> tuple[Array, Array]:
+    """Return a function's results on the host, or by one program: on a GPU, single operations take milliseconds."""
+    if isinstance(given, np.ndarray):
+        return function(given, np)
+    return jax.jit(function, static_argnums=1)(given, jnp)
+
+
+def _unit_quaternion(given: Float[Array, "*B 4"], xp: Any) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
+    squared = xp.sum(given**2, -1, keepdims=True)
     valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
-    safe = jnp.where(valid, given, jnp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
-    length = jnp.sqrt(jnp.sum(safe**2, -1, keepdims=True))
-    return jnp.where(valid, safe / length, jnp.nan), valid[..., 0]
+    safe = xp.where(valid, given, xp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
+    length = xp.sqrt(xp.sum(safe**2, -1, keepdims=True))
+    return xp.where(valid, safe / length, xp.nan), valid[..., 0]
 
 
 @_evaluated
@@ -65,34 +75,48 @@ def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B
         ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
             becomes NaN if it is traced.
     """
-    rotation, valid = _nearest_rotation(given)
+    rotation, valid = _computed(_nearest_rotation, given)
     _refuse(valid, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
     return rotation
 
 
-@jax.jit
-def _nearest_rotation(given: Float[Array, "*B 3 3"]) -> tuple[Float[Array, "*B 3 3"], Bool[Array, "*B"]]:
-    eye = jnp.eye(3, dtype=given.dtype)
-    residual = jnp.max(jnp.abs(_product(given, jnp.swapaxes(given, -1, -2)) - eye), (-1, -2), keepdims=True)
+def _nearest_rotation(given: Float[Array, "*B 3 3"], xp: Any) -> tuple[Float[Array, "*B 3 3"], Bool[Array, "*B"]]:
+    eye = xp.eye(3, dtype=given.dtype)
+    off = _product(given, xp.swapaxes(given, -1, -2), xp) - eye
+    residual = xp.max(xp.abs(off), (-1, -2), keepdims=True)
     first, second, third = (given[..., k, :] for k in range(3))
-    right_handed = jnp.sum(jnp.cross(first, second) * third, -1)[..., None, None] > 0.0
+    right_handed = xp.sum(xp.cross(first, second) * third, -1)[..., None, None] > 0.0
     valid = (residual <= (1.0 + ROUNDED) ** 2 - 1.0) & right_handed
     exact = residual <= _EXACT * float(jnp.finfo(given.dtype).eps)
-    safe = jnp.where(valid, given, eye)
-    rotation = jax.lax.cond(jnp.all(exact), lambda matrix: matrix, _nearest, safe)
-    return jnp.where(valid, jnp.where(exact, safe, rotation), jnp.nan), valid[..., 0, 0]
+    safe = xp.where(valid, given, eye)
+    if xp is np:
+        rotation = safe if exact.all() else _nearest(safe, xp)
+    else:
+        rotation = jax.lax.cond(jnp.all(exact), lambda matrix: matrix, partial(_nearest, xp=xp), safe)
+    return xp.where(valid, xp.where(exact, safe, rotation), xp.nan), valid[..., 0, 0]
 
 
-def _nearest(matrix: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
+def _nearest(matrix: Float[Array, "*B 3 3"], xp: Any) -> Float[Array, "*B 3 3"]:
     """Return the orthogonal factor of the polar decomposition (Higham, "Functions of Matrices", 2008, section 8.3)."""
     for _ in range(_ITERATIONS):
-        gram = _product(jnp.swapaxes(matrix, -1, -2), matrix)
-        matrix = 1.5 * matrix - 0.5 * _product(matrix, gram)
+        gram = _product(xp.swapaxes(matrix, -1, -2), matrix, xp)
+        matrix = 1.5 * matrix - 0.5 * _product(matrix, gram, xp)
     return matrix
 
 
-def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
-    return jnp.matmul(a, b, precision="highest")
+def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"], xp: Any) -> Float[Array, "*B 3 3"]:
+    return a @ b if xp is np else jnp.matmul(a, b, precision="highest")
+
+
+def matrix_of(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation matrix of a unit quaternion w x y z, with NumPy."""
+    w, x, y, z = quaternion.tolist()
+    rows = (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+    return np.array(rows, quaternion.dtype)
 
 
 def _refuse(valid: Bool[Array, "*B"], given: Array, what: str, right: str) -> None:

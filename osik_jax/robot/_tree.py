@@ -206,6 +206,12 @@ class KinematicTree:
         return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
 
     @cached_property
+    def quaternions(self) -> tuple[int, ...]:
+        """Return the index in q of the first entry of each quaternion."""
+        ends = ((at + QPOS_WIDTH[self.joint_types[joint]], joint) for joint, at in self.qpos_address.items())
+        return tuple(end - 4 for end, joint in ends if self.joint_types[joint] in (FREE, BALL))
+
+    @cached_property
     def nq(self) -> int:
         """Return the length of q."""
         return sum(QPOS_WIDTH[self.joint_types[j]] for j in self.independent)

@@ -21,7 +21,7 @@ import numpy as np
 from .._errors import OsikError, OsikValueError, OsikWarning
 from .._whole_file import write_text
 from ..control._checks import check_setting, check_tasks, checked_limits
-from ..control._packed_step import packed_step
+from ..control._packed_step import packed_section
 from ..control._step import build_problem
 from ..kinematics import integrate
 from ..limits import Limit, Limits
@@ -112,7 +112,7 @@ def save_controller(
 
 def _with_packed_step(text: str, saved: Controller) -> str:
     """Return the file's text with its last two entries: the step for programs without Python, and a checksum."""
-    step = packed_step(saved.robot, saved.tasks, saved.scheme, saved.limits, saved.dt)
+    step = packed_section(saved.robot, saved.tasks, saved.scheme, saved.limits, saved.dt)
     text = f'{text[:-2]},\n "core": {json.dumps(step, ensure_ascii=False)}'
     return text + _CHECKSUM + _checksum(text)
 

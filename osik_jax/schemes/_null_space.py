@@ -90,7 +90,7 @@ class NullSpace(Scheme):
         status = answer.status
         if constraints is not None:
             status = status_with(constraints, status, answer.x, start=self._start(problem))
-        first, count = levels[0].scaled(), jnp.asarray(len(levels))
+        first, count = levels[0].scaled(), jnp.asarray(len(levels), jnp.int32)
         if self.saturates:
             residual = _first_residual(first, answer, problem)
             return SchemeAnswer(answer.x, status, answer.iterations, count + answer.iterations, residual)

@@ -102,7 +102,8 @@ class ContactTask(PlaneTask):
         self.gain = as_gain(gain, dtype)
         self.point = as_vector(point, (3,), "point", dtype)
         self.normal = as_normal(normal, dtype)
-        held = as_pose(home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor, dtype)
+        given = home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor
+        held = as_pose(given, dtype, numbers=jnp)
         height = dot(self.normal, held[0] + dot(held[1], self.point)) if offset is None else offset
         self.offset = as_offset(height, dtype)
         self.anchor = None if sliding else held

@@ -91,7 +91,8 @@ class PoseTask(FramedTask):
             )
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.target = as_pose(home if target is None else target, dtype, rest=self._rest(home))
+        pose = as_pose(home if target is None else target, dtype, rest=self._rest(home))
+        self.target = jnp.asarray(pose[0], dtype), jnp.asarray(pose[1], dtype)
         self.target_velocity = as_vector(
             0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
         )
@@ -205,7 +206,7 @@ class PoseTask(FramedTask):
 
     def _convert(self, name: str, value: Any) -> Any:
         if name == "target":
-            return as_pose(value, self.weight.dtype, rest=self._rest(self.target))
+            return as_pose(value, self.weight.dtype, rest=PoseTask._rest(self, self.target))
         if name in ("position_weight", "orientation_weight"):
             return _row_weight(value, name, self.weight.dtype)
         return super()._convert(name, value)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..numerics._rotations import exact_quaternion, exact_rotation
+from ..numerics._rotations import exact_quaternion, exact_rotation, matrix_of
 from ._leaves import check_finite, concrete
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
@@ -23,13 +25,14 @@ if the other is not used.
 """
 
 _LAST_ROW = 1e-4
+_POSITION = "the target's position"
 _ACCEPTED = (
     "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix or a "
     "jaxlie.SE3"
 )
 
 
-def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = jnp) -> Pose:
+def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = None) -> Pose:
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
@@ -39,12 +42,14 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
         value: the pose.
         dtype: of the result.
         rest: position and rotation where the value has only the other part; None: the value has to have that part.
-        numbers: module that makes arrays of what is not computed, ``jax.numpy`` or ``numpy``.
+        numbers: module that makes the arrays, ``jax.numpy`` or ``numpy``. Default: ``numpy`` unless a number is traced.
 
     Raises:
         TypeError: no numbers.
         ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
     """
+    if numbers is None:
+        numbers = jnp if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)) else np
     parts = pose_parts(value, dtype, numbers=numbers)
     if parts is None:
         array = pose_array(value, dtype, numbers=numbers)
@@ -52,15 +57,16 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
             parts = array[:3, 3], array[:3, :3]
             _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
-            parts = array, jnp.asarray(rest[1], dtype)
+            check_finite(array, _POSITION)
+            return array, rest[1]
         elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
-            parts = jnp.asarray(rest[0], dtype), array
+            return rest[0], _rotation(array)
         else:
             raise _unfit(f"an array of shape {array.shape}", rest)
     position, rotation = parts
     if position.shape != (3,) or rotation.shape not in ((3, 3), (4,)):
         raise _unfit(f"a pair of shapes {position.shape} and {rotation.shape}", rest)
-    check_finite(position, "the target's position")
+    check_finite(position, _POSITION)
     return position, _rotation(rotation)
 
 
@@ -99,10 +105,11 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
     return OsikValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
 
 
-def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
+def _rotation(given: Any) -> Any:
     """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
-        return jaxlie.SO3(exact_quaternion(given, "the target's quaternion")).as_matrix()
+        quaternion = exact_quaternion(given, "the target's quaternion")
+        return matrix_of(quaternion) if isinstance(quaternion, np.ndarray) else jaxlie.SO3(quaternion).as_matrix()
     return exact_rotation(given, "the target's rotation")
 
 

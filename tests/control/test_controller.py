@@ -1,0 +1,198 @@
+"""Steps outside ``jit``, by ``solve`` and by a ``Controller``: beside compiled ones, with new numbers, and by two threads."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from core_checks import needs_core
+from refusals import refuses
+
+import osik_jax as osik
+from osik_jax.control import _plain_step, _step
+
+DT = 0.01
+SCHEMES = {
+    "default": None,
+    "weighted": osik.WeightedQP(damping=1e-6),
+    "classical": osik.NullSpace(),
+    "saturated": osik.NullSpace(method="saturated"),
+}
+
+
+def tasks_of(robot: osik.Robot) -> dict[str, osik.Task]:
+    hand, other = robot.tree.body_names[-1], robot.tree.body_names[2]
+    return {
+        "hand": osik.FrameTask(robot, hand, gain=20.0),
+        "com": osik.ComTask(robot, axes="xy", lower=-0.02, upper=0.05, priority=1),
+        "other": osik.FrameTask(robot, other, rows="position", priority=2),
+        "posture": osik.PostureTask(robot, priority=3),
+    }
+
+
+def moved(robot: osik.Robot, seed: int) -> np.ndarray:
+    """A configuration beside home, and so a target that is not met there."""
+    aside = np.random.default_rng(seed).uniform(-0.2, 0.2, robot.nv)
+    return np.asarray(osik.integrate(robot, robot.q0, aside))
+
+
+def compiled(robot: osik.Robot, q: Any, tasks: Any, **options: Any) -> osik.control.Solution:
+    return jax.jit(lambda q: osik.solve(robot, q, tasks, dt=DT, **options))(q)
+
+
+def assert_same(found: osik.control.Solution, wanted: osik.control.Solution) -> None:
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@needs_core
+@pytest.mark.parametrize(
+    ("name", "scheme"), [("nao", "default"), ("arm7", "weighted"), ("arm7", "classical"), ("nao", "saturated")]
+)
+@pytest.mark.filterwarnings("ignore:a WeightedQP ignores priorities")
+def test_answers_are_those_of_a_compiled_step(name: str, scheme: str) -> None:
+    robot = osik.load_robot(name)
+    tasks, options = tasks_of(robot), {"scheme": SCHEMES[scheme], "dt": DT}
+    controller = osik.Controller(robot, tasks, **options)
+    home: Any = vars(tasks["hand"])["target"]
+    aim = osik.forward_kinematics(robot, moved(robot, 9)).frame_pose(robot, robot.tree.body_names[-1])
+    program = jax.jit(
+        lambda q, target, warm: osik.solve(robot, q, tasks, targets={"hand": target}, warm_start=warm, **options)
+    )
+    cold = program(moved(robot, 0), home, None)
+    for seed in range(3):
+        q = moved(robot, seed)
+        wanted = program(q, home, None)
+        plain = osik.solve(robot, q, tasks, **options)
+        assert isinstance(plain.velocity, jax.Array)
+        assert_same(plain, wanted)
+        if cold.warm_start is not None:
+            warm = osik.solve(robot, q, tasks, warm_start=cold.warm_start, **options)
+            assert_same(warm, program(q, home, cold.warm_start))
+        found = controller.step(q)
+        assert isinstance(found.velocity, np.ndarray)
+        assert_same(found, wanted)
+        aimed = program(q, aim, None)
+        assert_same(osik.solve(robot, q, tasks, targets={"hand": aim}, **options), aimed)
+        assert_same(controller.step(q, {"hand": tuple(map(np.asarray, aim))}), aimed)
+        assert_same(controller.step(q), wanted)  # the target was that of one step
+        after = controller.integrate(q, found.velocity)
+        traced = jax.jit(osik.integrate, static_argnums=())(robot, q, wanted.velocity, DT)
+        np.testing.assert_allclose(after, traced, atol=1e-12)
+        np.testing.assert_allclose(after, osik.integrate(robot, q, wanted.velocity, DT), atol=1e-12)
+
+
+@needs_core
+def test_new_numbers_and_new_structures_are_seen(arm: osik.Robot) -> None:
+    tasks, q = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm)}, moved(arm, 1)
+    controller = osik.Controller(arm, tasks, dt=DT)
+    changes = (
+        {"hand": tasks["hand"].replace(gain=3.0, weight=2.0)},
+        {"posture": tasks["posture"].replace(weight=np.linspace(0.1, 1.0, arm.nv), target=moved(arm, 2))},
+        {"hand": osik.FrameTask(arm, "hand", rows="position", axes="frame")},
+        {"hand": osik.FrameTask(arm, "hand", lower=-0.01, upper=0.02)},
+        {"extra": osik.FrameTask(arm, "link3", rows="orientation")},
+        {"hand": osik.LookAtTask(arm, "hand", target=[1.0, 0.0, 0.3])},
+        {"hand": tasks["hand"]},
+    )
+    for change in changes:
+        tasks = {**tasks, **change}
+        controller.tasks.update(change)
+        wanted = compiled(arm, q, tasks)
+        assert_same(osik.solve(arm, q, tasks, dt=DT), wanted)
+        np.testing.assert_allclose(controller.step(q).velocity, wanted.velocity, atol=1e-9)
+    for dt in (0.02, np.float64(0.003), jax.numpy.asarray(0.004)):
+        wanted = jax.jit(lambda q, dt, tasks=tasks: osik.solve(arm, q, tasks, dt=dt))(q, dt)
+        np.testing.assert_allclose(osik.solve(arm, q, tasks, dt=dt).velocity, wanted.velocity, atol=1e-9)
+
+
+@needs_core
+def test_numbers_that_are_not_finite_get_a_status(arm: osik.Robot) -> None:
+    task = osik.FrameTask(arm, "hand")
+    position = np.asarray(task.target[0]) * np.nan
+    spoiled = jax.tree.map(lambda leaf: leaf, task)
+    vars(spoiled)["target"] = (jax.numpy.asarray(position), task.target[1])
+    for tasks in ({"hand": spoiled}, {"hand": task}):  # the second is not harmed by the first
+        assert_same(osik.solve(arm, arm.q0, tasks), compiled_default(arm, tasks))
+
+
+def compiled_default(robot: osik.Robot, tasks: Any) -> osik.control.Solution:
+    return jax.jit(lambda q: osik.solve(robot, q, tasks))(robot.q0)
+
+
+@needs_core
+def test_a_step_of_the_core_compiles_nothing(arm: osik.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_step, "step", None)
+    tasks = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm, weight=1e-3)}
+    q = moved(arm, 3)
+    for _ in range(3):
+        q = osik.integrate(arm, q, osik.solve(arm, q, tasks, dt=DT).velocity, DT)
+        tasks = {**tasks, "hand": tasks["hand"].replace(target=(np.array([0.4, 0.1, 0.4]), np.eye(3)))}
+
+
+@needs_core
+def test_threads_wait_for_each_other(arm: osik.Robot) -> None:
+    tasks = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm, weight=1e-3)}
+    starts = [moved(arm, seed) for seed in range(4)]
+    wanted = [np.asarray(osik.solve(arm, q, tasks, dt=DT).velocity) for q in starts]
+    wrong: list[int] = []
+
+    def run(k: int) -> None:
+        for _ in range(200):
+            if not np.array_equal(osik.solve(arm, starts[k], tasks, dt=DT).velocity, wanted[k]):
+                wrong.append(k)
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_a_loop_is_a_rollout(arm: osik.Robot) -> None:
+    """With a limit and a task that remember the last velocity."""
+    hand = osik.FrameTask(arm, "hand", target=osik.forward_kinematics(arm, moved(arm, 5)).frame_pose(arm, "hand"))
+    tasks = {"hand": hand, "calm": osik.LowAccelerationTask(arm, weight=1e-2)}
+    limits = (osik.AccelerationLimit(arm, {"*": 3.0}),)
+    path = osik.rollout(arm, arm.q0, tasks, limits=limits, dt=DT, steps=20)
+    controller, q = osik.Controller(arm, tasks, limits=limits, dt=DT), arm.q0
+    for wanted in path.q[1:]:
+        q = controller.integrate(q, controller.step(q).velocity)
+        np.testing.assert_allclose(q, wanted, atol=1e-9)
+    controller.forget()
+    np.testing.assert_allclose(controller.step(arm.q0).velocity, path.solution.velocity[0], atol=1e-9)
+
+
+def test_wrong_arguments_are_named(arm: osik.Robot) -> None:
+    tasks = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm)}
+    controller = osik.Controller(arm, tasks, dt=DT)
+    refuses(ValueError, "q has shape", controller.step, np.zeros(3))
+    refuses(ValueError, "not finite", controller.step, np.full(arm.nq, np.nan))
+    refuses(KeyError, "'hnad'", controller.step, arm.q0, {"hnad": np.zeros(3)})
+    refuses(ValueError, "a pose is", controller.step, arm.q0, {"hand": np.zeros(5)})
+    refuses(
+        ValueError,
+        "has to be finite",
+        osik.solve,
+        arm,
+        arm.q0,
+        tasks,
+        targets={"hand": (np.full(3, np.nan), np.eye(3))},
+    )
+    refuses(ValueError, "v has shape", controller.integrate, arm.q0, np.zeros(3))
+    refuses(ValueError, "dt is -1", osik.Controller, arm, tasks, dt=-1.0)
+    bounded = {**tasks, "hand": osik.FrameTask(arm, "hand", lower=-1.0, upper=1.0), "speed": osik.DampingTask(arm)}
+    refuses(TypeError, "has no 'target'", osik.Controller(arm, bounded, dt=DT).step, arm.q0, {"speed": arm.q0})
+
+
+def test_few_steps_are_kept(arm: osik.Robot) -> None:
+    tasks = {"posture": osik.PostureTask(arm)}
+    for k in range(_plain_step._MOST + 3):
+        osik.solve(arm, arm.q0, {f"posture {k}": tasks["posture"]})
+    assert len(_plain_step._kept) <= _plain_step._MOST
