@@ -21,6 +21,7 @@ from ..kinematics import forward_kinematics
 from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
 from ..robot import Robot
+from ..robot._configuration import check_configuration
 from ..robot._made_for import check_made_for, check_robot
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
@@ -166,7 +167,7 @@ def checked_configuration(robot: Robot, q: Any) -> Array:
         q = jnp.asarray(q)
     except (TypeError, ValueError):
         raise OsikTypeError(f"q is {q!r}; it is a configuration: {robot.nq} numbers") from None
-    robot.check_configuration(q)
+    check_configuration(robot, q, "q")
     return q.astype(jnp.result_type(q, robot.q0))
 
 

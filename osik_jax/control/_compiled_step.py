@@ -33,8 +33,8 @@ from ..tasks import AdaptiveGain, ComTask, FrameTask, PostureTask, RelativeFrame
 from ..tasks._com import axis_numbers
 from ._solution import Solution
 
-_SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
-_LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
+SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
+_LIMITS = (*SIMPLE_LIMITS, AccelerationLimit)
 _POSE, _CENTER, _POSTURE = range(3)
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
@@ -314,7 +314,7 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     guesses, box = jax.tree.leaves(warm_start), -1
     given = [a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    if not (q.dtype == jnp.float64 and all(type(limit) in _SIMPLE_LIMITS for limit in limits)):
+    if not (q.dtype == jnp.float64 and all(type(limit) in SIMPLE_LIMITS for limit in limits)):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv

@@ -82,6 +82,7 @@ class Controller:
         self.scheme = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
         self._plain = plain_step(robot, self.tasks, self.scheme, self.limits, self.dt)
         self._velocity: Any = None
+        self._checked: tuple[Any, Any] = None, None
         self._started = False
 
     def __iter__(self) -> Iterator[Any]:
@@ -104,6 +105,7 @@ class Controller:
             checked_start(self.robot, q)
             self._started = True
         values = plain_configuration(self.robot, q)
+        self._checked = q, values
         if self._plain is not None and values is not None:
             found = self._plain.solve(values, self.tasks, targets or {}, self.dt, None)
             if found is None:  # another structure of tasks
@@ -123,7 +125,10 @@ class Controller:
         Raises:
             ValueError: q or the velocity has the wrong length, or q is not finite.
         """
-        values, v = plain_configuration(self.robot, q), np.asarray(velocity)
+        at, values = self._checked
+        v = np.asarray(velocity)
+        if at is not q:
+            values = plain_configuration(self.robot, q)
         if self._plain is None or values is None or v.shape != (self.robot.nv,) or v.dtype != np.float64:
             return np.asarray(integrate(self.robot, q, velocity, self.dt))
         return plain_integration(self.robot.tree)(values, v * self.dt)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
+from itertools import chain
 from typing import Any
 
 import jax
@@ -24,41 +25,43 @@ from ..schemes._default import scheme_for
 from ..solvers.hqp import WorkingSet
 from ..tasks import Task
 from ._checks import LARGEST_GAIN, checked_limits, plain_configuration
-from ._compiled_step import is_compiled
+from ._compiled_step import SIMPLE_LIMITS, is_compiled
 from ._packed_step import missing_part, pack
 from ._solution import Solution
 
 _MOST = 32
 """Number of steps that are kept; each has its workspace in the core, some hundred kilobytes."""
-_kept: dict[tuple[Any, ...], tuple[PlainStep | None, Any]] = {}
-"""Steps, None where the core has none, with the objects by whose identity each is found: they have to live as long."""
+_kept: dict[tuple[Any, ...], tuple[Checked, Any]] = {}
+"""Steps, with the objects by whose identity each is found: they have to live as long."""
 
 
-def kept_step(robot: Robot, tasks: Any, scheme: Any, limits: Any) -> PlainStep | None:
-    """Return the step that is kept for the same robot, scheme and limits, and for tasks of the same names, if any."""
+def kept_step(robot: Robot, tasks: Any, scheme: Any, limits: Any) -> Checked | None:
+    """Return what is kept for the same robot, scheme and limits, and for tasks of the same names, if anything."""
     return _kept.get(_key(robot, tasks, scheme, limits), (None,))[0] if type(tasks) is dict else None
 
 
 def keep_step(
     robot: Robot, q: Any, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Limits | None, dt: Any
-) -> PlainStep | None:
-    """Return the step for checked arguments, and keep it; None if the core has none, or numbers are traced."""
-    if _is_traced((robot, q, dict(tasks), scheme, limits, dt)):
+) -> Checked | None:
+    """Return a step of the core for checked arguments, and keep it, or that all was checked; None if traced."""
+    if _is_traced((robot, q, dict(tasks), scheme, limits, dt)) or robot.q0.dtype != jnp.result_type(float):
         return None
     key = _key(robot, tasks, scheme, limits)
-    step, _ = _kept.get(key, (None, None))
-    if key not in _kept or (step is not None and not step.fits(tasks)):
+    step = _kept[key][0] if key in _kept else None
+    if step is None or not step.fits(tasks):
         while len(_kept) >= _MOST:
             _kept.pop(next(iter(_kept)))
         with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
-            step = plain_step(robot, tasks, scheme, checked_limits(robot, limits), dt)
+            step = plain_step(robot, tasks, scheme, checked_limits(robot, limits), dt) or Checked(tasks)
         _kept[key] = step, (robot, scheme, tuple(limits) if isinstance(limits, tuple | list) else limits)
     return step
 
 
 def _key(robot: Robot, tasks: Mapping[str, Task], scheme: Any, limits: Any) -> tuple[Any, ...]:
-    of_limits = tuple(map(id, limits)) if isinstance(limits, tuple | list) else id(limits)
-    return id(robot), id(scheme), of_limits, jax.config.jax_enable_x64, *tasks  # pyright: ignore[reportAttributeAccessIssue]
+    """Return what a step is found by; limits that the core does not have change from step to step."""
+    given = limits if isinstance(limits, tuple | list) else (limits,)
+    of_limits = [id(limit) if limit is None or type(limit) in SIMPLE_LIMITS else type(limit) for limit in given]
+    return id(robot), id(scheme), *of_limits, jax.config.jax_enable_x64, *tasks  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def plain_step(
@@ -77,7 +80,45 @@ def _is_traced(tree: Any) -> bool:
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
-class PlainStep:
+class Checked:
+    """Tasks that were checked, recognised by their identity.
+
+    Args:
+        tasks: by name.
+    """
+
+    def __init__(self, tasks: Mapping[str, Task]) -> None:
+        self._seen = dict(tasks)
+        self._look_at_gains()
+
+    def has_checked(self, tasks: Mapping[str, Task], dt: Any) -> bool:
+        """Return whether nothing but targets is new in the tasks, and dt is ordinary."""
+        same = all(self._seen[name] is task or _is_aimed(task, self._seen[name]) for name, task in tasks.items())
+        return same and isinstance(dt, float) and 0.0 < dt <= self._longest
+
+    def fits(self, tasks: Mapping[str, Task]) -> bool:
+        """Return whether ``solution`` takes these tasks."""
+        del tasks
+        return True
+
+    def solution(
+        self, robot: Robot, q: Any, tasks: Mapping[str, Task], targets: Any, dt: Any, warm_start: Any
+    ) -> Solution | None:
+        """Return the solution as ``control.solve`` does, which has checked all but q; None if the core has it not."""
+        del robot, q, targets, dt, warm_start
+        if any(self._seen[name] is not task for name, task in tasks.items()):
+            self._seen = dict(tasks)
+            self._look_at_gains()
+        return None
+
+    def _look_at_gains(self) -> None:
+        """Find the longest time of a step in which no gain is too large."""
+        gains = [getattr(task, "gain", 0.0) for task in self._seen.values()]
+        largest = max(float(np.asarray(getattr(gain, "maximum", gain))) for gain in gains)
+        self._longest = LARGEST_GAIN / largest if largest > 0.0 else np.inf
+
+
+class PlainStep(Checked):
     """A step of the core with its numbers; one thread at a time computes.
 
     Args:
@@ -98,7 +139,7 @@ class PlainStep:
         packed = pack(robot, tasks, scheme, bounds, dt)
         _, q, numbered, _, _, of_dt, _ = packed.numbered
         self._q, self._of_dt, self._dt = packed.place(q), packed.place(of_dt), dt
-        self._seen = dict(tasks)
+        super().__init__(tasks)
         self._leaves = {name: _places(packed, task) for name, task in numbered.items()}
         self._targets = {name: _places(packed, getattr(task, "target", None)) for name, task in numbered.items()}
         self._structures = {name: jax.tree.structure(task) for name, task in tasks.items()}
@@ -108,7 +149,7 @@ class PlainStep:
         sizes = [int(np.prod(shape)) for shape in self._labels]
         self._guess, self._integers = np.zeros(sum(sizes), np.int32), np.zeros(3 + sum(sizes), np.int32)
         structure = _structure(tuple(sorted(tasks)), type(scheme))
-        self.unpacked = partial(_unpacked, structure, _leaf_places(robot.nv, packed.rows.count, self._labels))
+        self.unpacked = partial(_unpacked, structure, *_leaf_places(robot.nv, packed.rows.count, self._labels))
         self.as_arrays = jax.jit(self.unpacked)
         self._free = functions().free  # while the process ends, modules are gone before objects
         self._handle = functions().new(packed.layout.ctypes.data, len(packed.layout))
@@ -118,17 +159,11 @@ class PlainStep:
         guess = self._guess.ctypes.data
         self._guesses = guess, guess + self._guess.itemsize * sizes[0] if len(sizes) > 1 else None
         self._results = self._result.ctypes.data, self._integers.ctypes.data
-        self._lock = threading.Lock()
-        self._look_at_numbers()
+        self._lock, self._clean = threading.Lock(), not np.isnan(self._numbers).any()
 
     def __del__(self) -> None:
         if getattr(self, "_handle", None):
             self._free(self._handle)
-
-    def has_checked(self, tasks: Mapping[str, Task], dt: Any) -> bool:
-        """Return whether nothing but targets is new since the tasks were laid out or taken, and dt is ordinary."""
-        same = all(self._seen[name] is task or _is_aimed(task, self._seen[name]) for name, task in tasks.items())
-        return same and isinstance(dt, float) and 0.0 < dt <= self._longest
 
     def fits(self, tasks: Mapping[str, Task]) -> bool:
         """Return whether the tasks have the structure of those that were laid out."""
@@ -174,11 +209,11 @@ class PlainStep:
                 self._numbers[self._of_dt] = self._dt = dt
             self._numbers[self._q] = q
             if guess:
-                np.concatenate([np.ravel(labels) for labels in guess], out=self._guess, casting="unsafe")
-            own = {name: self._exchanged(self._targets[name], parts) for name, parts in aims.items()}
+                np.concatenate([np.asarray(labels).ravel() for labels in guess], out=self._guess, casting="unsafe")
+            aimed = [self._aimed(name, tasks[name], parts) for name, parts in aims.items()]
             functions().step(*self._inputs, *(self._guesses if guess else (None, None)), self._clean, *self._results)
-            for name, parts in own.items():
-                self._exchanged(self._targets[name], parts)
+            for place, own in chain(*aimed):
+                self._numbers[place] = own
             return self._result.copy(), self._integers.copy()
 
     def _converted(self, name: str, task: Task, target: Any) -> list[Any]:
@@ -198,23 +233,23 @@ class PlainStep:
         sizes = [place.stop - place.start for place in places]
         if [np.size(leaf) for leaf in leaves] != sizes or _is_traced(leaves):
             return False
-        self._exchanged(places, leaves)
-        self._seen[name] = task
-        self._look_at_numbers()
+        for place, leaf in zip(places, leaves, strict=True):
+            self._put(place, leaf)
+        self._seen[name], self._clean = task, not np.isnan(self._numbers).any()
+        self._look_at_gains()
         return True
 
-    def _exchanged(self, places: Sequence[slice], parts: Sequence[Any]) -> list[np.ndarray]:
-        """Put numbers in their places; return those that were there."""
-        before = [self._numbers[place].copy() for place in places]
-        for place, part in zip(places, parts, strict=True):
-            self._numbers[place] = np.ravel(part)
+    def _aimed(self, name: str, task: Task, parts: Sequence[Any]) -> list[tuple[slice, np.ndarray]]:
+        """Put the parts of a target in their places; return these with the numbers that were there."""
+        before = []
+        for place, part, own in zip(self._targets[name], parts, jax.tree.leaves(vars(task)["target"]), strict=True):
+            if part is not own:
+                before.append((place, self._numbers[place].copy()))
+                self._put(place, part)
         return before
 
-    def _look_at_numbers(self) -> None:
-        """Find whether no number is NaN, and the longest time of a step in which no gain is too large."""
-        self._clean = not np.isnan(self._numbers).any()
-        gain = max(float(np.asarray(task.gain)) for task in self._seen.values())
-        self._longest = LARGEST_GAIN / gain if gain > 0.0 else np.inf
+    def _put(self, place: slice, part: Any) -> None:
+        self._numbers[place] = np.asarray(part).ravel()  # NumPy's ravel would run JAX's
 
 
 def _is_aimed(task: Task, seen: Task) -> bool:
@@ -232,28 +267,33 @@ def _places(packed: Any, numbered: Any) -> list[slice]:
 
 
 def _unpacked(
-    structure: Any, places: Sequence[tuple[bool, Any, tuple[int, ...]]], numbers: Any, integers: Any
+    structure: Any,
+    of_numbers: Sequence[Any],
+    of_labels: Sequence[tuple[slice, tuple[int, ...]]],
+    numbers: Any,
+    integers: Any,
 ) -> Solution:
-    """Return the solution; places are those of its leaves: whether they are integers, where, and their shape."""
-    leaves = [(integers if is_integer else numbers)[place] for is_integer, place, _ in places]
-    shaped = [leaf.reshape(shape) if len(shape) > 1 else leaf for leaf, (*_, shape) in zip(leaves, places, strict=True)]
-    shaped[1] = shaped[1].astype(int)
-    return jax.tree.unflatten(structure, shaped)
+    """Return the solution whose leaves are in these places of the results."""
+    velocity, *others = [numbers[place] for place in of_numbers]
+    labels = [integers[place].reshape(shape) for place, shape in of_labels]
+    leaves = [velocity, integers[0].astype(int), integers[1], integers[2], *others, *labels]
+    return jax.tree.unflatten(structure, leaves)
 
 
-def _leaf_places(nv: int, rows: Mapping[str, int], labels: Sequence[tuple[int, ...]]) -> list[tuple[bool, Any, Any]]:
+def _leaf_places(
+    nv: int, rows: Mapping[str, int], labels: Sequence[tuple[int, ...]]
+) -> tuple[list[Any], list[tuple[slice, tuple[int, ...]]]]:
     """Return where the leaves of a solution are in ``StepResult`` of ``core/step_rows.hpp``."""
-    found: list[tuple[bool, Any, Any]] = [(False, slice(nv), ()), *((True, k, ()) for k in range(3))]
-    found += [(False, nv, ()), (False, nv + 1, ())]
+    of_numbers: list[Any] = [slice(nv), nv, nv + 1]
     at = nv + 2
     for count in [rows[name] for name in sorted(rows)] * 2:  # slacks, then errors
-        found.append((False, slice(at, at + count), ()))
+        of_numbers.append(slice(at, at + count))
         at += count
-    at = 3
+    of_labels, at = [], 3
     for shape in labels:
-        found.append((True, slice(at, at + int(np.prod(shape))), shape))
+        of_labels.append((slice(at, at + int(np.prod(shape))), shape))
         at += int(np.prod(shape))
-    return found
+    return of_numbers, of_labels
 
 
 @cache

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Sequence
+from ctypes import byref
 from functools import cache, partial
 from typing import Any
 
@@ -73,12 +75,12 @@ def plain_integration(tree: KinematicTree) -> Callable[[np.ndarray, np.ndarray],
     scalar_q, scalar_v, quaternions = layout(tree)
     scalar = np.concatenate([scalar_q, scalar_v]).astype(np.int32)
     quaternion = np.array(quaternions, np.int32).reshape(-1, 2).T.copy()
-    arguments = len(scalar_q), len(quaternions), scalar.ctypes.data, quaternion.ctypes.data
-    call = functions().integrate
+    places = len(scalar_q), len(quaternions), scalar.ctypes.data, quaternion.ctypes.data
+    call, address = functions().integrate, ctypes.c_double.from_buffer  # an array's own address takes longer
 
     def integrated(q: np.ndarray, v: np.ndarray, kept: tuple[np.ndarray, ...] = (scalar, quaternion)) -> np.ndarray:
-        q, v, out = np.ascontiguousarray(q), np.ascontiguousarray(v), np.empty(len(q))
-        call(*arguments, q.ctypes.data, v.ctypes.data, out.ctypes.data)
+        given, out = np.concatenate([q, v]), np.empty(len(q))
+        call(*places, byref(address(given)), byref(address(given, 8 * len(q))), byref(address(out)))
         return out
 
     return integrated

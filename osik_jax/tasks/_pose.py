@@ -91,7 +91,7 @@ class PoseTask(FramedTask):
             )
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        pose = as_pose(home if target is None else target, dtype, rest=self._rest(home))
+        pose = as_pose(home if target is None else target, dtype, rest=_rest(home, self.kept, self.coupled))
         self.target = jnp.asarray(pose[0], dtype), jnp.asarray(pose[1], dtype)
         self.target_velocity = as_vector(
             0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
@@ -205,21 +205,24 @@ class PoseTask(FramedTask):
         return inverse_left_jacobian(error)
 
     def _convert(self, name: str, value: Any) -> Any:
+        own = vars(self)  # Equinox looks at each attribute that is asked for
         if name == "target":
-            return as_pose(value, self.weight.dtype, rest=PoseTask._rest(self, self.target))
+            rest = _rest(own["target"], own["kept"], own["error"] == "se3")
+            return as_pose(value, own["weight"].dtype, rest=rest)
         if name in ("position_weight", "orientation_weight"):
             return _row_weight(value, name, self.weight.dtype)
         return super()._convert(name, value)
 
-    def _rest(self, pose: Pose) -> tuple[Any, Any]:
-        """Return position and rotation if the rows do not depend on them, None otherwise: targets may omit them."""
-        position, rotation = pose
-        if self.coupled:
-            return None, None
-        return (None if any(self.kept[:3]) else position), (None if any(self.kept[3:]) else rotation)
-
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
+
+
+def _rest(pose: Pose, kept: Sequence[bool], coupled: bool) -> tuple[Any, Any]:
+    """Return position and rotation if the rows do not depend on them, None otherwise: targets may omit them."""
+    if coupled:
+        return None, None
+    position, rotation = pose
+    return (None if any(kept[:3]) else position), (None if any(kept[3:]) else rotation)
 
 
 def pose_fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:

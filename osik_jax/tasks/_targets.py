@@ -94,6 +94,8 @@ def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
     elif hasattr(value, "homogeneous"):
         value = value.homogeneous
     try:
+        if numbers is np and np.asarray(value).dtype.kind not in "biuf":  # NumPy reads texts, and None as NaN
+            raise TypeError
         return numbers.asarray(value, dtype)
     except (TypeError, ValueError):
         raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted}") from None

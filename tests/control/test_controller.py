@@ -1,4 +1,4 @@
-"""Steps outside ``jit``, by ``solve`` and by a ``Controller``: beside compiled ones, with new numbers, by two threads."""
+"""Steps outside ``jit``, by ``solve`` and a ``Controller``: beside compiled ones, with new numbers, by two threads."""
 
 from __future__ import annotations
 
