@@ -76,7 +76,8 @@ def plain_integration(tree: KinematicTree) -> Callable[[np.ndarray, np.ndarray],
     scalar = np.concatenate([scalar_q, scalar_v]).astype(np.int32)
     quaternion = np.array(quaternions, np.int32).reshape(-1, 2).T.copy()
     places = len(scalar_q), len(quaternions), scalar.ctypes.data, quaternion.ctypes.data
-    call, address = functions().integrate, ctypes.c_double.from_buffer  # an array's own address takes longer
+    call = functions().integrate
+    address: Any = ctypes.c_double.from_buffer  # an array's own address takes longer
 
     def integrated(q: np.ndarray, v: np.ndarray, kept: tuple[np.ndarray, ...] = (scalar, quaternion)) -> np.ndarray:
         given, out = np.concatenate([q, v]), np.empty(len(q))
