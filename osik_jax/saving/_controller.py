@@ -26,7 +26,7 @@ from ..control._step import build_problem
 from ..kinematics import integrate
 from ..limits import Limit, Limits
 from ..robot import Robot, load_robot
-from ..robot.loading import is_mjcf
+from ..robot._load_robot import read_robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
 from ..tasks import Task
@@ -268,7 +268,7 @@ def _loaded(described: Mapping[str, Any]) -> Robot:
         raise FileNotFoundError(f"the robot's file is not there: {file}")
     if _hash(file) != described["sha256"]:
         raise OsikValueError(f"{file} has changed since the controller was saved: save it again")
-    return (Robot.from_mjcf if is_mjcf(str(file)) else Robot.from_urdf)(file, **options)
+    return read_robot(str(file), **options)
 
 
 def _hash(file: Path) -> str:

@@ -21,7 +21,7 @@ from ...saving._parts import decode_parts, encode_parts
 from ...schemes import Scheme
 from ...tasks import Task
 from ._python import python
-from ._source import RobotSource, load_source
+from ._source import RobotSource
 from ._step import Controller
 
 _FORMAT = "osik-jax session 1"
@@ -174,7 +174,7 @@ def session_from_json(text: str, where: str = "this") -> Session:
 
 def _session(content: Mapping[str, Any]) -> Session:
     source = RobotSource(**content["robot"])
-    robot = load_source(source)
+    robot = source.load()
     q = np.asarray(content["q"], float)
     robot.check_configuration(jnp.asarray(q))
     off = {name: frozenset(content.get(name, ())) for name in ("off", "limits_off")}
