@@ -30,15 +30,15 @@ def converted(data: Any) -> Any:
     kind = data["class"].rpartition(".")[2]
     if kind == "NoLimits":
         return {"kind": "no_limits"}
-    fields = {name: converted(one) for name, one in data["fields"].items()}
-    if "kept" in fields:
-        fields["rows"] = fields.pop("kept")
-    if kind == "JointCouplingTask":
-        fields["ratios"] = dict(zip(fields.pop("joints"), fields["ratios"], strict=True))
+    fields = {{"kept": "rows"}.get(name, name): one for name, one in data["fields"].items()}
+    joints = converted(fields.pop("joints")) if kind == "JointCouplingTask" else ()
     arguments = inspect.signature(getattr(osik_jax, kind)).parameters if hasattr(osik_jax, kind) else {}
     if lost := fields.keys() - arguments.keys() - _DERIVED:
         raise OsikValueError(
-            f"its {data['class']} was saved by an older version with {', '.join(sorted(lost))}, which this version "
-            "does not read: make the controller again and save it"
+            f"its {kind} was saved by an older version with {', '.join(sorted(lost))}, which this version does not "
+            "read: make the controller again and save it"
         )
-    return {"kind": kind} | {name: one for name, one in fields.items() if name in arguments}
+    made = {name: converted(one) for name, one in fields.items() if name in arguments}
+    if joints:
+        made["ratios"] = dict(zip(joints, made["ratios"], strict=True))
+    return {"kind": kind} | made
