@@ -63,7 +63,7 @@ def _run(command: _Command) -> int:
 def _left_behind(command: _Command) -> str:
     """Return a remark where an interrupted command has written something."""
     if isinstance(command, Reach) and command.unfinished.is_dir():
-        return f"; with --resume it goes on where it was ({command.unfinished})"
+        return f"; the same command goes on where it was ({command.unfinished})"
     if isinstance(command, Retarget) and os.path.isdir(command.clip) and command.out.is_dir():
         return f"; the same command goes on where it was ({command.out})"
     if not isinstance(command, Demo | Retarget) or not command.out.is_dir() or not os.listdir(command.out):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ._messages import CommandError, told, writing
+from ._messages import told, writing
 from ._robots import read_robot
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ class Reach:
     """Maps what a frame gets to: for each position of a grid, the share of orientations that it reaches.
 
     Writes the map and, beside it, a picture. What is finished is kept in a folder until then: the name of the map with
-    .chunks after it.
+    .chunks after it. The same command resumes an interrupted map; for another one remove the folder or change --out.
     """
 
     robot: str
@@ -31,8 +31,6 @@ class Reach:
     """The frame: a link, body, site or geom, carried by hinges and slides."""
     out: Path = Path("map.npz")
     """File to write. The picture has the same name, and ends in .png."""
-    resume: bool = False
-    """Go on with a map that was interrupted, with the same options."""
     positions: int = 20_000
     """About how many positions."""
     orientations: int = 64
@@ -64,10 +62,6 @@ class Reach:
         from .. import reachability
 
         chunks = self.unfinished
-        if chunks.exists() and not self.resume:
-            raise CommandError(
-                f"{chunks} has an unfinished map: --resume goes on with it; else remove it, or change --out"
-            )
         robot = read_robot(self.robot, self.base)
         with told():
             found = reachability.reachability_map(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .._errors import OsikValueError
@@ -22,35 +21,19 @@ def read_robot(source: str, base: str = "auto") -> Robot:
     Raises:
         CommandError: no such file, or what is in it is broken.
     """
-    from ..robot import Robot, load_robot
-    from ..robot.loading import NAMES, ROBOTS, is_mjcf
+    from ..robot import _load_robot
+    from ..robot.loading import ROBOTS
 
     with told():
-        if source in ROBOTS and not os.path.exists(source):
-            if base != "auto":
-                raise OsikValueError(f"--base goes with a file; {source} is what it is")
-            return load_robot(source)
-        path, floating = Path(source), FLOATING[base]
-        if not path.is_file():
-            if source in NAMES or source.endswith("_description"):
-                return _described(source, floating)
-            raise FileNotFoundError(
-                f"no such file: {source} (robots by name: {', '.join(NAMES)}; names of robot_descriptions end in "
-                "_description)"
-            )
-        if is_mjcf(path):
-            return Robot.from_mjcf(path, floating_base=floating)
-        return Robot.from_urdf(path, floating_base=floating)
-
-
-def _described(name: str, floating: bool | None) -> Robot:
-    """Return a robot of robot_descriptions, whose git may fail in ways of its own."""
-    from ..robot import load_robot
-
-    try:
-        return load_robot(name, floating_base=floating)
-    except USER_ERRORS:
-        raise
-    except Exception as error:
-        reason = " ".join(str(error).split())
-        raise CommandError(f"{name} could not be fetched: {type(error).__name__}: {reason}") from error
+        if base != "auto" and source in ROBOTS and not os.path.exists(source):
+            raise OsikValueError(f"--base goes with a file; {source} is what it is")
+        try:
+            return _load_robot.read_robot(source, floating_base=FLOATING[base])
+        except USER_ERRORS:
+            raise
+        except Exception as error:
+            if _load_robot.is_file(source):
+                raise
+            # robot_descriptions: its git may fail in ways of its own
+            reason = " ".join(str(error).split())
+            raise CommandError(f"{source} could not be fetched: {type(error).__name__}: {reason}") from error

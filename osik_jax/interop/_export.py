@@ -48,7 +48,7 @@ def export_controller(
     platforms: Sequence[str] = PLATFORMS,
     inputs: Sequence[str] | None = None,
 ) -> bytes:
-    """Return a control step as bytes, for ``load_controller`` in a process with JAX alone.
+    """Return a control step as bytes, for ``load_exported`` in a process with JAX alone.
 
     The inputs are the configuration ``q``, the targets of the tasks and, where tasks or limits remember it, the
     velocity of the last step (``last_velocity``). The outputs are ``velocity``, ``q`` after a step of ``dt``, and

@@ -41,7 +41,7 @@ class Port(NamedTuple):
 
 
 class ExportedController:
-    """A compiled control step; ``load_controller`` says what it has."""
+    """A compiled control step; ``load_exported`` says what it has."""
 
     inputs: dict[str, Port]
     outputs: dict[str, Port]
@@ -92,7 +92,7 @@ class ExportedController:
         return f"ExportedController(dt={self.dt}, batch={self.batch!r}, {'; '.join(parts)})"
 
 
-def load_controller(exported: bytes | str | os.PathLike[str]) -> ExportedController:
+def load_exported(exported: bytes | str | os.PathLike[str]) -> ExportedController:
     """Return the controller that ``export_controller`` made.
 
     Args:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import itertools
-import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,7 +17,6 @@ from ..execution._workers import cores
 from ..robot import Robot
 from ..scaling import run_in_chunks
 from ..scaling._progress import reported
-from ..scaling._saved import Saved
 from ._body import measured
 from ._guess import describe_profile
 from ._lanes import (
@@ -120,19 +116,17 @@ class Retargeter(OnRobot):
         mapping: Mapping[str, str] | None = None,
         fps: float | None = None,
         chunk: int = 32,
-        out: str | os.PathLike[str] | None = None,
         progress: bool = True,
     ) -> list[Retargeted]:
         """Retarget clips of any lengths in batches; clips of similar length share one compiled program.
+
+        ``osik retarget FOLDER`` keeps each finished clip, so that an interrupted job resumes.
 
         Args:
             motions: the clips.
             mapping: as of ``retarget``, the same for all clips.
             fps: as of ``retarget``.
-            chunk: clips per batch, and per file in ``out``; takes about 100 kB of memory per frame of each clip. On a
-                CPU without ``out``, one clip per core.
-            out: folder for finished batches, from which an interrupted job resumes
-                (``osik_jax.scaling.run_in_chunks``). None: nothing is saved.
+            chunk: clips per batch; takes about 100 kB of memory per frame of each clip. On a CPU, one clip per core.
             progress: whether to show a bar.
 
         Returns:
@@ -142,9 +136,9 @@ class Retargeter(OnRobot):
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
         if any(self._for(motion) is not self for motion in motions):
-            return self._from_sources(motions, out, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
+            return self._from_sources(motions, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
-        if out is None and one_a_core():
+        if one_a_core():
             with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
                 made = []
                 for one in pool.map(self._made_by_a_core, checked):
@@ -158,31 +152,24 @@ class Retargeter(OnRobot):
         found: dict[int, Retargeted] = {}
         for (length, touching), members in sorted(groups.items()):
             lanes = [as_lane(clips[i], length) for i in members]
-            solved = run_in_chunks(
+            results = run_in_chunks(
                 solve_side_by_side,
                 jax.tree.map(lambda *leaves: np.stack(leaves), *lanes),
                 chunk=even(len(members), chunk),
                 shared=self._shared(touching),
-                out=None if out is None else Path(out) / "_".join([f"frames_{length}", *itertools.chain(*touching)]),
                 progress=progress,
                 unit="clips",
             )
-            results = solved[:] if isinstance(solved, Saved) else solved
             for lane, i in enumerate(members):
                 found[i] = self._finished(clips[i], jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
         return [found[i] for i in range(len(clips))]
 
-    def _from_sources(
-        self, motions: Sequence[Source], out: str | os.PathLike[str] | None, **options: Any
-    ) -> list[Retargeted]:
-        """Retarget clips of which some lack limbs, each by the retargeter and in a folder of its limbs."""
+    def _from_sources(self, motions: Sequence[Source], **options: Any) -> list[Retargeted]:
+        """Retarget clips of which some lack limbs, each by the retargeter of its limbs."""
         makers, found = [self._for(motion) for motion in motions], {}
         for own in dict.fromkeys(makers):
             members = [i for i, maker in enumerate(makers) if maker is own]
-            lacks = [role for role in self.profile.keypoints if role not in own.profile.keypoints]
-            folder = None if out is None else Path(out) / "_".join(["without", *lacks])
-            made = own.retarget_all([motions[i] for i in members], out=folder, **options)
-            found |= dict(zip(members, made, strict=True))
+            found |= dict(zip(members, own.retarget_all([motions[i] for i in members], **options), strict=True))
         return [found[i] for i in range(len(motions))]
 
     def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:

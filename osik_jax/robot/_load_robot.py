@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from .._errors import OsikKeyError, OsikTypeError
 from . import loading
@@ -70,3 +72,27 @@ def load_robot(
         has_home=home is not None,
     )
     return Robot._of(loading.named(name, options), home)
+
+
+def is_file(source: str) -> bool:
+    """Return whether the source of a robot is a file rather than a name that ``load_robot`` takes."""
+    return Path(source).is_file() or not (source in loading.NAMES or source.endswith("_description"))
+
+
+def read_robot(source: str, **options: Any) -> Robot:
+    """Return a robot by its name, or from a URDF or MJCF file, told apart by its content.
+
+    ``options`` are those of ``load_robot``.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ImportError, KeyError, ValueError: as in ``load_robot``, ``Robot.from_urdf`` and ``Robot.from_mjcf``.
+    """
+    if not is_file(source):
+        return load_robot(source, **options)
+    if not Path(source).is_file():
+        raise FileNotFoundError(
+            f"no such file: {source} (robots by name: {', '.join(loading.NAMES)}; names of robot_descriptions end in "
+            "_description)"
+        )
+    return (Robot.from_mjcf if loading.is_mjcf(source) else Robot.from_urdf)(source, **options)

@@ -26,13 +26,14 @@ from ..control._step import build_problem
 from ..kinematics import integrate
 from ..limits import Limit, Limits
 from ..robot import Robot, load_robot
-from ..robot.loading import is_mjcf
+from ..robot._load_robot import read_robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
 from ..tasks import Task
-from ._parts import decode, encode
+from ._parts import decode_parts, encode_parts
+from ._version_2 import converted
 
-_FORMAT = "osik-jax controller 2"
+_FORMAT, _OLDER = "osik-jax controller 3", "osik-jax controller 2"
 _CHECKSUM = ',\n "checksum": '
 _ACCURACY = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-4}
 """Largest difference of a step's numbers, relative to the largest of each array, that is roundoff of an MJCF."""
@@ -95,15 +96,12 @@ def save_controller(
     check_setting("save_controller(path, robot, tasks)", robot, scheme, dt)
     check_tasks(tasks, robot)
     given = checked_limits(robot, limits) or ()
-    used, tree = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, robot.tree
+    used = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
     content = {
         "format": _FORMAT,
         "robot": _source(robot, source),
         "dt": float(dt),
-        "scheme": encode(used, "scheme", tree),
-        "limits": [encode(limit, f"limits[{place}]", tree) for place, limit in enumerate(given)],
-        "tasks": [[name, encode(task, f"tasks[{name!r}]", tree)] for name, task in tasks.items()],
-    }
+    } | encode_parts(robot, tasks, used, given)
     saved = Controller(robot, dict(tasks), used, given, content["dt"])
     if source is None:
         saved = _check_written(saved, content)
@@ -151,7 +149,7 @@ def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         text = Path(path).read_text(encoding="utf-8")
         content = json.loads(text)
-        known = isinstance(content, dict) and content.get("format") == _FORMAT
+        known = isinstance(content, dict) and content.get("format") in (_FORMAT, _OLDER)
     except (RecursionError, ValueError):
         known = False
     if not known:
@@ -167,13 +165,14 @@ def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
     """Return the controller of a file's content, with its robot."""
-    return Controller(
-        robot=robot,
-        tasks={name: decode(task, robot.tree) for name, task in content["tasks"]},
-        scheme=decode(content["scheme"], robot.tree),
-        limits=tuple(decode(limit, robot.tree) for limit in content["limits"]),
-        dt=content["dt"],
-    )
+    if content["format"] == _OLDER:
+        content = {
+            name: converted(value) for name, value in content.items() if name in ("tasks", "scheme", "limits", "dt")
+        }
+    tasks, scheme, limits = decode_parts(content, robot)
+    # a scheme's constructor takes no robot, so it does not know the robot's precision
+    scheme = jax.tree.map(lambda number: number.astype(robot.q0.dtype), scheme)
+    return Controller(robot, tasks, scheme, limits, content["dt"])
 
 
 def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, Any]:
@@ -189,7 +188,12 @@ def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, An
             "the robot cannot be made again from its source: its joints, frames or shapes differ. Give source= as the "
             "name or file that it was loaded from, without options other than floating_base and locked_joints"
         )
-    return found | {"numbers": {name: encode(getattr(robot, name), name, robot.tree) for name in _numbers(robot)}}
+    return found | {"numbers": {name: _array_data(np.asarray(getattr(robot, name))) for name in _numbers(robot)}}
+
+
+def _array_data(array: np.ndarray) -> dict[str, Any]:
+    """Return an array as data; a list does not tell the shape of an array without entries."""
+    return {"array": array.tolist(), "shape": array.shape, "dtype": str(array.dtype)}
 
 
 def _check_written(saved: Controller, content: Mapping[str, Any]) -> Controller:
@@ -243,8 +247,12 @@ def _no_own_warnings() -> Iterator[None]:
 
 def _robot(described: Mapping[str, Any]) -> Robot:
     robot = _loaded(described)
-    numbers = {name: decode(one, robot.tree) for name, one in described.get("numbers", {}).items()}
-    return eqx.tree_at(lambda own: [getattr(own, name) for name in numbers], robot, list(numbers.values()))
+    numbers = {
+        name: np.asarray(one["array"], one["dtype"]).reshape(one["shape"])
+        for name, one in described.get("numbers", {}).items()
+    }
+    as_own = [jnp.asarray(n) if isinstance(getattr(robot, name), jax.Array) else n for name, n in numbers.items()]
+    return eqx.tree_at(lambda own: [getattr(own, name) for name in numbers], robot, as_own)
 
 
 def _loaded(described: Mapping[str, Any]) -> Robot:
@@ -260,7 +268,7 @@ def _loaded(described: Mapping[str, Any]) -> Robot:
         raise FileNotFoundError(f"the robot's file is not there: {file}")
     if _hash(file) != described["sha256"]:
         raise OsikValueError(f"{file} has changed since the controller was saved: save it again")
-    return (Robot.from_mjcf if is_mjcf(str(file)) else Robot.from_urdf)(file, **options)
+    return read_robot(str(file), **options)
 
 
 def _hash(file: Path) -> str:

@@ -1,147 +1,185 @@
-"""Tasks, limits and schemes as JSON data, field by field and to the last bit."""
+"""Tasks, limits, schemes and gains as plain data for JSON: the public class name and the constructor's arguments."""
 
 from __future__ import annotations
 
-import contextlib
-import dataclasses
-import enum
-import importlib
-import sys
-from collections.abc import Mapping
+import inspect
+import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._errors import OsikValueError
-from ..limits import NoLimits, no_limits
-from ..numerics._replace import Replaceable
-from ..robot._tree import KinematicTree
+import osik_jax
 
-_PACKAGE = "osik_jax."
-_NUMBERED = {"joint": "joint_names", "joints": "joint_names", "bodies": "body_names", "frames": "frame_names"}
-"""Fields that number parts of a robot, and where its tree has their names. A file has the names: the robot that is
-read from it may number its parts in another order."""
+from .._errors import OsikValueError, OsikWarning
+from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, no_limits
+from ..robot import Robot
+from ..schemes import Scheme
+from ..tasks import AdaptiveGain, SupportPolygon, Task
+from ._collision import collision_arguments, collision_data
+
+Data = dict[str, Any]
+"""``{"kind": name of a public class, argument: value, ...}``; an argument that is missing has its default."""
+
+_CLASSES = (Task, Limit, Scheme, AdaptiveGain, SupportPolygon)
+_NO_LIMITS = "no_limits"
+_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
 
 
-def encode(value: Any, where: str, tree: KinematicTree) -> Any:
-    """Return the value as data for JSON.
+def encode_parts(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> Data:
+    """Return the data of a controller's tasks, scheme and limits, for ``decode_parts``."""
+    return {
+        "scheme": encode(scheme, robot, "scheme"),
+        "limits": [encode(limit, robot, f"limits[{place}]") for place, limit in enumerate(limits)],
+        "tasks": {name: encode(task, robot, f"tasks[{name!r}]") for name, task in tasks.items()},
+    }
+
+
+def decode_parts(content: Mapping[str, Any], robot: Robot) -> tuple[dict[str, Task], Scheme, tuple[Limit, ...]]:
+    """Return tasks, scheme and limits of data from ``encode_parts``."""
+    tasks = {name: decode(one, robot, f"tasks[{name!r}]") for name, one in dict(content["tasks"]).items()}
+    limits = [decode(one, robot, f"limits[{place}]") for place, one in enumerate(content["limits"])]
+    return tasks, decode(content["scheme"], robot, "scheme"), tuple(limits)
+
+
+def encode(part: Any, robot: Robot, where: str) -> Data:
+    """Return a task, limit, scheme or gain as plain data.
 
     Args:
-        value: a task, limit, scheme or what their fields hold.
-        where: name of the value, for messages.
-        tree: of the robot that the value was made for.
+        part: an object of a public class.
+        robot: the robot that it was made for.
+        where: name of the object, for messages.
 
     Raises:
-        ValueError: an object of a class that is not in osik_jax, such as a function or a task of your own.
+        ValueError: a class that is not public in osik_jax, or an object that its constructor does not make again.
     """
-    if isinstance(value, enum.Enum):
-        return {"class": _name(type(value), where), "value": value.value}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, jax.Array | np.ndarray | np.generic):
-        array = np.asarray(value)
-        return {
-            "array": array.tolist(),
-            "shape": array.shape,  # which the list does not tell of an array without entries
-            "dtype": str(array.dtype),
-            "of": "jax" if isinstance(value, jax.Array) else "numpy",
-        }
-    if isinstance(value, Mapping):
-        pairs = [[encode(key, where, tree), encode(one, f"{where}[{key!r}]", tree)] for key, one in value.items()]
-        return {"mapping": pairs}
-    if (names := _field_names(type(value))) is not None:
-        fields = {name: _field(name, getattr(value, name), f"{where}.{name}", tree) for name in names}
-        return {"class": _name(type(value), where), "fields": fields}
-    if isinstance(value, tuple | list | frozenset):
-        kind = type(value).__name__
-        return {"sequence": kind, "items": [encode(one, f"{where}[{k}]", tree) for k, one in enumerate(value)]}
-    raise OsikValueError(
-        f"{where} is a {type(value).__name__}, which a file cannot hold: it holds classes of osik_jax and numbers"
-    )
+    if isinstance(part, NoLimits):
+        return {"kind": _NO_LIMITS}
+    kind = type(part).__name__
+    if getattr(osik_jax, kind, None) is not type(part):
+        raise OsikValueError(
+            f"{where} is a {kind}, which is no class of osik_jax: a file cannot hold it. Make it again after loading, "
+            "and add it to the tasks or limits"
+        )
+    if isinstance(part, CollisionAvoidanceLimit):
+        data = {"kind": kind} | collision_data(part, robot)
+    else:
+        names = [name for name in inspect.signature(type(part)).parameters if name != "robot"]
+        data = {"kind": kind} | {name: _argument(part, robot, name, where) for name in names}
+    if not makes(data, robot, part):
+        raise OsikValueError(
+            f"{where} is a {kind} that its constructor does not make again, which a file cannot hold: use {kind}(...)"
+        )
+    return data
 
 
-def _field_names(cls: type) -> tuple[str, ...] | None:
-    """Return the names of the fields of a dataclass or named tuple, None for other classes."""
-    if dataclasses.is_dataclass(cls):
-        return tuple(field.name for field in dataclasses.fields(cls))
-    return getattr(cls, "_fields", None) if issubclass(cls, tuple) else None
+def makes(data: Data, robot: Robot, part: Any) -> bool:
+    """Return whether data makes an object of the same structure and with the same numbers, to the last bit."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OsikWarning)
+        try:
+            made = decode(data, robot, "it")
+        except (KeyError, ValueError):
+            return False
+    (numbers, structure), (given, wanted) = jax.tree.flatten(made), jax.tree.flatten(part)
+    return structure == wanted and all(map(np.array_equal, numbers, given))
 
 
-def _field(name: str, value: Any, where: str, tree: KinematicTree) -> Any:
-    numbers = value if isinstance(value, tuple) else (value,)
-    if name not in _NUMBERED or not all(type(number) is int for number in numbers):
-        return encode(value, where, tree)
-    names = [getattr(tree, _NUMBERED[name])[number] for number in numbers]
-    return {"names": _NUMBERED[name], "of": names if isinstance(value, tuple) else names[0]}
-
-
-def decode(data: Any, tree: KinematicTree) -> Any:
-    """Return the value of data from ``encode``, for the robot with this tree.
+def decode(data: Any, robot: Robot, where: str) -> Any:
+    """Return the object of data from ``encode``, made by its constructor for this robot.
 
     Raises:
-        ValueError: no such data, a class or field that this version does not have, or a name that the robot has not.
+        ValueError: no such data, a class that this version does not have, or arguments that it does not take.
     """
-    if not isinstance(data, Mapping):
-        return data
-    if "array" in data:
-        array = np.asarray(data["array"], data["dtype"]).reshape(data["shape"])
-        return jnp.asarray(array) if data["of"] == "jax" else array
-    if "mapping" in data:
-        return {decode(key, tree): decode(one, tree) for key, one in data["mapping"]}
-    if "sequence" in data:
-        items = [decode(one, tree) for one in data["items"]]
-        return {"tuple": tuple, "list": list, "frozenset": frozenset}[data["sequence"]](items)
-    if "names" in data:
-        names, of = getattr(tree, data["names"]), data["of"]
-        for name in [of] if isinstance(of, str) else of:
-            if name not in names:
-                raise OsikValueError(f"the robot has no {name!r} in its {data['names']}")
-        return names.index(of) if isinstance(of, str) else tuple(map(names.index, of))
-    cls = _class(data["class"])
-    if "value" in data:
-        return cls(data["value"])
-    return _made(cls, {name: decode(one, tree) for name, one in data["fields"].items()})
-
-
-def _made(cls: Any, fields: dict[str, Any]) -> Any:
-    """Return an object of a class with these fields, without its constructor."""
-    if cls is NoLimits:
+    kind = data.get("kind") if isinstance(data, Mapping) else None
+    if kind == _NO_LIMITS:
         return no_limits
-    known = _field_names(cls) or ()
-    if set(known) != set(fields):
-        raise OsikValueError(f"a {cls.__name__} of this version has the fields {sorted(known)}, not {sorted(fields)}")
-    if issubclass(cls, tuple):
-        return cls(**fields)
-    made = object.__new__(cls)
-    for name, value in fields.items():
-        object.__setattr__(made, name, value)
-    if isinstance(made, Replaceable):  # raises for numbers that the constructor would refuse
-        made.replace(**{name: getattr(made, name) for name in made.replaceable})
+    cls: Any = getattr(osik_jax, str(kind), None)
+    if not _is_kept(cls):
+        raise OsikValueError(f"{where} is {kind or data!r}, which is no task, limit, scheme or gain of this version")
+    given = {name: _value(one, robot, f"{where}.{name}") for name, one in data.items() if name != "kind"}
+    if kind == "SupportPolygon":  # its constructor converts nothing
+        given = {name: np.asarray(one, float) for name, one in given.items()}
+    try:
+        if cls is CollisionAvoidanceLimit:
+            return _collision_limit(robot, given)
+        made = cls(robot, **given) if takes_robot(cls) else cls(**given)
+    except TypeError as error:
+        raise OsikValueError(f"{where}: {error}") from error
+    return _with_exact_directions(made, given)
+
+
+def _with_exact_directions(made: Any, given: Mapping[str, Any]) -> Any:
+    """Set the directions that a constructor has made unit again, which changes their last bit, to those of the data."""
+    for name, value in given.items():
+        own: Any = getattr(made, name, None)
+        if isinstance(value, list) and _is_real(own) and np.shape(value) == own.shape:
+            exact = np.asarray(value, own.dtype)
+            if np.allclose(own, exact, rtol=0.0, atol=8.0 * np.finfo(own.dtype).eps):
+                object.__setattr__(made, name, jnp.asarray(exact))
     return made
 
 
-def _name(cls: type, where: str) -> str:
-    """Return the name of a class of osik_jax, the public one where it has one; raise for other classes.
-
-    Modules are private and may change their places: a public name stays.
-    """
-    if not cls.__module__.startswith(_PACKAGE):
-        raise OsikValueError(
-            f"{where} is a {cls.__name__}, which is no class of osik_jax: a file cannot hold it. Make it again after "
-            "loading, and add it to the tasks or limits"
-        )
-    public = getattr(sys.modules[_PACKAGE[:-1]], cls.__name__, None) is cls
-    return f"{_PACKAGE}{cls.__name__}" if public else f"{cls.__module__}.{cls.__qualname__}"
+def _is_real(value: Any) -> bool:
+    return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
 
 
-def _class(name: str) -> Any:
-    module, _, own = name.rpartition(".")
-    found = None
-    if f"{module}.".startswith(_PACKAGE):
-        with contextlib.suppress(ImportError):
-            found = getattr(importlib.import_module(module), own, None)
-    if not isinstance(found, type) or not (dataclasses.is_dataclass(found) or issubclass(found, tuple | enum.Enum)):
-        raise OsikValueError(f"{name!r} is no class of this version of osik_jax")
-    return found
+def takes_robot(cls: type) -> bool:
+    """Return whether the first argument of a class is the robot."""
+    return next(iter(inspect.signature(cls).parameters), None) == "robot"
+
+
+def _is_kept(cls: Any) -> bool:
+    return inspect.isclass(cls) and issubclass(cls, _CLASSES)
+
+
+def _collision_limit(robot: Robot, given: Mapping[str, Any]) -> CollisionAvoidanceLimit:
+    arguments, left_out = collision_arguments(given)
+    made = CollisionAvoidanceLimit(robot, **arguments)
+    object.__setattr__(made, "left_out", left_out)  # a record alone: all pairs of the file are kept
+    return made
+
+
+def _argument(part: Any, robot: Robot, name: str, where: str) -> Any:
+    """Return the constructor's argument that makes this part of the object, as plain data."""
+    names = robot.tree.joint_names
+    if name == "rows":
+        return _ROWS.get(part.kept, list(part.kept))
+    if name == "joint":
+        return names[part.joint]
+    if name == "joints":
+        joints = part.joints if hasattr(part, "joints") else _joints_of(robot, part.dofs)
+        return [names[joint] for joint in joints]
+    if name == "ratios":
+        return dict(zip((names[joint] for joint in part.joints), np.asarray(part.ratios).tolist(), strict=True))
+    if name == "constraints":
+        return [constraint.name for constraint in part.constraints]
+    if not hasattr(part, name):
+        raise OsikValueError(f"{where} is a {type(part).__name__}, whose {name} a file cannot hold")
+    return _plain(getattr(part, name), robot, f"{where}.{name}")
+
+
+def _joints_of(robot: Robot, dofs: Sequence[int]) -> list[int]:
+    """Return the joints of some entries of v, each once."""
+    owners = robot.tree.dof_joint[robot.tree.own_dofs]
+    return list(dict.fromkeys(owners[list(dofs)].tolist()))
+
+
+def _plain(value: Any, robot: Robot, where: str) -> Any:
+    """Return numbers as floats and lists of floats, and objects as their data."""
+    if isinstance(value, _CLASSES):
+        return encode(value, robot, where)
+    if isinstance(value, tuple | list):
+        return [_plain(one, robot, where) for one in value]
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        return np.asarray(value).tolist()
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise OsikValueError(f"{where} is a {type(value).__name__}, which a file cannot hold")
+
+
+def _value(data: Any, robot: Robot, where: str) -> Any:
+    """Return an argument from plain data."""
+    return decode(data, robot, where) if isinstance(data, Mapping) and "kind" in data else data

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import json
 import os
 import socket
 from collections.abc import Iterator
@@ -12,18 +11,16 @@ from pathlib import Path
 
 from ._chunk_file import unwritable
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
+"""Errors of file systems that know no locks."""
 
 
 @contextlib.contextmanager
 def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
     """Make the folder, and lock it against other jobs inside the block.
 
-    The operating system holds the lock for the process and drops it when the process ends, however it ends. So a lock
-    file that a killed job left behind stops nobody.
+    The operating system holds the lock for the process and drops it when the process ends, however it ends. So the lock
+    file, which stays in the folder, stops nobody.
 
     Args:
         folder: where the results go.
@@ -36,77 +33,32 @@ def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
         BlockingIOError: another process has the folder; the message names it.
         OSError: the folder cannot be made or written to.
     """
-    path = folder / (f".lock.{process}" if process else ".lock")
+    from filelock import FileLock, Timeout  # a tenth of a second, which jobs in memory need not wait for
+
+    name, alone = f".lock.{process}" if process else ".lock", True
+    lock, owner = FileLock(folder / name, timeout=0), folder / f"{name}.owner"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = _taken(path)
-    except BlockingIOError as error:
-        message = f"{_owner(path)} works in the folder; wait until it ends, or name another folder"
+        lock.acquire()
+        owner.write_text(f"process {os.getpid()} on {socket.gethostname()}")
+    except Timeout as error:
+        message = f"{_read(owner)} works in the folder; wait until it ends, or name another folder"
         raise BlockingIOError(errno.EWOULDBLOCK, message, str(folder)) from error
     except OSError as error:
-        raise unwritable(folder, "the folder for the results cannot be made or written to", error) from error
+        alone = False
+        if error.errno not in _NO_LOCKS:
+            lock.release()
+            raise unwritable(folder, "the folder for the results cannot be made or written to", error) from error
     try:
-        yield descriptor is not None
+        yield alone
     finally:
-        if descriptor is not None:
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
-            os.close(descriptor)
+        if alone:
+            owner.unlink(missing_ok=True)
+            lock.release()
 
 
-def _taken(path: Path) -> int | None:
-    """Return the descriptor of the locked file, None if it cannot be locked here."""
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            locked = _locked(descriptor)
-            if locked and _is_at(descriptor, path):  # else the one before us has just removed it
-                _sign(descriptor)
-                return descriptor
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
-        if not locked:
-            path.unlink(missing_ok=True)
-            return None
-
-
-def _sign(descriptor: int) -> None:
-    """Write the owner of the lock to its file."""
-    os.ftruncate(descriptor, 0)
-    os.write(descriptor, json.dumps({"pid": os.getpid(), "host": socket.gethostname()}).encode())
-    os.fsync(descriptor)
-
-
-def _locked(descriptor: int) -> bool:
-    """Lock a file; False if the file system cannot.
-
-    Raises:
-        BlockingIOError: another process has locked it.
-    """
-    if fcntl is None:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
-    except OSError:
-        return False
-    return True
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
-        return False
-
-
-def _owner(path: Path) -> str:
+def _read(owner: Path) -> str:
     """Return the owner of a lock, as its file names it."""
-    try:
-        found = json.loads(path.read_text())
-        return f"process {found['pid']} on {found['host']}"
-    except (OSError, ValueError, TypeError, KeyError):  # it has not written its name yet, or ends just now
-        return "another process"
+    with contextlib.suppress(OSError):  # it has not written its name yet, or ends just now
+        return owner.read_text() or "another process"
+    return "another process"

@@ -16,7 +16,8 @@ import osik_jax as osik
 
 pytest.importorskip("flatbuffers", reason="the extra export")
 
-from osik_jax.interop import export_controller, load_controller
+from osik_jax import interop
+from osik_jax.interop import export_controller, load_exported
 
 ELSEWHERE = """
 import importlib.abc, json, sys
@@ -32,8 +33,8 @@ import jax
 jax.config.update("jax_enable_x64", sys.argv[2] == "float64")
 for folder, counts in json.loads(sys.argv[1]).items():
     sys.path.insert(0, f"{folder}/controller.zip")
-    from osik_controller import load_controller
-    controller = load_controller(f"{folder}/controller.zip")
+    from osik_controller import load_exported
+    controller = load_exported(f"{folder}/controller.zip")
     given = dict(np.load(f"{folder}/in.npz"))
     q = given.pop("q")
     found = {}
@@ -143,7 +144,7 @@ def remembering():
 
 def test_names_shapes_and_units(remembering):
     robot, tasks, _, data = remembering
-    loaded = load_controller(data)
+    loaded = load_exported(data)
     assert {name: (port.shape, port.unit) for name, port in loaded.inputs.items()} == {
         "q": ((7,), ["rad"] * 7),
         "hand.target[0]": ((3,), "m"),
@@ -160,7 +161,7 @@ def test_names_shapes_and_units(remembering):
 def test_a_loop_that_remembers_its_velocity(remembering):
     """Fed with its own velocity, an exported step with a limit on accelerations is ``rollout``."""
     robot, tasks, limits, data = remembering
-    loaded = load_controller(data)
+    loaded = load_exported(data)
     position, weight = tasks["hand"].target[0] + jnp.array([0.1, -0.2, 0.1]), 0.02
     q, v, path = robot.q0, None, []
     for _ in range(30):
@@ -180,7 +181,7 @@ def test_a_loop_that_remembers_its_velocity(remembering):
 def test_targets_are_checked_in_the_program(remembering):
     """A rotation of two digits is normalised as ``replace`` does; NaN gives a status and finite numbers."""
     robot, tasks, _, _ = remembering
-    loaded = load_controller(export_controller(robot, {"hand": tasks["hand"]}, platforms=("cpu",)))
+    loaded = load_exported(export_controller(robot, {"hand": tasks["hand"]}, platforms=("cpu",)))
     R = np.round(np.asarray(tasks["hand"].target[1]), 2) @ np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0, 0, 1]])
     p = np.asarray(tasks["hand"].target[0])
     wanted = osik.solve(robot, robot.q0, {"hand": tasks["hand"].replace(target=(p, R))}).velocity
@@ -191,12 +192,13 @@ def test_targets_are_checked_in_the_program(remembering):
 
 def test_what_does_not_fit_is_told(remembering):
     robot, tasks, _, data = remembering
-    loaded = load_controller(data)
+    loaded = load_exported(data)
     with pytest.raises(KeyError, match=r"hand\.target.*inputs: q, hand\.target\[0\], posture\.weight"):
         loaded(robot.q0, {"hand.target": robot.q0})
     refuses(ValueError, r"q has shape \(6,\), expected \(7,\)", loaded, robot.q0[:6])
     refuses(ValueError, r"hand\.target\[0\] has shape \(2,\)", loaded, robot.q0, {"hand.target[0]": robot.q0[:2]})
-    refuses(ValueError, "no bytes of export_controller", load_controller, b"something else")
+    refuses(ValueError, "no bytes of export_controller", load_exported, b"something else")
+    refuses(ImportError, "has load_exported", getattr, interop, "load_controller")
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
         loaded(np.zeros(7))
     refused: list[dict[str, Any]] = [{"batch": 0}, {"batch": "many"}, {"batch": 2.5}, {"platforms": ("tpu",)}]
@@ -218,11 +220,11 @@ def test_another_release_of_jax_or_another_platform_is_refused(remembering):
                 new.writestr(name, content)
         return out.getvalue()
 
-    load_controller(edited(jax="0.1.0"))  # StableHLO alone runs with other releases
+    load_exported(edited(jax="0.1.0"))  # StableHLO alone runs with other releases
     with pytest.raises(ValueError, match=r"needs the release of JAX that made it, 0\.1\.0"):
-        load_controller(edited(jax="0.1.0", same_jax=True))
-    refuses(ValueError, r"exported for \['cuda'\]", load_controller, edited(platforms=["cuda"]))
-    refuses(ValueError, "this loader reads", load_controller, edited(format="another"))
+        load_exported(edited(jax="0.1.0", same_jax=True))
+    refuses(ValueError, r"exported for \['cuda'\]", load_exported, edited(platforms=["cuda"]))
+    refuses(ValueError, "this loader reads", load_exported, edited(format="another"))
 
 
 @pytest.mark.release
@@ -231,7 +233,7 @@ def test_a_fixed_batch_and_programs_for_cuda():
     robot, tasks = controller()
     for scheme in (osik.WeightedQP(), osik.HierarchicalQP()):
         data = export_controller(robot, tasks, scheme=scheme, batch=40, platforms=("cpu", "cuda"))
-        loaded, given = load_controller(data), inputs(robot, tasks, 40)
+        loaded, given = load_exported(data), inputs(robot, tasks, 40)
         wanted = expected(robot, tasks, given, scheme=scheme)[0]
         q = given.pop("q")
         np.testing.assert_allclose(loaded(q, given)["velocity"], wanted, atol=1e-9)

@@ -279,10 +279,10 @@ def test_the_command_writes_a_map_and_a_picture_and_goes_on(planar, tmp_path, ca
     with monkeypatch.context() as patch:
         patch.setattr(_reachability_map, "inverse_kinematics", stopped)
         assert cli.main(words) == 130
-    assert f"with --resume it goes on where it was ({out}.chunks)" in " ".join(capsys.readouterr().err.split())
-    assert cli.main(words) == 2
-    assert "--resume goes on with it" in capsys.readouterr().err and not out.exists()
-    assert cli.main([*words, "--resume"]) == 0
+    assert f"the same command goes on where it was ({out}.chunks)" in " ".join(capsys.readouterr().err.split())
+    assert cli.main([*words, "--key", "1"]) == 2
+    assert "map.npz.chunks has another job in it" in "".join(capsys.readouterr().err.split("\n")) and not out.exists()
+    assert cli.main(words) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["map.npz", "map.png", "planar.xml"]
     found = reachability.load_map(out)
     assert found.reached.shape[3] == 8 and 50 <= found.share.size <= 60

@@ -94,7 +94,7 @@ def test_limbs_that_a_source_lacks_are_left_out(tmp_path):
     assert figures["tracking"]["segment_angle_deg_mean"] < 1.0 and figures["feet"]["slip_mm_max"] < 0.1
     elbows = [whole.robot.joint_qpos_index(f"{side}_elbow") for side in ("left", "right")]
     assert np.abs(led.q[:, elbows] - np.asarray(whole.robot.q0)[elbows]).max() < 0.01
-    both = whole.retarget_all([dance, source], out=tmp_path / "batch", progress=False)
+    both = whole.retarget_all([dance, source], progress=False)
     np.testing.assert_allclose(both[1].q, led.q, atol=1e-5)
     assert len(both[0].profile.followed) == len(LIMBS)
     (tmp_path / "clips").mkdir()

@@ -11,13 +11,13 @@ import osik_jax as osik
 from osik_jax.cli import CommandError, read_robot
 from osik_jax.cli._retarget import _robot_to_retarget
 from osik_jax.robot.loading import NAMES, example_urdf
-from osik_jax.viewer.live._source import RobotSource, load_source, source_look
+from osik_jax.viewer.live._source import RobotSource, source_look
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_way_loads_the_same_robot(name: str):
     robot = osik.load_robot(name)
-    for other in (read_robot(name), load_source(RobotSource(name))):
+    for other in (read_robot(name), RobotSource(name).load()):
         assert other.tree == robot.tree
         np.testing.assert_array_equal(other.q0, robot.q0)
     if name in ("nao", "g1", "talos"):

@@ -217,20 +217,56 @@ def test_other_files_and_classes_are_refused(tmp_path, arm):
     refuses(ValueError, "no controller that save_controller wrote", osik.load_controller, path)
     osik.save_controller(path, arm, {"p": osik.PostureTask(arm)}, source="arm7")
     content = json.loads(path.read_text())
-    content["scheme"]["class"] = "os.system"
-    path.write_text(edited(content))
-    refuses(ValueError, "'os.system' is no class of this version", osik.load_controller, path)
+    for kind in ("os.system", "load_robot", "Robot", None):
+        content["scheme"]["kind"] = kind
+        path.write_text(edited(content))
+        refuses(ValueError, "scheme is .*, which is no task, limit, scheme or gain of this", osik.load_controller, path)
 
 
-def test_a_file_has_public_names_of_classes_and_older_names_are_read(saved, arm, tmp_path):
-    content = json.loads(saved)
-    written = [one["class"] for one in (content["scheme"], *(task for _, task in content["tasks"]))]
-    assert written == ["osik_jax.HierarchicalQP", "osik_jax.FrameTask", "osik_jax.PostureTask"]
-    older = edited(content).replace("osik_jax.FrameTask", "osik_jax.tasks._frame.FrameTask")
-    older = older.replace("osik_jax.HierarchicalQP", "osik_jax.schemes._hierarchical.HierarchicalQP")
-    (path := tmp_path / "c.json").write_text(older)
+def version_2(module: str, cls: str, **fields: Any) -> dict[str, Any]:
+    """Return an object as the format before this one has it: with all its fields."""
+    common = {"made_for": "j", "weight": number(3.0), "gain": number(5.0), "priority": 2, "hard": False}
+    return {"class": f"osik_jax.{module}.{cls}", "fields": {**common, **fields}}
+
+
+def number(value: Any) -> dict[str, Any]:
+    return {"array": value, "shape": np.shape(value), "dtype": "float64", "of": "jax"}
+
+
+def test_a_file_of_the_older_format_is_read_or_refused_with_what_to_do(saved, arm, tmp_path):
+    joints = {"names": "joint_names", "of": ["joint2", "joint4"]}
+    fields = dict(target=number([0.3]), target_velocity=number([0.1]), lower=None, upper=None)
+    gear = version_2("tasks._moved", "JointCouplingTask", joints=joints, ratios=number([1.0, -2.0]), **fields)
+    capped = {"class": "osik_jax.limits._velocity.VelocityLimit", "fields": {"velocity": number([0.5] * 7)}}
+    scheme = {"class": "osik_jax.WeightedQP", "fields": {"damping": number(1e-5)}}  # the rest at its default
+    content = json.loads(saved) | {"format": "osik-jax controller 2", "scheme": scheme, "limits": [capped]}
+    content["tasks"] = [["gear", gear]]
+    (path := tmp_path / "c.json").write_text(edited(content))
     found = osik.load_controller(path)
-    assert type(found.tasks["hand"]) is osik.FrameTask and type(found.scheme) is osik.HierarchicalQP
+    options: dict[str, Any] = dict(weight=3.0, gain=5.0, priority=2)
+    ratios = {"joint2": 1.0, "joint4": -2.0}
+    assert same(found.tasks["gear"], osik.JointCouplingTask(arm, ratios, target=0.3, target_velocity=0.1, **options))
+    assert same(found.limits[0], osik.VelocityLimit(arm, velocity={"*": 0.5})) and same(
+        found.scheme, osik.WeightedQP(1e-5)
+    )
+    content["tasks"] = [["index", version_2("tasks", "ManipulabilityTask", dofs={"sequence": "tuple", "items": [0]})]]
+    path.write_text(edited(content))
+    refuses(
+        ValueError, "ManipulabilityTask .* older version with dofs, .* make the controller", osik.load_controller, path
+    )
+
+
+def test_a_file_has_public_names_and_what_is_missing_in_it_is_the_default(saved, arm, tmp_path):
+    content = json.loads(saved)
+    kinds = [one["kind"] for one in (content["scheme"], *content["tasks"].values())]
+    assert kinds == ["HierarchicalQP", "FrameTask", "PostureTask"]
+    content |= {"scheme": {"kind": "HierarchicalQP"}, "limits": [{"kind": "ConfigurationLimit", "gain": 0.5}]}
+    content["tasks"] = {"hand": {"kind": "FrameTask", "frame": "hand", "weight": 7.0}, "rest": {"kind": "PostureTask"}}
+    (path := tmp_path / "c.json").write_text(edited(content))
+    found = osik.load_controller(path)
+    wanted = {"hand": osik.FrameTask(arm, "hand", weight=7.0), "rest": osik.PostureTask(arm)}
+    assert same(found.tasks, wanted) and same(found.scheme, osik.HierarchicalQP())
+    assert same(found.limits, (osik.ConfigurationLimit(arm, gain=0.5),))
 
 
 def edited(content: dict[str, Any]) -> str:
@@ -262,16 +298,18 @@ EDITS = {
     "period": (["dt"], 0.0, "dt is 0.0; it has to be positive and finite"),
     "no period": (["dt"], float("nan"), "dt is nan; it has to be positive"),
     "no tasks": (["tasks"], [], "there is no task"),
-    "frame": (["tasks", 0, 1, "fields", "frame"], "paw", "no frame 'paw'"),
-    "joint": (["tasks", 1, 1, "fields", "joints", "of", 2], "knee", "the robot has no 'knee' in its joint_names"),
-    "weight": (["tasks", 0, 1, "fields", "weight", "array"], -1.0, "weight is -1.0; it has to be .* not negative"),
-    "shape": (["tasks", 0, 1, "fields", "weight", "shape"], [3], "cannot reshape"),
-    "task": (["tasks", 0, 1], None, r"tasks\['hand'\] is a NoneType, not a Task"),
+    "frame": (["tasks", "hand", "frame"], "paw", "no frame 'paw'"),
+    "joint": (["tasks", "rest", "joints", 2], "knee", "no joint 'knee'"),
+    "weight": (["tasks", "hand", "weight"], -1.0, "weight is -1.0; it has to be .* not negative"),
+    "shape": (["tasks", "hand", "weight"], [1.0, 2.0], "weight has shape"),
+    "text": (["tasks", "hand", "gain"], "much", r"gain|much"),
+    "argument": (["tasks", "hand", "wait"], 1.0, r"tasks\['hand'\]: .*'wait'"),
+    "no frame": (["tasks", "hand", "frame"], ..., r"tasks\['hand'\]: .*'frame'"),
+    "task": (["tasks", "hand"], None, r"tasks\['hand'\] is None, which is no task"),
+    "scheme": (["tasks", "hand"], {"kind": "WeightedQP"}, r"tasks\['hand'\] is a WeightedQP, not a Task"),
     "robot": (["robot", "name"], "arm77", "no robot 'arm77'|arm77"),
     "no scheme": (["scheme"], ..., "its entry 'scheme' is missing"),
     "no robot": (["robot"], ..., "its entry 'robot' is missing"),
-    "no fields": (["scheme", "fields"], ..., "its entry 'fields' is missing"),
-    "no shape": (["tasks", 0, 1, "fields", "weight", "shape"], ..., "its entry 'shape' is missing"),
 }
 
 
@@ -292,7 +330,7 @@ def test_an_edited_file_that_solve_does_not_take_is_refused(saved, tmp_path, edi
 
 def test_an_edited_file_is_loaded(saved, tmp_path):
     content = json.loads(saved)
-    content["tasks"][0][1]["fields"]["weight"]["array"] = 3.0
+    content["tasks"]["hand"]["weight"] = 3.0
     path = tmp_path / "c.json"
     path.write_text(edited(content))
     assert osik.load_controller(path).tasks["hand"].weight == 3.0

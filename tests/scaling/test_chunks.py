@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import json
 import os
@@ -58,7 +59,8 @@ def done(tmp_path):
 
 
 def leftovers(folder: Path) -> list[str]:
-    return [path.name for path in folder.iterdir() if path.name.startswith(".")]
+    """Return hidden files but for the lock, which stays: to remove it would let two jobs in."""
+    return [path.name for path in folder.iterdir() if path.name.startswith(".") and path.name != ".lock"]
 
 
 def flipped(data: bytes, place: int) -> bytes:
@@ -208,7 +210,7 @@ def test_two_jobs_where_the_file_system_has_no_locks(tmp_path, monkeypatch):
     import fcntl
 
     def no_locks(*_: Any) -> None:
-        raise OSError("no locks available")
+        raise OSError(errno.ENOLCK, "no locks available")
 
     real, second = np.savez, []
 
@@ -226,8 +228,9 @@ def test_two_jobs_where_the_file_system_has_no_locks(tmp_path, monkeypatch):
 
 
 def test_what_a_killed_job_left_stops_nobody(done):
-    """A lock file that nobody holds, and half a chunk; the lock names a process that runs, this one."""
-    (done / ".lock").write_text(json.dumps({"pid": os.getpid(), "host": "here"}))
+    """A lock file that nobody holds, and half a chunk; its owner is a process that runs, this one."""
+    (done / ".lock").touch()
+    (done / ".lock.owner").write_text(f"process {os.getpid()} on here")
     (done / ".00000001.npz.0123.partial").write_bytes(b"half")
     (done / "00000001.npz").unlink()
     assert_right(run(done, program, shared=(3.0,)))
@@ -306,7 +309,7 @@ def test_a_disk_that_fills_up(tmp_path):
         with pytest.raises(OSError, match=r"00000002\.npz cannot be written: File too large; chunks .* stay") as caught:
             run(tmp_path, function, batch, count=20, shared=(3.0,))
     assert caught.value.filename == str(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["00000000.npz", "00000001.npz", "manifest.json"]
+    assert sorted(path.name for path in tmp_path.glob("[!.]*")) == ["00000000.npz", "00000001.npz", "manifest.json"]
     function.ran.clear()
     assert_right(run(tmp_path, function, batch, count=20, shared=(3.0,)))
     assert function.ran == [8, 12, 16]
@@ -358,7 +361,7 @@ def test_a_job_of_numpy_that_is_done(tmp_path):
 )
 def test_results_that_would_not_come_back(tmp_path, function, message):
     refuses(ValueError, message, run, tmp_path, function)
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+    assert [path.name for path in tmp_path.glob("[!.]*")] == ["manifest.json"]
 
 
 def test_the_bar_says_how_many_of_what_are_done(tmp_path, capfd):

@@ -134,14 +134,14 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
         """Of somebody's own."""
 
     made: Any = Mine
-    with pytest.raises(ValueError, match="Mine is no class of osik_jax"):
+    with pytest.raises(ValueError, match=r"tasks\['mine'\] is a Mine, which is no class of osik_jax"):
         session(tasks={"mine": made(ROBOT)}).to_json()
     with pytest.raises(ValueError, match="where the robot comes from is not known"):
         session(source=None).save(tmp_path / "session.json")
     hull = osik.CollisionShape.convex(np.random.default_rng(0).normal(size=(9, 3)), frame="l_wrist")
     kept = osik.CollisionAvoidanceLimit(ROBOT, shapes={"stone": hull}, pairs=[("stone", "torso:0")])
-    with pytest.raises(ValueError, match="cannot hold the shape 'stone'"):
-        session(limits=(kept,)).to_json()
+    with pytest.raises(ValueError, match="no program can make the shape 'stone'"):
+        session(limits=(kept,)).to_python()
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
         (dict(format="something else"), "no session of osik view"),
         (dict(q=[0.0, 1.0]), "q has shape"),
         (dict(robot=dict(robot="nowhere.urdf", floating_base=None)), "no such file: nowhere.urdf"),
-        (dict(scheme=dict(kind="NoScheme")), "'NoScheme' is no class of osik_jax"),
+        (dict(scheme=dict(kind="NoScheme")), "scheme is 'NoScheme', which is no .* scheme"),
         (dict(tasks=dict(hand=dict(kind="FrameTask", frame="l_griper"))), "l_gripper"),
     ],
 )

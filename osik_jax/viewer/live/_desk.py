@@ -15,11 +15,11 @@ from jaxtyping import Float
 from ..._errors import OsikValueError, unknown_name
 from ...collision import CollisionShape
 from ...limits import CollisionAvoidanceLimit, VelocityLimit
+from ...saving._parts import decode, encode
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
 from .._parts import RobotParts
 from ._covers import link_covers
-from ._description import describe, rebuild
 from ._hold import targets_here
 from ._loop import ControlLoop
 from ._obstacles import PARKED, Obstacle, free_slot, keeps_off_world, moved, obstacles_in, own_limit, world_limit
@@ -98,7 +98,7 @@ class Desk:
         with self._lock:
             task, robot = self.task(name), self._session.robot
             if task.priority != priority:
-                self._put(name, rebuild({**describe(task, robot), "priority": priority}, robot))
+                self._put(name, decode({**encode(task, robot, name), "priority": priority}, robot, name))
 
     def add_frame(self, frame: str) -> str:
         """Add a task for a frame with its target at the current pose; return the task's name."""

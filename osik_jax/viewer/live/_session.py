@@ -17,10 +17,11 @@ from ..._errors import OsikValueError
 from ..._whole_file import write_text
 from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
+from ...saving._parts import decode_parts, encode_parts
 from ...schemes import Scheme
 from ...tasks import Task
-from ._description import describe, python, rebuild
-from ._source import RobotSource, load_source
+from ._python import python
+from ._source import RobotSource
 from ._step import Controller
 
 _FORMAT = "osik-jax session 1"
@@ -105,12 +106,9 @@ class Session:
             "robot": dataclasses.asdict(self.source),
             "dt": self.dt,
             "q": np.asarray(self.q).tolist(),
-            "scheme": describe(self.scheme, self.robot),
-            "limits": [describe(limit, self.robot) for limit in self.limits],
             "limits_off": sorted(self.limits_off),
-            "tasks": {name: describe(task, self.robot) for name, task in self.tasks.items()},
             "off": sorted(self.off),
-        }
+        } | encode_parts(self.robot, self.tasks, self.scheme, self.limits)
         return json.dumps(content, indent=1) + "\n"
 
     def to_python(self) -> str:
@@ -121,8 +119,8 @@ class Session:
         """
         if self.source is None:
             raise OsikValueError("where the robot comes from is not known, so no program can load it: give source=")
-        tasks = {name: python(describe(task, self.robot)) for name, task in self.active_tasks.items()}
-        limits = [python(describe(limit, self.robot)) for limit in self.active_limits]
+        tasks = {name: python(task, self.robot, name) for name, task in self.active_tasks.items()}
+        limits = [python(limit, self.robot) for limit in self.active_limits]
         lines = [
             "import jax",
             "import numpy as np",
@@ -136,7 +134,7 @@ class Session:
             *(f"    {name!r}: {text}," for name, text in tasks.items()),
             "}",
             f"limits = ({''.join(f'{text}, ' for text in limits).rstrip(' ')})",
-            f"scheme = {python(describe(self.scheme, self.robot))}",
+            f"scheme = {python(self.scheme, self.robot)}",
             f"solution = osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt={self.dt!r})",
         ]
         return "\n".join(lines) + "\n"
@@ -176,20 +174,11 @@ def session_from_json(text: str, where: str = "this") -> Session:
 
 def _session(content: Mapping[str, Any]) -> Session:
     source = RobotSource(**content["robot"])
-    robot = load_source(source)
+    robot = source.load()
     q = np.asarray(content["q"], float)
     robot.check_configuration(jnp.asarray(q))
-    return Session(
-        robot=robot,
-        tasks={name: rebuild(one, robot) for name, one in content["tasks"].items()},
-        scheme=rebuild(content["scheme"], robot),
-        limits=tuple(rebuild(one, robot) for one in content["limits"]),
-        dt=float(content["dt"]),
-        q=q,
-        off=frozenset(content["off"]),
-        limits_off=frozenset(content["limits_off"]),
-        source=source,
-    )
+    off = {name: frozenset(content.get(name, ())) for name in ("off", "limits_off")}
+    return Session(robot, *decode_parts(content, robot), float(content["dt"]), q, **off, source=source)
 
 
 def _loose(limit: Limit) -> Limit | None:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from contextlib import suppress
-from pathlib import Path
 
-from ...robot import Robot, load_robot
-from ...robot.loading import ELSEWHERE, EXAMPLES, NAMES, ROBOTS, example_urdf, is_mjcf, urdf_of_description
+from ...robot import Robot
+from ...robot._load_robot import is_file, read_robot
+from ...robot.loading import ELSEWHERE, EXAMPLES, ROBOTS, example_urdf, is_mjcf, urdf_of_description
 from .._look import Look, read_look
-
-_SUFFIX = "_description"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,12 +26,20 @@ class RobotSource:
     @property
     def is_file(self) -> bool:
         """Return whether the source is a file rather than a name."""
-        return Path(self.robot).is_file() or (self.robot not in NAMES and not self.robot.endswith(_SUFFIX))
+        return is_file(self.robot)
 
     @property
     def is_mjcf(self) -> bool:
         """Return whether the source is an MJCF file."""
         return self.is_file and is_mjcf(self.robot)
+
+    def load(self) -> Robot:
+        """Return the robot.
+
+        Raises:
+            FileNotFoundError, ImportError, KeyError, ValueError: as in ``read_robot``.
+        """
+        return read_robot(self.robot, floating_base=self.floating_base)
 
     def python(self) -> str:
         """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
@@ -41,21 +47,6 @@ class RobotSource:
         if not self.is_file:
             return f"osik.load_robot({self.robot!r}{base})"
         return f"osik.Robot.{'from_mjcf' if self.is_mjcf else 'from_urdf'}({self.robot!r}{base})"
-
-
-def load_source(source: RobotSource) -> Robot:
-    """Return the robot of a source.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ImportError, KeyError, ValueError: as in ``load_robot``, ``Robot.from_urdf`` and ``Robot.from_mjcf``.
-    """
-    if not source.is_file:
-        return load_robot(source.robot, floating_base=source.floating_base)
-    if not Path(source.robot).is_file():
-        raise FileNotFoundError(f"no such file: {source.robot}")
-    load = Robot.from_mjcf if source.is_mjcf else Robot.from_urdf
-    return load(source.robot, floating_base=source.floating_base)
 
 
 def source_look(source: RobotSource) -> Look | None:
