@@ -2,34 +2,37 @@
 
     python -m benchmarks.contact_sheet [--robots ur5,panda] [--out sheet] [--write]
 
-runs the command for each robot and keeps its folder in ``--out``. ``--write`` writes
+runs the demonstration of each robot and keeps its folder in ``--out``. ``--write`` writes
 docs/data/demonstrations.csv, and the sheet into docs/images.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from PIL import Image
 
-import osik_jax as osik
-from osik_jax import cli, viewer
+from osik_jax import viewer
+from osik_jax.cli import Demo
+from osik_jax.cli._demo import demo_motion
+from osik_jax.demo._demo import run_demo
+from osik_jax.demo._figures import Figure, figures
+from osik_jax.demo._motion import Motion
 from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
 from .data_file import DATA, DOCS, write_csv
-from .robots_table import ROBOTS, file_of, load
+from .robots_table import ROBOTS, file_of
 
 SHEET, TABLE = DOCS / "images" / "robots.png", DATA / "demonstrations.csv"
 HEAD = (
-    "robot", "base", "dofs", "scheme", "what moves", "off its path [mm]", "once there [mm]", "feet drift [mm]",
-    "limits broken", "steps solved", "CPU time [s]",
+    "robot", "base", "dofs", "scheme", "what moves", "off its path [mm]", "feet drift [mm]", "limits broken",
+    "steps solved", "CPU time [s]",
 )  # fmt: skip
 NAMES = (
     "ur5", "panda", "so101", "baxter", "tiago", "talos", "icub", "g1", "romeo", "anymal_b", "solo12", "go1",
@@ -40,62 +43,47 @@ TILE, COLUMNS = (400, 330), 4
 
 
 class Row(NamedTuple):
-    """A robot's line: ``goal`` and ``figures`` are those of its report."""
+    """A robot's line: its motion, the configurations of it, and their figures by label."""
 
     name: str
-    robot: osik.Robot
-    goal: str
-    figures: dict[str, Any]
+    motion: Motion
+    path: np.ndarray
+    figures: dict[str, Figure]
+    steps: int
     seconds: float
 
     def cells(self) -> tuple[str, ...]:
         """Return the texts of the columns in ``HEAD``."""
-        figures, status = self.figures, self.figures["status"]
-        drift = figures.get("feet_drift_mm")
+        robot, goal, drift = self.motion.robot, next(iter(self.motion.goals)), "standing feet, drift [mm]"
+        rooms = [figure for label, figure in self.figures.items() if label.startswith("room to")]
         return (
             self.name,
-            "floating" if self.robot.floating_base else "fixed",
-            str(self.robot.nv),
+            "floating" if robot.floating_base else "fixed",
+            str(robot.nv),
             SCHEME,
-            self.goal,
-            f"{figures[f'{self.goal}_mm']:.2g}",
-            f"{figures[f'{self.goal}_once_there_mm']:.2g}",
-            "-" if drift is None else f"{drift:.1g}",
-            str(figures["position_limits_broken"] + figures["velocity_limits_broken"]),
-            f"{status['SOLVED']}/{sum(status.values())}",
+            goal,
+            f"{self.figures[f'{goal}, from path [mm]'].worst:.2g}",
+            f"{self.figures[drift].worst:.1g}" if drift in self.figures else "-",
+            str(sum(figure.missed for figure in rooms)),
+            f"{self.steps - int(self.figures['steps not solved'].worst or 0)}/{self.steps}",
             f"{self.seconds:.0f}",
         )
 
 
 def demonstrate(name: str, folder: Path) -> Row:
-    """Runs the command.
-
-    Raises:
-        RuntimeError: it failed.
-    """
-    out, started = folder / name, time.process_time()
-    words = ["demo", "--robot", str(file_of(name)), "--schemes", SCHEME, "--duration", f"{DURATION:g}"]
-    code = cli.main([*words, "--picture", "--no-animation", "--out", str(out)])
-    if code:
-        raise RuntimeError(f"osik demo ended with {code} for {name}")
-    seconds = time.process_time() - started
-    figures = json.loads((out / "report.json").read_text(encoding="utf-8"))["schemes"][SCHEME]
-    robot = load(name)
-    if robot.nq != _path(name, folder).shape[1]:  # the command bolts down what floats but has no feet
-        robot = osik.Robot.from_urdf(file_of(name), floating_base=False)
-    return Row(name, robot, "waist" if "waist_mm" in figures else "hand", figures, seconds)
-
-
-def _path(name: str, folder: Path) -> np.ndarray:
-    return np.load(folder / name / "motion.npz")[f"q_{SCHEME}"]
+    """Runs the demonstration of a robot."""
+    started = time.process_time()
+    motion = demo_motion(Demo(robot=str(file_of(name)), duration=DURATION))
+    _, (run,) = run_demo(motion, folder / name, schemes=(SCHEME,), picture=True, animation=False)
+    found = {figure.label: figure for figure in figures(motion, run)}
+    return Row(name, motion, run.q, found, len(run.solution.status), time.process_time() - started)
 
 
 def tile(row: Row, folder: Path) -> Image.Image:
     """The robot in the middle of its motion."""
-    path = _path(row.name, folder)
-    look = file_of(row.name)
+    middle, look = row.path[len(row.path) // 2], file_of(row.name)
     picture = viewer.hero_picture(
-        folder / f"{row.name}.png", row.robot, [path[len(path) // 2]], look=look, labels=(row.name,), size=TILE
+        folder / f"{row.name}.png", row.motion.robot, [middle], look=look, labels=(row.name,), size=TILE
     )
     with Image.open(picture) as image:
         return image.convert("RGB")

@@ -71,8 +71,8 @@ plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False, "axes.tit
 motions = {name: scene(DURATION) for name, scene in SCENES.items()}
 runs = {name: run_physics(motion, SCHEME, dt=DT) for name, motion in motions.items()}
 for name, run in runs.items():
-    print(f"{name}: {len(run.plan.q) - 1} steps, fell: {run.physics.fell is not None}")
-    assert run.physics.fell is None
+    print(f"{name}: {len(run.plan.q) - 1} steps, fell: {run.recording.fell}")
+    assert not run.recording.fell
 
 # %% [markdown]
 # ### Snapshots of the motion (the paper's Fig. 1)
@@ -99,7 +99,7 @@ name, run = list(runs.items())[-1]
 motion = motions[name]
 figure, rows = plt.subplots(2, 1, figsize=(9, 6.8), layout="compressed")
 for axes, title, part in ((rows[0], "kinematic", run.plan), (rows[1], "dynamic (MuJoCo, sensed)", run)):
-    picture = snapshots(motion.robot, part.q, part.measurement.support, INSTANTS)
+    picture = snapshots(motion.robot, part.q, part.seen.support, INSTANTS)
     axes.imshow(picture)
     axes.set_axis_off()
     axes.set_title(f"{title}: {motion.title}")
@@ -108,28 +108,28 @@ for axes, title, part in ((rows[0], "kinematic", run.plan), (rows[1], "dynamic (
 # ### Tasks over time (for the paper's Fig. 4)
 #
 # Again in place of the figure and not a copy: the waist against its reference, how far waist and feet are off, and the
-# centre of mass in the polygon. All of it is computed again by MuJoCo's C code from the configurations alone.
+# centre of mass in the polygon, from the configurations alone.
 
 
 # %%
 def draw_tasks(column, part, title):
     """One column: waist and reference, errors, margin of the centre of mass, and the view from above."""
-    m = part.measurement
+    seen = part.seen
     waist, errors, balance, above = column
-    waist.plot(m.time, 1e3 * m.wanted["waist"][:, 1], "--", color="k", lw=1.2, label="reference", zorder=3)
-    waist.plot(m.time, 1e3 * m.displacement["waist"][:, 1], color=BLUE, lw=2.5, label="waist")
+    waist.plot(seen.time, 1e3 * seen.wanted["waist"][:, 1], "--", color="k", lw=1.2, label="reference", zorder=3)
+    waist.plot(seen.time, 1e3 * seen.moved["waist"][:, 1], color=BLUE, lw=2.5, label="waist")
     waist.set(title=f"{title}: the waist follows its path", ylabel="to the left [mm]")
-    feet = np.nanmax([track.position for track in m.stances.values()], 0)
-    errors.semilogy(m.time, 1e3 * np.maximum(m.goals["waist"].position, 1e-10), color=BLUE, label="waist off its path")
-    errors.semilogy(m.time, 1e3 * np.maximum(feet, 1e-10), color=ORANGE, label="feet off their place")
+    off = {"waist off its path": (seen.off_path("waist"), BLUE), "feet off their place": (seen.drift, ORANGE)}
+    for label, (distance, color) in off.items():
+        errors.semilogy(seen.time, 1e3 * np.maximum(distance, 1e-10), color=color, label=label)
     errors.set(title="what waist and feet are off by", ylabel="[mm]")
-    balance.plot(m.time, 1e3 * m.com_margin, color=BLUE, label="distance to the nearest edge")
+    balance.plot(seen.time, 1e3 * seen.com_inside, color=BLUE, label="distance to the nearest edge")
     balance.axhline(0.0, color=RED, ls="--", label="edge of the polygon")
     balance.set(title="the centre of mass stays over the feet", ylabel="[mm]", xlabel="time [s]")
-    polygon = 1e3 * m.support[0][[*range(len(m.support[0])), 0]]
+    polygon = 1e3 * seen.support[0][[*range(len(seen.support[0])), 0]]
     above.fill(polygon[:, 1], polygon[:, 0], color="#009e73", alpha=0.15)
     above.plot(polygon[:, 1], polygon[:, 0], color="#009e73", label="support polygon")
-    above.plot(1e3 * m.com[:, 1], 1e3 * m.com[:, 0], color=BLUE, lw=2.5, label="centre of mass")
+    above.plot(1e3 * seen.com[:, 1], 1e3 * seen.com[:, 0], color=BLUE, lw=2.5, label="centre of mass")
     above.set(title="from above", xlabel="to the left [mm]", ylabel="forward [mm]", aspect="equal")
     above.invert_xaxis()
 
@@ -144,9 +144,8 @@ for axes in grid[:, 1]:
 # %%
 def worst(part):
     """Greatest errors and least margin of a motion [mm]."""
-    m = part.measurement
-    feet = max(float(np.nanmax(track.position)) for track in m.stances.values())
-    return 1e3 * float(m.goals["waist"].position.max()), 1e3 * feet, 1e3 * float(m.com_margin.min())
+    seen = part.seen
+    return tuple(1e3 * float(x) for x in (seen.off_path("waist").max(), np.nanmax(seen.drift), seen.com_inside.min()))
 
 
 print(f"{'worst, in mm':24}{'waist off path':>16}{'feet off place':>16}{'mass inside by':>16}")
@@ -158,12 +157,9 @@ for name, run in runs.items():
     waist, feet, margin = worst(run.plan)
     assert waist < 1.0 and feet < 0.1 and margin > 0.0  # on the screen
     assert worst(run)[1] < 5.0 and worst(run)[2] > 0.0  # on the floor: feet within 5 mm, balanced
-    height, turn = 1e3 * run.physics.height_error.max(), np.degrees(run.physics.tilt_error.max())
-    slip = 1e3 * max(float(np.nanmax(feet)) for feet in run.physics.slip.values())
-    beyond = np.degrees(run.physics.beyond_limits.max())
-    print(f"{name}, dynamic, at most: base {height:.2f} mm and {turn:.2f} deg off the kinematic motion,")
-    print(f"  feet {slip:.2f} mm off over the floor, joints {beyond:.2f} deg beyond their limits")
-    assert height < 10.0 and turn < 3.0 and slip < 5.0 and beyond < 1.0
+    height, turn = 1e3 * run.height_error.max(), np.degrees(run.tilt_error.max())
+    print(f"{name}, dynamic, at most: base {height:.2f} mm and {turn:.2f} deg off the kinematic motion")
+    assert height < 10.0 and turn < 3.0
 
 # %% [markdown]
 # On the screen the errors are those of a step of Euler's rule. On the floor they are what servos, gravity and a soft

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Moves a robot with each scheme, and writes a film, a figure, the motion and a report to a folder.
+    """Moves a robot with each scheme, and writes a film, a figure and the motion to a folder.
 
     NAO sways over both feet (double-support), or lifts one (single-support). With --robot, the base or the tip of your
     own robot goes 5 cm to its left and back.
@@ -61,7 +61,7 @@ class Demo:
         from ..demo._folder import writable_folder
 
         console = Console()
-        motion, dt = _motion(self), 1.0 / self.frequency
+        motion, dt = demo_motion(self), 1.0 / self.frequency
         with told():
             out = writable_folder(self.out, motion, schemes=len(self.schemes), dt=dt)
         for note in motion.notes:
@@ -70,13 +70,13 @@ class Demo:
         console.print(f"{escape(motion.title)}: this will take about {spoken(estimate_seconds(motion, **settings))}")
         settings |= dict(picture=self.picture, renderer=self.renderer)
         with writing(out), progress(console) as announce:
-            _, shown, _ = run_demo(motion, out, announce=announce, **settings)
+            shown, _ = run_demo(motion, out, announce=announce, **settings)
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)
         return 0
 
 
-def _motion(command: Demo) -> Motion:
+def demo_motion(command: Demo) -> Motion:
     """Return the motion that the options ask for."""
     from ..demo._file import file_motion
     from ..demo._nao import double_support, single_support

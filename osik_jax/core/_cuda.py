@@ -99,11 +99,6 @@ def text_of(header: str) -> str:
     return rolled(inlined(header))
 
 
-def text_of_parts(folder: str, parts: Sequence[str]) -> str:
-    """Return the CUDA files of a kernel whose text is in several."""
-    return "\n".join((_build.FOLDER / folder / f"{part}.cu").read_text() for part in parts)
-
-
 def rolled(text: str) -> str:
     """Return CUDA text with loop unrolling disabled, except for loops marked for unrolling."""
     return _LOOP.sub(r"#pragma unroll 1\n\g<0>", text)

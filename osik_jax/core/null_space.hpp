@@ -30,7 +30,7 @@ template <class Team> struct NullSpace {
   using Int = typename Team::Int;
   using Sizes = NullSpaceSizes;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 17, INTEGERS = Team::SPARES_SPACE ? 3 : 10;  // the last seven: of saturation
+  static constexpr int VECTORS = 17, INTEGERS = 3;
   Team t;
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
@@ -75,8 +75,8 @@ template <class Team> struct NullSpace {
     const int n = Team::variables(s.n), m = Team::level_rows(s.m);
     return greater(m, n) * SizeAt<2>::of(s) + smaller(n, m) * SizeAt<5>::of(s);
   }
-  static constexpr OSIK_HOST int bytes(const Sizes& s) {
-    return (int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * INTEGERS * SizeAt<7>::of(s) + 15) / 16 * 16;
+  static constexpr OSIK_HOST int bytes(const Sizes& s, int integers = INTEGERS) {
+    return (int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * integers * SizeAt<7>::of(s) + 15) / 16 * 16;
   }
   template <int K, int COLUMN = 0> struct MatrixAt {
     static constexpr OSIK_HOST int of(const Sizes& s) {

@@ -62,7 +62,7 @@ void saturate(const xla::Call& call) {
     const SaturationProblem p{numbers(0) + l * m * n, numbers(1) + l * m, numbers(2) + l * m, numbers(4) + l,
                               numbers(5) + l, numbers(6) + l, numbers(7) + l * n, numbers(8) + l * n,
                               numbers(9) + b * n, numbers(10) + b * n, call.in<int>(3) + l * m, numbers(11)[b],
-                              call.in<int>(12)[0], L, m};
+                              call.in<int>(12)[0], L, m, n, 1};
     const SaturationAnswer a{call.out<double>(0) + b * n, call.out<double>(1) + b * n * n, call.out<double>(2) + l,
                              call.out<int>(3) + l, call.out<int>(4) + l * n, call.out<int>(5) + l * n,
                              call.out<int>(6) + l, call.out<int>(7) + b * n, call.out<int>(8) + b * 2};
@@ -74,7 +74,8 @@ void saturate(const xla::Call& call) {
 extern "C" {
 // Bytes of shared memory that a warp needs for one problem, a multiple of 16, and numbers beside it; m: rows of the longest
 // level.
-int osik_null_space_bytes(int n, int m) { return NullSpace<WarpSizes<>>::bytes({n, m}); }
+int osik_projection_bytes(int n, int m) { return NullSpace<WarpSizes<>>::bytes({n, m}); }
+int osik_saturation_bytes(int n, int m) { return Saturation<WarpSizes<>>::bytes({n, m}); }
 int osik_null_space_outside(int n, int m) { return NullSpace<WarpSizes<>>::numbers_outside({n, m}); }
 
 void* osik_projection(xla::CallFrame* frame) { return xla::handle<project>(frame); }

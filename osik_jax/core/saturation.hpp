@@ -37,6 +37,7 @@ struct SaturationProblem {
   double rank_tol;
   int max_changes;  // limit on the changes of the active set, for each level
   int L, m;         // levels, rows of each
+  int row, column;  // entry i of row a of level k is at matrix[k m n + a row + i column]
 };
 
 // The results of one problem. Sides are -1 (lower), 1 (upper) or 2 (pinned), 0 for none.
@@ -48,7 +49,6 @@ struct SaturationAnswer {
 template <class Team> struct Saturation : NullSpace<Team> {
   using Base = NullSpace<Team>;
   using typename Base::Algebra, typename Base::Int;
-  static_assert(!Team::SPARES_SPACE, "levels are given row by row; on a GPU: saturation_cuda");
   using Base::t, Base::n, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::free;
   using Base::Z, Base::B, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
       Base::IN_COST, Base::MISSING;
@@ -96,7 +96,9 @@ template <class Team> struct Saturation : NullSpace<Team> {
   double sign, push, stop_rate;       // of the entering joint, its multiplier so far; of the scale
   bool dropping, crossing, is_known;
 
-  OSIK_FN Saturation(const NullSpaceSizes& s, char* space) : Base(s, space), BEFORE(this->V) {
+  static constexpr OSIK_HOST int bytes(const NullSpaceSizes& s) { return Base::bytes(s, 10); }
+  OSIK_FN Saturation(const NullSpaceSizes& s, char* space, double* outside = nullptr)
+      : Base(s, space, outside), BEFORE(this->V) {
     this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE,
                 PASSED, BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
   }
@@ -616,7 +618,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_METHOD bool solve_level(const SaturationProblem& p, const SaturationAnswer& to, int k, int& all_changes) {
     const int at = k * p.m;
     this->begin_level({p.matrix + at * n, p.lower + at, p.upper + at, p.bends + k * n, p.equality + at, p.constant[k],
-                       p.unmet[k], p.demand[k], p.m, n, 1});
+                       p.unmet[k], p.demand[k], p.m, p.row, p.column});
     target = p.targets + k * n;
     this->compute_damping(true);
     this->find_motion();

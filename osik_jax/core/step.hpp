@@ -291,7 +291,7 @@ class Step : StepRows {
     int *sides = found_labels.data(), report[2];
     const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
                               targets.data(), low_speed.data(), high_speed.data(), equality.data(),
-                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m};
+                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m, n, 1};
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];
@@ -348,7 +348,7 @@ class Step : StepRows {
     }
     targets.resize(L * n), separate.resize(3 * L + n), scales.resize(L);
     const NullSpaceSizes sizes{n, m};
-    solver_space.resize(NullSpace<Team>::bytes(sizes) / sizeof(double));
+    solver_space.resize(Saturation<Team>::bytes(sizes) / sizeof(double));
     char* space = reinterpret_cast<char*>(solver_space.data());
     if (s.scheme == CLASSICAL) projection.emplace_back(sizes, space);
     else saturation.emplace_back(sizes, space);

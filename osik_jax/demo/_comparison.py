@@ -15,7 +15,6 @@ from ._run import TITLES
 
 _COLORS = ("#f08c3a", "#8a8f98", "#1565c0")
 _INK, _BAD, _GRID = "#2b2f36", "#d7263d", "#e3e7ec"
-_NOTE = "All figures are from MuJoCo: of the configurations alone, or along the simulation."
 
 
 def comparison(title: str, figures: Mapping[str, Sequence[Figure]], dt: float) -> Page:
@@ -38,7 +37,7 @@ def comparison(title: str, figures: Mapping[str, Sequence[Figure]], dt: float) -
         axes.set_axis_off()
     page.suptitle(title, x=0.012, ha="left", fontsize=14, weight="bold", color=_INK)
     page.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=len(figures), frameon=False)
-    page.supxlabel(f"time [s]      {_NOTE}", fontsize=9, color=_INK)
+    page.supxlabel("time [s]", fontsize=9, color=_INK)
     return page
 
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -15,10 +13,9 @@ from rich.table import Table
 from ..viewer import animate, hero_picture
 from ..viewer._opengl import RendererName
 from ._comparison import comparison
-from ._figures import figures
+from ._figures import figures, table
 from ._motion import Motion
 from ._physics import PhysicsRun, run_physics
-from ._report import report, table
 from ._run import TITLES, Run, run_scheme
 
 _DIRECTIONS = ("forward", "to the left", "up")
@@ -35,8 +32,8 @@ def run_demo(
     picture: bool = False,
     renderer: RendererName = "auto",
     announce: Callable[[str, float], None] = lambda stage, done: None,
-) -> tuple[dict[str, Any], Table, Sequence[Run]]:
-    """Run the schemes in turn and write ``comparison.png``, ``motion.npz``, ``report.json`` and a film.
+) -> tuple[Table, Sequence[Run]]:
+    """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
 
     Args:
         motion: what to do.
@@ -51,7 +48,7 @@ def run_demo(
         announce: called with the current stage and the finished share, 0 to 1.
 
     Returns:
-        The report, as it is in ``report.json``, the table and the runs.
+        The table of all figures, and the runs.
 
     Raises:
         KeyError: no such scheme.
@@ -66,7 +63,7 @@ def run_demo(
     for scheme in schemes:
         announce(f"{TITLES.get(scheme, scheme)}: {doing}", share * len(runs))
         runs.append(run(motion, scheme, dt=dt))
-    start, files = share * len(runs), ["comparison.png", "motion.npz", "report.json"]
+    start = share * len(runs)
     announce("drawing the comparison", start)
     found = {run.scheme: figures(motion, run) for run in runs}
     comparison(motion.title, found, dt).savefig(folder / "comparison.png")
@@ -75,16 +72,11 @@ def run_demo(
         names = ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]
         for name in names:
             _film(folder / name, motion, runs[-1], dt, renderer, lambda x: announce("filming", start + 0.35 * x))
-        files += names
     if picture:
         announce("drawing the picture", 0.97)
         _draw_picture(folder / "picture.png", motion, runs[-1])
-        files.append("picture.png")
-    summary = report(motion, runs, found, dt=dt, files=files)
-    text = json.dumps(summary, indent=2, allow_nan=False)
-    (folder / "report.json").write_text(text + "\n", encoding="utf-8")
     announce("done", 1.0)
-    return summary, table(motion.title, found), runs
+    return table(motion.title, found), runs
 
 
 def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
@@ -98,7 +90,7 @@ def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
             names = ("time", "q", "command", "effort", "com", "contact_points", "contact_forces")
             parts = {name: getattr(run.recording, name) for name in names} | {"plan": run.plan.q}
         else:
-            arrays["time"] = run.measurement.time
+            arrays["time"] = run.seen.time
             parts = {"q": run.q, "v": run.solution.velocity}
         arrays |= {f"{name}_{run.scheme.replace('-', '_')}": np.asarray(value) for name, value in parts.items()}
     return arrays
@@ -108,11 +100,11 @@ def _film(
     path: Path, motion: Motion, run: Run, dt: float, renderer: RendererName, progress: Callable[[float], None]
 ) -> None:
     """Write a film of a scheme's motion, with a curve of the largest component of up to two goals [mm]."""
-    m, values, wanted = run.measurement, {}, {}
-    for label in list(m.goals)[:2]:
-        axis = int(np.argmax(np.ptp(m.wanted[label], axis=0)))
+    seen, values, wanted = run.seen, {}, {}
+    for label in list(motion.goals)[:2]:
+        axis = int(np.argmax(np.ptp(seen.wanted[label], axis=0)))
         name = f"{label.replace('_', ' ')} {_DIRECTIONS[axis]}"
-        values[name], wanted[name] = 1e3 * m.displacement[label][:, axis], 1e3 * m.wanted[label][:, axis]
+        values[name], wanted[name] = 1e3 * seen.moved[label][:, axis], 1e3 * seen.wanted[label][:, axis]
     animate(
         path,
         motion.robot,
@@ -120,7 +112,7 @@ def _film(
         dt=dt,
         renderer=renderer,
         look=motion.look,
-        support=m.support or None,
+        support=seen.support or None,
         trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
         curves=values,
         wanted=wanted,
@@ -133,6 +125,6 @@ def _film(
 def _draw_picture(path: Path, motion: Motion, run: Run) -> None:
     """Write a PNG with three instants of a motion side by side."""
     shown = [round(part * (len(run.q) - 1)) for part in (0.0, 0.26, 0.45)]
-    support = [run.measurement.support[k] for k in shown] if run.measurement.support else None
-    labels = [f"{run.measurement.time[k]:.1f} s" for k in shown]
+    support = [run.seen.support[k] for k in shown] if run.seen.support else None
+    labels = [f"{run.seen.time[k]:.1f} s" for k in shown]
     hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels, look=motion.look)

@@ -16,7 +16,7 @@ _COMPILE = {"weighted": 8.0, "null-space": 5.0, "hierarchical": 12.0}
 """Compile time of a scheme's loop relative to that of its tasks' rows."""
 _STEP, _SIMULATED_STEP = 1e-3, 4e-3
 """Time to run and measure one step, and one with physics [s]."""
-_PICTURE, _MESH_PICTURE = 0.15, 0.5
+_PICTURE, _MESH_PICTURE = 0.15, 2.0
 """Time to draw one film picture on one core [s], of simple shapes and of meshes."""
 _PICTURES_PER_SECOND = 12.5
 

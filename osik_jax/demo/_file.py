@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -13,14 +12,14 @@ from ..kinematics import forward_kinematics
 from ..physics._world import contact_corners
 from ..robot import Robot
 from ..robot._feet import guess_feet
+from ..robot._hands import find_hands
 from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
+from ..viewer._crouch import crouched
 from ..viewer._look import Look
 from ..viewer._outline import robot_outline
 from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
-from ._start import raised, start
+from ._start import dexterous_start
 from ._sway import SWAY, sway, sway_of
-
-_HANDS = (r"tcp|tool|gripper|end_?effector|\bee\b", r"hand", r"flange|wrist")
 
 
 def file_motion(
@@ -55,9 +54,12 @@ def file_motion(
     # one or two feet are flat, more feet are points
     rows: Rows = "pose" if len(standing) <= 2 else "position"
     outline = robot_outline(robot, robot.q0, look)
-    q0 = start(robot, outline, moving, standing, rows)
     if robot.floating_base:
-        q0 = raised(robot, q0, -robot_outline(robot, q0, look).lowest)
+        q0 = crouched(robot, standing)
+        height = robot.tree.qpos_address[robot.tree.free_bases[0]] + 2
+        q0 = q0.at[height].add(-robot_outline(robot, q0, look).lowest)
+    else:
+        q0 = dexterous_start(robot, outline, moving)
     kinematics = forward_kinematics(robot, q0)
     still: dict[str, Task] = {
         foot: FrameTask(
@@ -123,18 +125,7 @@ def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:
 
 
 def guess_moving_frame(robot: Robot) -> str:
-    """Return the free joint's body; without one, the deepest frame named like a tool or hand, else the last tip."""
-    tree = robot.tree
+    """Return the free joint's body; without one, the first hand, else the tip."""
     if robot.floating_base:
-        return tree.body_names[tree.root]
-    depth = [0] * len(tree.body_parents)
-    for body, parent in enumerate(tree.body_parents[1:], 1):
-        depth[body] = depth[parent] + 1
-    for pattern in _HANDS:
-        found = [k for k, name in enumerate(tree.frame_names) if re.search(pattern, name, re.IGNORECASE)]
-        if found:
-            return tree.frame_names[max(found, key=lambda k: depth[tree.frame_bodies[k]])]
-    last = depth.index(max(depth))
-    own = [k for k, body in enumerate(tree.frame_bodies) if body == last]
-    reach = np.linalg.norm(np.asarray(robot.frame_position)[own], axis=-1)
-    return tree.frame_names[own[int(np.argmax(np.round(reach, 9)))]]
+        return robot.tree.body_names[robot.tree.root]
+    return find_hands(robot)[0]

@@ -62,12 +62,3 @@ class Path:
         shift, velocity = follow(self.strokes, t, 3)
         pose = jnp.asarray(self.position) + shift, jnp.asarray(self.rotation)
         return pose, jnp.concatenate([velocity, jnp.zeros(3)])
-
-    def still(self, t: np.ndarray) -> np.ndarray:
-        """Return whether the path has moved before and is at rest, for each time [s]. (T,)."""
-        begun = np.zeros(len(t), bool)
-        moving = np.zeros(len(t), bool)
-        for stroke in self.strokes:
-            begun |= t >= stroke.end
-            moving |= (t > stroke.start) & (t < stroke.end)
-        return begun & ~moving

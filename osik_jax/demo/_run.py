@@ -12,8 +12,8 @@ from jaxtyping import Float
 from .._errors import unknown_name
 from ..control import Solution, rollout
 from ..schemes import HierarchicalQP, NullSpace, WeightedQP
-from ._measure import Measurement, measure
 from ._motion import Motion
+from ._observed import Observed, observe
 
 _SCHEMES = {"weighted": WeightedQP, "null-space": NullSpace, "hierarchical": HierarchicalQP}
 TITLES = {"weighted": "Weighted QP", "null-space": "Null space", "hierarchical": "Hierarchical QP"}
@@ -30,7 +30,7 @@ class Run:
         solution: of each step, as NumPy arrays; every leaf has a leading axis. (steps, ...)
         compile_seconds: tracing and compiling the whole loop [s].
         run_seconds: running it once [s].
-        measurement: figures of the motion.
+        seen: frames and balance along the motion.
     """
 
     scheme: str
@@ -38,7 +38,7 @@ class Run:
     solution: Solution
     compile_seconds: float
     run_seconds: float
-    measurement: Measurement
+    seen: Observed
 
 
 def make_scheme(name: str) -> WeightedQP | NullSpace | HierarchicalQP:
@@ -53,7 +53,7 @@ def make_scheme(name: str) -> WeightedQP | NullSpace | HierarchicalQP:
 
 
 def run_scheme(motion: Motion, scheme: str, *, dt: float) -> Run:
-    """Compile the closed loop, run it once, and measure the motion."""
+    """Compile the closed loop, run it once, and look at the motion."""
     own, steps = make_scheme(scheme), round(motion.duration / dt)
     start = time.perf_counter()
     loop = jax.jit(lambda q0: rollout(motion.robot, q0, motion.tasks, scheme=own, dt=dt, steps=steps))
@@ -62,4 +62,4 @@ def run_scheme(motion: Motion, scheme: str, *, dt: float) -> Run:
     trajectory = jax.block_until_ready(program(motion.q0))
     done = time.perf_counter()
     q, solution = np.asarray(trajectory.q), jax.tree.map(np.asarray, trajectory.solution)
-    return Run(scheme, q, solution, compiled - start, done - compiled, measure(motion, q, dt))
+    return Run(scheme, q, solution, compiled - start, done - compiled, observe(motion, q, dt))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+import numpy as np
+
 from ._robot import Robot
 
 _HANDS = (r"gripper|tcp|tool|end_?effector|\bee\b", r"rubber_hand|palm|hand(?!.*(index|middle|thumb|finger))", r"wrist")
@@ -14,9 +16,8 @@ _SIDES = {"left": r"(^|_)(l|left)(_|$)|left|^L(?=[A-Z])", "right": r"(^|_)(r|rig
 def find_hands(robot: Robot) -> tuple[str, ...]:
     """Return one frame of the left and one of the right hand.
 
-    Where no names tell sides, return one frame that is named like a hand, else the tip of the robot.
-
-    Of several frames of one kind, the one that most joints move.
+    Where no names tell sides, return one frame that is named like a hand, else the tip of a robot with a fixed base. Of
+    several frames of one kind, return the one that most joints move.
     """
     tree = robot.tree
     depth = [0] * len(tree.body_parents)
@@ -28,8 +29,16 @@ def find_hands(robot: Robot) -> tuple[str, ...]:
         return tuple(sided)
     hand = _named(moving)
     if hand is None and not robot.floating_base:
-        hand = max(moving, key=lambda frame: frame[1])[0]
+        hand = _tip(robot, depth)
     return () if hand is None else (hand,)
+
+
+def _tip(robot: Robot, depth: Sequence[int]) -> str:
+    """Return the frame of the deepest body that is farthest from the body's origin; the first of equally far ones."""
+    last = depth.index(max(depth))
+    own = [k for k, body in enumerate(robot.tree.frame_bodies) if body == last]
+    reach = np.linalg.norm(np.asarray(robot.frame_position)[own], axis=-1)
+    return robot.tree.frame_names[own[int(np.argmax(np.round(reach, 9)))]]
 
 
 def _named(frames: Sequence[tuple[str, int]]) -> str | None:

@@ -9,14 +9,10 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ._raster import Rasterizer
 from ._raycast import Image, RayCaster
 from ._stage import Camera, Stage
 
 RendererName = Literal["auto", "mujoco", "raycast"]
-_MANY = 1000
-"""Number of mesh triangles above which triangles are rasterised instead of cast by rays."""
-
 _GL_ERRORS = (mujoco.FatalError, ImportError, AttributeError, OSError, RuntimeError)
 """Exceptions of MuJoCo's renderer without a GL library, without a screen, or with a broken driver."""
 
@@ -65,8 +61,6 @@ def make_renderer(
 ) -> GlRenderer | RayCaster:
     """Return MuJoCo's renderer (``"mujoco"``), a CPU renderer (``"raycast"``), or the first that works (``"auto"``).
 
-    On the CPU rays are cast, unless there are meshes of so many triangles that drawing those is faster.
-
     Raises:
         RuntimeError: ``"mujoco"`` where OpenGL does not work.
     """
@@ -76,8 +70,7 @@ def make_renderer(
         except RuntimeError:
             if name == "mujoco":
                 raise
-    triangles = sum(len(part.mesh[1]) for part in stage.parts if part.mesh is not None)
-    return (Rasterizer if triangles > _MANY else RayCaster)(stage, camera, size, floor=floor)
+    return RayCaster(stage, camera, size, floor=floor)
 
 
 def check_opengl() -> None:

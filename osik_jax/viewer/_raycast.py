@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import mujoco
@@ -17,7 +16,7 @@ Image = Float[np.ndarray, "height width 3"]
 
 _TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
 _SHADOW_MAP = 112
-_BLOCK = 8
+_CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(8, 3)
 _SUBPIXELS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]])
 _GROUPS = np.array([1, 1, 1, 1, 1, 0], np.uint8)
 
@@ -50,7 +49,7 @@ class RayCaster:
             data: from ``Stage.pose``.
             under: red, green, blue and alpha from 0 to 1, alpha not multiplied in.
         """
-        picture = self._background * self._shadow(data, lambda points: self._lit(data, points))[..., None]
+        picture = self._background * self._shadow(data)[..., None]
         if under is not None:
             picture += under[..., 3:] * (under[..., :3] - picture)
         rows, columns = np.nonzero(self._near_robots(data))
@@ -86,18 +85,16 @@ class RayCaster:
         return _edges(geom, normal)[y, x]
 
     def _near_robots(self, data: mujoco.MjData) -> np.ndarray:
-        """Return the pixels, in blocks, that the geoms' bounding spheres may cover. (height, width)."""
-        center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:]  # the floor is geom 0
-        middle = self.camera.project(center, self.size)
-        depth = (center - self.camera.eye) @ self.camera.axes[2]
-        # 10 % more for the perspective of spheres off the axis, and one block for the grid
-        reach = 1.1 * radius * self.camera.distance / depth * self.size[1] / self.camera.height + _BLOCK
-        shape = tuple(-(-n // _BLOCK) for n in (self.size[1], self.size[0]))
-        row, column = (_BLOCK * (k + 0.5) for k in np.indices(shape))
-        inside = np.zeros(shape, bool)
-        for (x, y), r in zip(middle, reach, strict=True):
-            inside |= (column - x) ** 2 + (row - y) ** 2 < r * r
-        return np.kron(inside, np.ones((_BLOCK, _BLOCK), bool))[: self.size[1], : self.size[0]]
+        """Return the pixels that the geoms' bounding boxes may cover. (height, width)."""
+        boxes, turns = self.stage.model.geom_aabb[1:], data.geom_xmat[1:].reshape(-1, 3, 3)  # the floor is geom 0
+        corners = boxes[:, None, :3] + boxes[:, None, 3:] * _CORNERS
+        places = self.camera.project(data.geom_xpos[1:, None] + corners @ turns.mT, self.size)
+        first = np.maximum(np.floor(places.min(1)).astype(int), 0)
+        last = np.ceil(places.max(1)).astype(int)
+        inside = np.zeros((self.size[1], self.size[0]), bool)
+        for (left, top), (right, bottom) in zip(first, last, strict=True):
+            inside[top : max(bottom, 0), left : max(right, 0)] = True
+        return inside
 
     def _cast(self, data: mujoco.MjData, origin: np.ndarray, rays: Float[np.ndarray, "n 3"]) -> _Hits:
         n = len(rays)
@@ -131,15 +128,8 @@ class RayCaster:
         hits = self._cast(data, self._lamp, way / length[:, None])
         return (hits.geom < 0) | (hits.distance > length)
 
-    def _shadow(
-        self, data: mujoco.MjData, lit: Callable[[Float[np.ndarray, "n 3"]], np.ndarray]
-    ) -> Float[np.ndarray, "height width"]:
-        """Return the fraction of the light that each pixel of the floor receives; shadows have soft edges.
-
-        Args:
-            data: from ``Stage.pose``.
-            lit: how much of the lamp each point [m] sees, 0 to 1.
-        """
+    def _shadow(self, data: mujoco.MjData) -> Float[np.ndarray, "height width"]:
+        """Return the fraction of the light that each pixel of the floor receives; shadows have soft edges."""
         center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:, None]
         way = center - self._lamp
         foot = self._lamp + way * ((self._floor - self._lamp[2]) / way[:, 2:])
@@ -148,7 +138,7 @@ class RayCaster:
         step = (high - low) / (_SHADOW_MAP - 1)
         i, j = np.mgrid[:_SHADOW_MAP, :_SHADOW_MAP]
         grid = np.stack([low[0] + i * step[0], low[1] + j * step[1], np.full(i.shape, self._floor)], -1)
-        dark = 1.0 - lit(grid.reshape(-1, 3)).reshape(i.shape)
+        dark = 1.0 - self._lit(data, grid.reshape(-1, 3)).reshape(i.shape)
         # blurred by the same length in the world along both axes of the map
         soft = ndimage.gaussian_filter(dark, 0.012 * self.camera.height / step)
         place = np.moveaxis((self._ground - low) / step, -1, 0)

@@ -11,7 +11,6 @@ from osik_jax.retargeting import _banded as banded
 from osik_jax.solvers.hqp import _cuda as hierarchy
 from osik_jax.solvers.hqp._padding import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
-from osik_jax.solvers.null_space import _projection_cuda as projection
 from osik_jax.solvers.qp import _cuda as weighted_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
@@ -43,8 +42,8 @@ TEXTS = {
     "more rows than variables": lambda: weighted_qp._source(40, 33, 3, False, 100, 1),
     "more than 32 variables": lambda: weighted_qp._source(5, 35, 2, True, 100, 1),
     "more than 64 variables": lambda: weighted_qp._source(5, 70, 2, True, 100, 1),
-    "saturated null space": lambda: null_space._source(null_space.Shape(7, 3, 6), 100),
-    "classical projection": lambda: projection._source(35, (12, 3, 3), 2),
+    "saturated null space": lambda: null_space._source("saturation", 7, (6, 6, 6), 2, 100),
+    "classical projection": lambda: null_space._source("projection", 35, (12, 3, 3), 2),
     "bodies": lambda: _cuda._lanes_source(
         "kinematics", True, ((2, 8), (1, 90), (40,)), (2,), ((2, 3, 3), *[(2, 2, 3)] * 4)
     ),
@@ -78,8 +77,8 @@ def test_what_does_not_fit_a_device_is_left_to_plain_jax(shared, capability, fit
     monkeypatch.setattr(_cuda, "_attribute", device.get)
     monkeypatch.setattr(_cuda, "nvrtc", lambda: "libnvrtc.so")
     levels = Layout(64, 3, 64, (64, 64, 0), (-1,) * 64, ())
-    assert projection.fits(64, (64,)) == hierarchy.fits(levels) == fit
-    assert projection.fits(7, (3, 3)) == (capability >= 8)
+    assert null_space.fits(64, (64,)) == hierarchy.fits(levels) == fit
+    assert null_space.fits(7, (3, 3)) == (capability >= 8)
 
 
 @pytest.mark.parametrize("shared, blocks", [(227, 9), (99, 4), (20, 1)])

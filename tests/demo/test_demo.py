@@ -1,7 +1,7 @@
-"""The demonstration: references, measurement by MuJoCo C, and the numbers that the motions have to reach."""
+"""The demonstration: references, figures beside MuJoCo C's, and the numbers that the motions have to reach."""
 
-import dataclasses
-import json
+from types import SimpleNamespace
+from typing import Any, cast
 
 import jax
 import mujoco
@@ -16,23 +16,23 @@ import osik_jax as osik
 from osik_jax.demo import _nao
 from osik_jax.demo._comparison import comparison
 from osik_jax.demo._demo import run_demo
-from osik_jax.demo._figures import Figure, figures
+from osik_jax.demo._figures import Figure, figures, table
 from osik_jax.demo._file import guess_moving_frame
-from osik_jax.demo._measure import measure
+from osik_jax.demo._observed import observe
 from osik_jax.demo._references import Path, Stroke, minimum_jerk
-from osik_jax.demo._report import table
-from osik_jax.demo._run import make_scheme, run_scheme
+from osik_jax.demo._run import Run, make_scheme, run_scheme
 from osik_jax.robot._feet import guess_feet
 
 DT = 0.005
+FEET = ("l_sole", "r_sole")
 
 
 @pytest.fixture(scope="module")
 def short(tmp_path_factory):
-    """A demonstration of half a second: its folder, report, motion and run."""
+    """A demonstration of half a second: its folder, table, motion and run."""
     folder, motion = tmp_path_factory.mktemp("demo"), _nao.double_support(0.5)
-    summary, _, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
-    return folder, summary, motion, run
+    shown, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    return folder, shown, motion, run
 
 
 def look_all(robot, q):
@@ -73,8 +73,6 @@ def test_path_velocity_is_the_rate_of_its_position():
         np.testing.assert_array_equal(velocity[3:], 0.0)
         np.testing.assert_array_equal(R, rotation)
     np.testing.assert_allclose(at(3.0)[0][0], [0.2, 0.1, 0.6], atol=1e-12)
-    times = np.array([0.0, 1.0, 2.9, 3.0, 4.0])
-    np.testing.assert_array_equal(path.still(times), [False, False, False, True, True])
 
 
 def test_the_polygon_shrinks_from_both_feet_to_one(nao):
@@ -98,33 +96,41 @@ def test_the_polygon_shrinks_from_both_feet_to_one(nao):
     assert (early >= np.asarray(foot.offsets) - 1e-12).all() and early.sum() > np.asarray(foot.offsets).sum() + 1e-3
 
 
-def test_measurement_of_a_motion_made_by_hand(nao):
-    """The whole robot slides and one knee goes past its limit: every number is known beforehand."""
+def test_a_motion_made_by_hand(nao):
+    """The whole robot slides and one knee goes past its limit: every number is known beforehand, or by MuJoCo."""
     motion = _nao.double_support(1.0)
     q = np.tile(np.asarray(nao.q0), (11, 1))
     q[:, 0] += 0.001 * np.arange(11)
     knee, dof = nao.joint_qpos_index("LKneePitch"), nao.joint_dof_index("LKneePitch")
-    top = float(nao.position_upper[dof])
+    low, top = float(nao.position_lower[dof]), float(nao.position_upper[dof])
     q[10, knee] = top + 0.1
-    m = measure(motion, q, 0.1)
-    np.testing.assert_allclose(m.stances["r_sole"].position, 0.001 * np.arange(11), atol=1e-12)
-    np.testing.assert_allclose(m.stances["r_sole"].orientation, 0.0, atol=1e-12)
+    seen = observe(motion, q, 0.1)
+    np.testing.assert_allclose(seen.drift[:10], 0.001 * np.arange(10), atol=1e-12)
+    np.testing.assert_allclose(seen.turn[:10], 0.0, atol=1e-7)
+    first, last = mujoco_at(nao, q[0]), mujoco_at(nao, q[10])
+    assert seen.drift[10] == pytest.approx(np.linalg.norm(last.site("l_sole").xpos - first.site("l_sole").xpos))
+    assert seen.turn[10] == pytest.approx(turn(last.site("l_sole").xmat, first.site("l_sole").xmat))
     wanted = jax.jit(jax.vmap(motion.goals["waist"].path.at))(0.1 * np.arange(11))[0][0]
-    np.testing.assert_allclose(m.goals["waist"].position, np.linalg.norm(q[:, :3] - wanted, axis=1), atol=1e-12)
-    hull = corners(mujoco_at(nao, q[0]), "l_sole", "r_sole")
+    np.testing.assert_allclose(seen.off_path("waist"), np.linalg.norm(q[:, :3] - wanted, axis=1), atol=1e-12)
+    hull = corners(first, "l_sole", "r_sole")
     hull = hull[ConvexHull(hull).vertices]
     equations = ConvexHull(hull).equations
     for k in (0, 5, 10):
         com = mujoco_at(nao, q[k]).subtree_com[1]
-        np.testing.assert_allclose(m.com[k], com, atol=1e-12)
-        assert m.com_margin[k] == pytest.approx(-np.max(equations[:, :2] @ com[:2] + equations[:, 2]), abs=1e-12)
-    assert m.position_violations == 1
-    low = float(nao.position_lower[dof])
-    assert m.position_margin[10] == pytest.approx(-0.2 / (top - low))
-    fast = abs(q[10, knee] - q[9, knee]) / 0.1
-    assert m.velocity_violations == int(fast > float(nao.velocity_limit[dof]))
-    assert m.velocity_margin[9] == pytest.approx(1.0 - fast / float(nao.velocity_limit[dof]))
-    np.testing.assert_allclose(m.velocity_margin[:9], 1.0)
+        np.testing.assert_allclose(seen.com[k], com, atol=1e-12)
+        assert seen.com_inside[k] == pytest.approx(-np.max(equations[:, :2] @ com[:2] + equations[:, 2]), abs=1e-12)
+    velocity = np.zeros((10, nao.nv))
+    velocity[3, dof] = 0.75 * float(nao.velocity_limit[dof])
+    solution = SimpleNamespace(velocity=velocity, status=np.array([osik.solvers.Status.SOLVED] * 9 + [3]))
+    rows = {row.label: row for row in figures(motion, Run("weighted", q, cast(Any, solution), 1.0, 2.0, seen))}
+    assert rows["room to position limits (0 to 1)"].worst == pytest.approx(-0.2 / (top - low))
+    assert rows["room to speed limits (0 to 1)"].worst == pytest.approx(0.25)
+    assert rows["steps not solved"].worst == 1 and rows["a step [µs]"].worst == pytest.approx(2e5)
+    missed = {label for label, row in rows.items() if row.missed}
+    feet = {"standing feet, drift [mm]", "standing feet, turn [mrad]"}
+    assert missed == feet | {"room to position limits (0 to 1)", "steps not solved"}
+    cells = [cell for column in table("x", {"weighted": list(rows.values())}).columns for cell in column.cells]
+    assert {"[red]1[/red]", f"[red]{-0.2 / (top - low):.2g}[/red]", "0.25"} <= set(cells)
 
 
 def check_requirements(motion, run, lifted=None):
@@ -157,7 +163,7 @@ def test_double_support_reaches_its_numbers():
     run = run_scheme(motion, "hierarchical", dt=DT)
     assert len(run.q) == 1601
     check_requirements(motion, run)
-    waist = run.measurement.displacement["waist"]
+    waist = run.seen.moved["waist"]
     assert waist[700, 1] == pytest.approx(0.05, abs=1e-3)
     assert waist[-1, 1] == pytest.approx(0.0, abs=1e-3)
 
@@ -168,14 +174,26 @@ def test_single_support_reaches_its_numbers():
     motion = _nao.single_support()
     run = run_scheme(motion, "hierarchical", dt=DT)
     check_requirements(motion, run, lifted=motion.stances[1].lifted)
-    height = run.measurement.displacement["right_foot"][:, 2]
+    height = run.seen.moved["right_foot"][:, 2]
     assert height[780] == pytest.approx(0.055, abs=1e-3)
-    assert run.measurement.displacement["left_hand"][780, 2] > 0.05
+    assert run.seen.moved["left_hand"][780, 2] > 0.05
 
 
-def test_own_figures_agree_with_the_measurement(short):
+def test_files_and_figures_agree_with_mujoco(short, nao):
     """Velocities integrate to the configurations, by MuJoCo's own integration."""
-    _, _, motion, run = short
+    folder, shown, motion, run = short
+    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz"}
+    arrays = np.load(folder / "motion.npz")
+    assert arrays["q_weighted"].shape == (101, nao.nq) and arrays["v_weighted"].shape == (100, nao.nv)
+    assert [column.header for column in shown.columns] == ["", "Weighted QP"]
+    data = list(look_all(nao, run.q))
+    drift = max(np.linalg.norm(d.site(foot).xpos - data[0].site(foot).xpos) for d in data for foot in FEET)
+    assert run.seen.drift.max() == pytest.approx(drift, rel=1e-6, abs=1e-12)
+    hull = ConvexHull(corners(data[0], *FEET)).equations
+    inside = min(-np.max(hull[:, :2] @ d.subtree_com[1][:2] + hull[:, 2]) for d in data)
+    assert run.seen.com_inside.min() == pytest.approx(inside, rel=1e-9)
+    missed = [row.label for row in figures(motion, run) if row.missed]
+    assert not any("room" in label or "steps" in label or "mass" in label for label in missed)
     model = motion.robot.mj_model
     own, _ = motion.robot.tree.dof_columns[0]
     for k in (0, 30, 90):
@@ -185,65 +203,17 @@ def test_own_figures_agree_with_the_measurement(short):
         np.testing.assert_allclose(full[own], run.solution.velocity[k], atol=1e-9)
 
 
-@pytest.mark.slow
-def test_demo_writes_every_file(short):
-    folder, summary, _, _ = short
-    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz", "report.json"}
-    assert json.loads((folder / "report.json").read_text()) == summary
-    assert set(summary["files"]) <= {p.name for p in folder.iterdir()}
-    assert summary["versions"]["mujoco"] == mujoco.__version__
-
-
-def test_report_agrees_with_mujoco(short, nao):
-    folder, summary, _, _ = short
-    arrays = np.load(folder / "motion.npz")
-    q, v = arrays["q_weighted"], arrays["v_weighted"]
-    assert q.shape == (101, nao.nq) and v.shape == (100, nao.nv)
-    data = list(look_all(nao, q))
-    told = summary["schemes"]["weighted"]
-    first = {foot: (data[0].site(foot).xpos, data[0].site(foot).xmat) for foot in ("l_sole", "r_sole")}
-    drift = max(np.linalg.norm(d.site(foot).xpos - p) for d in data for foot, (p, _) in first.items())
-    assert told["feet_drift_mm"] == pytest.approx(1e3 * drift, rel=1e-9, abs=1e-12)
-    turned = max(turn(d.site(foot).xmat, R) for d in data for foot, (_, R) in first.items())
-    assert told["feet_turn_mrad"] == pytest.approx(1e3 * turned, rel=1e-6, abs=1e-9)
-    hull = ConvexHull(corners(data[0], "l_sole", "r_sole")).equations
-    margin = min(-np.max(hull[:, :2] @ d.subtree_com[1][:2] + hull[:, 2]) for d in data)
-    assert told["com_inside_mm"] == pytest.approx(1e3 * margin, rel=1e-9)
-    assert told["position_limits_broken"] == told["velocity_limits_broken"] == told["steps_not_solved"] == 0
-    limit = np.asarray(nao.velocity_limit)
-    margin = 1.0 - np.max(np.abs(v[:, np.isfinite(limit)]) / limit[np.isfinite(limit)])
-    assert told["velocity_margin"] == pytest.approx(margin, abs=1e-6)
-    assert told["status"]["SOLVED"] == summary["steps"] == 100
-    assert told["step_us"] > 0.0 and told["compile_s"] > 0.0
-
-
-def test_table_and_report_tell_what_is_missed(short):
-    """Limits broken, and a drift over its requirement of 0.1 mm; the room to a limit is the least of all times."""
-    _, summary, motion, run = short
-    m = run.measurement
-    drift = dataclasses.replace(m.stances["l_sole"], position=np.linspace(0.0, 20.0, 101))
-    margin = np.linspace(0.5, -0.25, 101)
-    stances = m.stances | {"l_sole": drift}
-    broken = dataclasses.replace(m, position_violations=7, stances=stances, position_margin=margin)
-    rows = figures(motion, dataclasses.replace(run, measurement=broken))
-    missed, before = {row.name for row in rows if row.missed}, set(summary["schemes"]["weighted"]["missed"])
-    assert missed - before - {"feet_drift_mm"} == {"position_limits_broken", "position_margin"}
-    assert "feet_drift_mm" in missed
-    cells = [cell for column in table("x", {"weighted": rows}).columns for cell in column.cells]
-    assert {"[red]7[/red]", "[red]20000.0[/red]", "[red]-0.25[/red]"} <= set(cells)
-
-
 def test_comparison_draws_the_curves_it_gets(tmp_path):
     """Schemes in one plot; what is only rounding about a constant, or 0 throughout, draws no curve."""
     time = np.linspace(0.0, 1.0, 11)
     curves = {"weighted": 1e-3 * (1.0 + time), "hierarchical": 1e-6 * (1.0 + time)}
     rows = {
         scheme: [
-            Figure("a", "drift [mm]", values, most=0.1, floor=1e-5),
-            Figure("b", "margin [mm]", values, least=0.0),
-            Figure("c", "steady", 0.5 + 1e-16 * np.sin(40.0 * time), span=0.1),
-            Figure("d", "zero", 0.0 * time, floor=1e-5),
-            Figure("e", "number", 3.0),
+            Figure("drift [mm]", values, most=0.1, floor=1e-5),
+            Figure("margin [mm]", values, least=0.0),
+            Figure("steady", 0.5 + 1e-16 * np.sin(40.0 * time), span=0.1),
+            Figure("zero", 0.0 * time, floor=1e-5),
+            Figure("number", 3.0),
         ]
         for scheme, values in curves.items()
     }

@@ -243,7 +243,7 @@ def test_a_bad_lane_of_saturation_disturbs_no_other():
 
 
 def test_problems_that_do_not_fit_are_searched():
-    level = [Level(np.ones((1, 70)), np.ones(1))]
-    found = solve_nullspace(level, -np.ones(70), np.ones(70), backend="core")
+    level = [Level(np.ones((1, 130)), np.ones(1))]
+    found = solve_nullspace(level, -np.ones(130), np.ones(130), backend="core")
     assert found.status == Status.SOLVED
-    np.testing.assert_allclose(found.x, 1.0 / 70.0, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.x, 1.0 / 130.0, rtol=0, atol=1e-12)

@@ -18,10 +18,8 @@ from osik_jax.robot.loading._meshes import read_mesh
 from osik_jax.viewer._look import read_look
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
-from osik_jax.viewer._raster import Rasterizer, draw_triangles
-from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._shapes import lowest_points
-from osik_jax.viewer._stage import Stage, frame_camera
+from osik_jax.viewer._stage import frame_camera
 from osik_jax.viewer.live._surfaces import part_triangles
 
 MESHES = Path(__file__).parents[1] / "data" / "meshes"
@@ -153,40 +151,6 @@ def test_y_up_is_followed_where_that_brings_meshes_to_joints(tmp_path, elbow):
     (mesh,) = (shape.mesh[0] for shape in look.shapes if shape.mesh is not None)
     end = np.array([float(x) for x in elbow.split()])
     assert (mesh @ end).max() == pytest.approx(1.0) and (mesh @ end).min() == pytest.approx(0.0, abs=1e-12)
-
-
-def test_triangles_cover_what_they_cover():
-    rng, width, height = np.random.default_rng(0), 60, 40
-    places = rng.uniform(-20.0, 80.0, (40, 3, 2))
-    places[20:] = places[20:, :1] + 2.0 * rng.normal(size=(20, 3, 2))
-    nearness = rng.uniform(0.1, 1.0, (40, 3))
-    drawn = draw_triangles(places, nearness, (width, height))
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    front, owner = np.zeros((height, width)), np.full((height, width), -1)
-    for k in range(40):
-        weights = np.einsum(
-            "ij,jyx->iyx", np.linalg.inv(np.vstack([places[k].T, np.ones(3)])), np.stack([x, y, np.ones_like(x)])
-        )
-        value = np.einsum("iyx,i->yx", weights, nearness[k])
-        nearer = (weights >= 0.0).all(0) & (value > front)
-        front[nearer], owner[nearer] = value[nearer], k
-    assert (owner >= 0).sum() > 500
-    np.testing.assert_array_equal(drawn.triangle, owner)
-    np.testing.assert_allclose(drawn.nearness, front, atol=1e-12)
-
-
-def test_drawn_triangles_look_like_cast_rays():
-    path = example_file("hyq_description/robots/hyq_no_sensors.urdf")
-    robot, look = osik.Robot.from_urdf(path, floating_base=True), read_look(path)
-    shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, robot.q0))
-    size, floor = (180, 140), float(lowest_points(shape, data).min())
-    camera = frame_camera(shape.corners(data), size, 30.0, 12.0)
-    stage = Stage([shape], camera, floor=floor)
-    posed = stage.pose([data])
-    cast, drawn = (kind(stage, camera, size, floor=floor).image(posed) for kind in (RayCaster, Rasterizer))
-    empty = np.abs(cast - 1.0).max(-1) < 0.15
-    assert 0.1 < np.mean(~empty) < 0.9
-    assert np.abs(cast - drawn).mean() < 0.01 and np.mean(np.abs(cast - drawn).max(-1) > 0.2) < 0.02
 
 
 @pytest.mark.parametrize("lens", [2.0, 3.6, 10.0])

@@ -1,95 +1,137 @@
-"""GPU kernel of saturation in the null space (``core/saturation_cuda``), one warp of 32 threads per problem.
+"""Null-space projections on a GPU, one warp of 32 threads per problem.
 
-It is the method of ``core/saturation.hpp``, which takes 1.3 to 1.6 times as long there.
+The methods are in ``core/null_space.hpp`` and ``core/saturation.hpp``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ...core import _cuda, _library
-from ...numerics import _constants
 
-PARTS = (
-    *("workspace", "reductions", "calls", "problem", "level", "row_space", "cholesky", "damping", "motion"),
-    *("saturated", "stop", "choices", "search", "attempt", "after", "levels"),
-)
-"""Files of the kernel in order; each uses the definitions of earlier ones."""
-_MAX_ROWS, _MAX_WARPS = 64, 2
-_WHOLE = ("DAMPING_ITERATIONS", "MAX_SATURATION_CHANGES", "PART", "PATH_SEARCHES", "SIGN_CHECKS", "STRAIGHT", "WHOLE")
-_NUMBERS = (
-    *("BLOCKING_RANK", "BOUND_DISTANCE", "COST_FRACTION", "DAMPING_RIDGE", "FULL_STEP", "LARGEST_RATE"),
-    *("MIN_RADIUS", "NEGLIGIBLE_CURVATURE", "NEGLIGIBLE_DAMPING", "NEGLIGIBLE_ENTRY", "NEGLIGIBLE_STEP", "PATH_END"),
-    *("PATH_STEP", "SATURATION_LOSS", "SATURATION_RANK", "SATURATION_RESIDUAL", "SATURATION_ROUNDOFF"),
-    *("SATURATION_COMPLIANCE", "SOFT_SATURATION_RANK", "STIFFER_SATURATION_COMPLIANCE"),
-)
-"""Names of the constants from ``numerics/_constants.py`` in the kernel's text."""
-_KERNEL = """
-#define INFINITY __longlong_as_double(0x7ff0000000000000ll)
-extern "C" __global__ void __launch_bounds__(32 * WARPS) osik_kernel(
-    const double* matrix, const double* rows_lower, const double* rows_upper, const double* dampings,
-    const double* bends, const double* targets, const double* lower, const double* upper,
-    const double* rank_tolerance, const int* rows_equal, double* solution, double* projectors, double* scales,
-    int* dones, int* joints_at_bounds, int* joints_blocking, int* blockers, int* active_joints, int* report,
-    int problems) {
-const int pid = (blockIdx.x * blockDim.x + threadIdx.x) / 32;
-if (pid >= problems) return;
+_MAX_RANK = 64  # the triangular solves of a warp hold two entries a thread
+_PROBLEMS = """
+  const NullSpaceSizes sizes{N, M};
+  Method method(sizes, nullptr, outside + size_t(blockIdx.x) * Method::numbers_outside(sizes));
+  for (int i = 0; i < PER_BLOCK; ++i) {
+    const size_t b = size_t(blockIdx.x) * PER_BLOCK + i;
+    if (b >= problems) return;
+"""
+_PROJECTION = """
+using namespace osik;
+using Method = ClassicalProjection<Warp<double, N, M, 0>>;
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
+    const double* secondary, const double* constant, const double* unmet, const double* demand, const double* bends,
+    const double* rank_tol, LEVELS, double* x, double* projector, double* outside, int problems) {
+  const double* const matrices[] = {MATRIX};
+  const double* const lowers[] = {LOWER};
+  const double* const uppers[] = {UPPER};
+  const int* const equalities[] = {EQUAL};
+  PROBLEMS
+    method.rank_tol = rank_tol[b];
+    method.begin();
+    for (int k = 0; k < L; ++k) {
+      const int rows = ROWS[k];
+      const size_t e = b * L + k, first = b * rows;
+      method.solve_level({matrices[k] + first * N, lowers[k] + first, uppers[k] + first, bends + e * N,
+                          equalities[k] + first, constant[e], unmet[e], demand[e], rows, 1, rows});
+    }
+    method.end(secondary + b * N, x + b * N, projector + b * N * N);
+  }
+}
+"""
+_SATURATION = """
+using namespace osik;
+using Method = Saturation<Warp<double, N, M, 0>>;
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
+    const double* matrix, const double* lower, const double* upper, const int* equality, const double* constant,
+    const double* unmet, const double* demand, const double* bends, const double* targets, const double* low,
+    const double* high, const double* rank_tol, double* x, double* projector, double* scales, int* ended, int* sides,
+    int* blocking, int* blockers, int* active, int* report, double* outside, int problems) {
+  PROBLEMS
+    const size_t e = b * L, row = e * M, joint = b * N;
+    method.solve({matrix + row * N, lower + row, upper + row, constant + e, unmet + e, demand + e, bends + e * N,
+                  targets + e * N, low + joint, high + joint, equality + row, rank_tol[b], MAX_CHANGES, L, M, 1, M},
+                 {x + joint, projector + joint * N, scales + e, ended + e, sides + e * N, blocking + e * N,
+                  blockers + e, active + joint, report + b * 2});
+  }
+}
 """
 
 
-class Shape(NamedTuple):
-    """Sizes for which a kernel is compiled."""
+def fits(n: int, rows: Sequence[int], method: str = "projection") -> bool:
+    """Return whether a GPU has room for a problem of n variables and levels of so many rows.
 
-    variables: int
-    levels: int
-    rows: int  # of the longest level
-
-    @property
-    def warps(self) -> int:
-        """Return the number of warps per block; 0 if a problem is too large for this kernel."""
-        n, m = self.variables, self.rows
-        if m > _MAX_ROWS:
-            return 0
-        # rows have odd lengths, so that the threads of a warp read from different banks of memory
-        wide = max(n, m)
-        room = n * (wide | 1) + (0 if m * (m | 1) <= n * n else m * (m | 1))
-        doubles = n * (n | 1) + room + 14 * n + 6 * m + wide
-        return min(_MAX_WARPS, _cuda.DEFAULT_SHARED_BYTES // (8 * doubles + 4 * (6 * n + m)))
+    Args:
+        n: number of variables.
+        rows: number of rows of each level.
+        method: "projection" (the classical one) or "saturation".
+    """
+    most = max(rows)
+    return _cuda.installed() and min(n, most) <= _MAX_RANK and _cuda.space_of(method, n, most) <= _cuda.shared_bytes()
 
 
-def fits(n: int, m: int) -> bool:
-    """Return whether a GPU has room for a problem of n variables and levels of up to m rows."""
-    return _cuda.installed() and Shape(n, 1, m).warps > 0
-
-
-@cache
-def _source(shape: Shape, max_iterations: int) -> str:
-    """Return the CUDA text for a shape: its numbers as constants, then the body of the kernel."""
-    n, levels, m = shape
-    numbers = dict(N=n, LEVELS=levels, M=m, WARPS=shape.warps, max_iterations=max_iterations)
-    numbers |= {name: getattr(_constants, name) for name in _WHOLE}
-    floats = [f"constexpr double {name} = {getattr(_constants, name)!r};" for name in _NUMBERS]
-    head = _cuda.constants(**numbers) + "\n".join(floats)
-    return head + _KERNEL + _cuda.rolled(_cuda.text_of_parts("saturation_cuda", PARTS)) + "}\n"
+def project(_: str, outputs: _library.Shapes, secondary: Array, *given: Array) -> list[Array]:
+    """Project a batch on the default GPU: as ``_library.call`` of the method "projection" does on a CPU."""
+    n, kind = secondary.shape[1], secondary.dtype
+    numbers, levels = given[:5], list(given[5:])
+    # column by column, so that the threads of a warp read neighbours
+    levels[::4] = [jnp.swapaxes(matrix, 1, 2) for matrix in levels[::4]]
+    rows = tuple(a.shape[1] for a in levels[1::4])
+    shapes = [(shape, jnp.float64) for shape, _ in outputs]
+    results = _call("projection", shapes, (secondary, *numbers, *levels), n, rows)
+    return [a.astype(kind) for a in results]
 
 
 def saturate(_: str, outputs: _library.Shapes, matrix: Array, *given: Any) -> list[Array]:
     """Saturate a batch on the default GPU: as ``_library.call`` of the method "saturation" does on a CPU."""
-    lower, upper, equal, *damping, bends, targets, low, high, rank_tol, most_changes = given
-    batch, levels, m, n = matrix.shape
-    shape = Shape(n, levels, m)
-    numbers = jnp.swapaxes(matrix, 2, 3), lower, upper, jnp.stack(damping, 1), bends, targets, low, high, rank_tol
-    return _cuda.call(
-        _source(shape, int(most_changes[0])),
-        outputs,
-        *map(_cuda.as_double, numbers),
-        equal.astype(jnp.int32),
+    *numbers, most_changes = given
+    levels, m, n = matrix.shape[1:]
+    inputs = jnp.swapaxes(matrix, 2, 3), *numbers
+    return _call("saturation", outputs, inputs, n, (m,) * levels, int(most_changes[0]))
+
+
+def _call(
+    method: str, outputs: _library.Shapes, inputs: Sequence[Array], n: int, rows: tuple[int, ...], max_changes: int = 0
+) -> list[Array]:
+    """Run a kernel for a batch: each block solves one problem or several in turn."""
+    batch, sizes = len(inputs[0]), (n, max(rows))
+    per_block = _cuda.problems_of_a_block(batch)
+    outside = -(-batch // per_block), _cuda.space_outside("null_space", *sizes)
+    results = _cuda.call(
+        _source(method, n, rows, per_block, max_changes),
+        [*outputs, (outside, jnp.float64)],
+        *(a.astype(jnp.int32) if a.dtype == bool else _cuda.as_double(a) for a in inputs),
         problems=batch,
-        shared=0,
-        per_block=shape.warps,
-        warps=shape.warps,
+        shared=_cuda.space_of(method, *sizes),
+        per_block=per_block,
     )
+    return results[:-1]  # without the workspace in global memory
+
+
+@cache
+def _source(method: str, n: int, rows: tuple[int, ...], per_block: int, max_changes: int = 0) -> str:
+    """Return the CUDA text of a method for levels of so many rows."""
+    m = max(rows)
+    numbers = dict(PER_BLOCK=per_block, BLOCKS=_cuda.blocks_beside(_cuda.space_of(method, n, m)))
+    sizes = _cuda.constants(N=n, M=m, L=len(rows), ROWS=rows, MAX_CHANGES=max_changes, **numbers)
+    header, kernel = (
+        ("null_space.hpp", _projection(len(rows))) if method == "projection" else ("saturation.hpp", _SATURATION)
+    )
+    return _cuda.text_of(header) + sizes + _cuda.rolled(kernel.replace("PROBLEMS", _PROBLEMS))
+
+
+def _projection(levels: int) -> str:
+    """Return the kernel of the classical projection, which has arguments for each level."""
+    names = {name: [f"{name.lower()}{k}" for k in range(levels)] for name in ("MATRIX", "LOWER", "UPPER", "EQUAL")}
+    parameters = [name for level in zip(*names.values(), strict=True) for name in level]
+    arguments = ", ".join(f"const {'int' if 'equal' in name else 'double'}* {name}" for name in parameters)
+    text = _PROJECTION.replace("LEVELS", arguments)
+    for key, own in names.items():
+        text = text.replace(key, ", ".join(own))
+    return text

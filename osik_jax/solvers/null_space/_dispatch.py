@@ -20,7 +20,7 @@ from ...execution._lanes import in_lanes
 from ...execution._rules import custom_jvp
 from .._damping import Damping
 from ..hqp import Level
-from . import _projection_cuda
+from . import _cuda
 from ._projection import solve_forward
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
@@ -60,8 +60,8 @@ def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Arr
     def solve(levels: list[Level], secondary: Float[Array, "B n"], *rest: Any) -> Any:
         kernels: dict[str, Callable[..., Any]] = dict(core=partial(_by_core, _library.call))
         rows = tuple(level.matrix.shape[1] for level in levels)
-        if takes(backend, "core-cuda", fits=_projection_cuda.fits(secondary.shape[1], rows)):
-            kernels["core-cuda"] = partial(_by_core, _projection_cuda.call)
+        if takes(backend, "core-cuda", fits=_cuda.fits(secondary.shape[1], rows)):
+            kernels["core-cuda"] = partial(_by_core, _cuda.project)
         return on_platforms(kernels, plain, levels, secondary, *rest)
 
     return in_lanes(solve)

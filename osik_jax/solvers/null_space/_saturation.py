@@ -14,9 +14,9 @@ no admissible scale, and then drops the whole task. The motion d always has one.
 joints that block it can move no more whatever comes after: they are removed from the null space of the levels below,
 whose scale would otherwise be 0.
 
-The core takes a problem through all levels: ``core/saturation.hpp`` on CPUs, ``core/saturation_cuda`` on CUDA devices,
-a warp of threads for each problem. Problems that it does not solve are searched here, which is the definition, what
-runs elsewhere, and the derivative.
+The core takes a problem through all levels (``core/saturation.hpp``), on CUDA devices with a warp of threads for each
+problem. Problems that it does not solve are searched here, which is the definition, what runs elsewhere, and the
+derivative.
 
 When not to use it: where a large motion along a wrong direction is better than a small one along the right, and where
 rows are inequalities. One unreachable row scales its whole level down; ``solve_hqp`` fits it by least squares.
@@ -113,7 +113,7 @@ def _solve_on_platform(max_iterations: int, backend: Backend, problem: Problem) 
     search = partial(_solve_levels, max_iterations, backend)
     kernels = {}
     _, _, m, n = problem.levels.matrix.shape
-    if takes(backend, "core-cuda", fits=_cuda.fits(n, m)):
+    if takes(backend, "core-cuda", fits=_cuda.fits(n, (m,), "saturation")):
         kernels["core-cuda"] = _kernel_candidates(max_iterations, search, partial(by_core, _cuda.saturate), None)
     if takes(backend, "core", fits=True):
         kernels["core"] = _kernel_candidates(max_iterations, search, partial(by_core, _library.call), BLOCK)
