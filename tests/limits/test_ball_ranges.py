@@ -176,7 +176,7 @@ def test_searches_turn_ball_joints_and_find_different_solutions():
     turned = [Rotation.from_rotvec(own) for own in angles * axes / np.linalg.norm(axes, axis=-1, keepdims=True)]
     position, rotation = (np.array(part) for part in zip(*map(tip, turned), strict=True))
     found = osik.inverse_kinematics(robot, {"tip": (position, rotation)}, all=True, seeds=16, restarts=0, closest=False)
-    assert found.converged.all()
+    assert found.converged.all() and found.count is not None and found.solutions is not None
     for at, (place, frame) in enumerate(zip(position, rotation, strict=True)):
         count = int(found.count[at])
         turns = Rotation.from_quat(np.asarray(found.solutions[at, :count]).reshape(-1, 4), scalar_first=True)
