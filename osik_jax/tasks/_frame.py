@@ -84,6 +84,7 @@ class FrameTask(PoseTask):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
         orientation_weight: ArrayLike | Array = RADIAN**2,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",

@@ -50,6 +50,7 @@ class VelocityTask(Task):
         dofs = dofs_of(robot, self.joints)
         wanted = self.wanted(dofs)
         return TaskRows(
+            # no error of the configuration and no gain: the rows ask for the velocity itself
             error=jnp.zeros_like(wanted),
             jacobian=jnp.asarray(np.eye(robot.nv)[dofs], wanted.dtype),
             lower=wanted,
@@ -107,6 +108,7 @@ class DampingTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
+        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
         weight = background_weight(robot) if weight is None else weight
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
 
@@ -231,6 +233,7 @@ class LowAccelerationTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
+        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
         weight = background_weight(robot) if weight is None else weight
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
