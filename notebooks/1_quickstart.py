@@ -247,7 +247,7 @@ else:
 def reach(p):
     """Where the hand ends, from its target p."""
     aimed = {**tasks, "hand": tasks["hand"].replace(target=(p, rotation))}
-    path = osik.rollout(robot, robot.q0, aimed, scheme=osik.WeightedQP(), limits=limits, dt=0.02, steps=STEPS // 2)
+    path = osik.rollout(robot, robot.q0, aimed, limits=limits, dt=0.02, steps=STEPS // 2)
     return jnp.linalg.norm(path.solution.error["hand"][-1]), path.solution.status.max()
 
 

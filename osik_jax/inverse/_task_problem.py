@@ -200,7 +200,7 @@ def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
 
 
 def _starts(robot: Robot, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Return the box of starts: limits or half a turn; free and ball joints keep their values."""
+    """Return the box of starts: limits or half a turn; free and ball joints keep their values here."""
     once, again = one_turn(lower, upper, first)
     wide = np.array(turns) & (upper - lower > TURN)
     width = np.zeros(robot.nq)

@@ -15,7 +15,7 @@ from ..control._step import velocity_problem
 from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..robot import Robot
-from ..robot._balls import with_balls_inside
+from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem, WeightedQP
 from ..tasks import AxisAlignTask, ContactTask, LookAtTask, Task, TaskRows
@@ -102,10 +102,21 @@ class TaskSearch(eqx.Module):
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
         """Return the starts of the searches: the first configuration, then points at growing distances from it."""
         del goal
-        points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
+        unit = unit_points(self.shift, seed, self.low.dtype)
+        points = self.low + (self.high - self.low) * unit
         ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
         ratio = jnp.where(seed == 0, 0.0, ratio)[:, None]
-        return jnp.clip(self.first + ratio * (points - self.first), self.lower, self.upper)
+        q = jnp.clip(self.first + ratio * (points - self.first), self.lower, self.upper)
+        return jax.vmap(self._with_balls_turned)(q, ratio * (2.0 * unit - 1.0))
+
+    def _with_balls_turned(self, q: Float[Array, " nq"], share: Float[Array, " nq"]) -> Float[Array, " nq"]:
+        """Return q with ball joints turned by shares of their range, or of half a turn; other joints stay."""
+        velocity = jnp.zeros_like(self.angles)
+        for joint in independent_balls(self.robot.tree):
+            entry, dof = self.robot.tree.qpos_address[joint] + 1, self.robot.tree.dof_address[joint]
+            greatest = jnp.minimum(self.angles[dof : dof + 3], jnp.pi)
+            velocity = velocity.at[dof : dof + 3].set(greatest * share[entry : entry + 3])
+        return self._moved(q, velocity) if independent_balls(self.robot.tree) else q
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
@@ -209,8 +220,17 @@ class TaskSearch(eqx.Module):
         return jnp.concatenate([jnp.zeros((0, self.robot.nv), q.dtype), *parts])
 
     def unwound(self, q: Float[Array, "*lanes nq"]) -> Float[Array, "*lanes nq"]:
-        """Return the same poses, each joint turned as near to the first configuration as its limits allow."""
-        return unwound(q, self.first, self.lower, self.upper, self.turns)
+        """Return the same poses, each joint turned as near to the first configuration as its limits allow.
+
+        Of the two quaternions of a ball joint's rotation it is the one nearer to that of the first configuration.
+        """
+        q = unwound(q, self.first, self.lower, self.upper, self.turns)
+        for joint in independent_balls(self.robot.tree):
+            entries = self.robot.tree.qpos_address[joint] + np.arange(4)
+            turn = q[..., entries]
+            is_far = jnp.sum(turn * self.first[entries], -1, keepdims=True) < 0.0
+            q = q.at[..., entries].set(jnp.where(is_far, -turn, turn))
+        return q
 
     def costs(self, q: Float[Array, "lanes nq"], goal: Aims) -> Float[Array, " lanes"]:
         """Return the costs that ``local_optima`` lowers: weighted errors, those of higher levels above all."""

@@ -77,12 +77,14 @@ class AngularMomentumTask(Task):
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per axis [kg m^2/s]."""
         del q
+        # the centroidal matrix has [linear; angular] rows
         kept = np.array([3 + "xyz".index(axis) for axis in self.axes])
         jacobian = centroidal_momentum_matrix(robot, kinematics)[kept]
         weight = jnp.broadcast_to(self.weight, (len(kept),))
         error = jnp.zeros(len(kept), jacobian.dtype)
         if self.lower is not None and self.upper is not None:
             return TaskRows(error, jacobian, self.lower, self.upper, weight, is_equality=False)
+        # momentum depends on velocities alone, so the rows ask for the target as it is, without a gain
         wanted = error if self.target is None else self.target
         return TaskRows(error, jacobian, wanted, wanted, weight, is_equality=True)
 

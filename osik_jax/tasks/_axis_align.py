@@ -55,7 +55,9 @@ class AxisAlignTask(PointingTask):
         direction, velocity = unit(self.target), self.target_velocity
         if self.target_frame is not None:
             direction, velocity = dot(rotations[1], direction), dot(rotations[1], velocity)
+            # where the direction turns with another frame, the relative turn counts
             spin = spin - jacobians[1, 3:]
+        # a direction d, seen from a frame that turns by w, changes by d x w; its own turning has the other sign
         turned = dot(turn, cross_matrix(direction))
         return self.pointing_rows(dot(turn, direction), dot(turned, spin), -dot(turned, velocity))
 

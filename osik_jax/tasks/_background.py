@@ -29,5 +29,6 @@ def angle_scale(robot: Robot) -> Float[Array, ""] | float:
     """Return the factor on weights of joint angles relative to distances: 1 for robots of half a metre or more."""
     size = robot_size(robot)
     if isinstance(size, float):
+        # squared, because weights multiply squared errors
         return min(max(size / _FULL_SIZE, _LEAST_SIZE / _FULL_SIZE), 1.0) ** 2
     return jnp.clip(size / _FULL_SIZE, _LEAST_SIZE / _FULL_SIZE, 1.0) ** 2

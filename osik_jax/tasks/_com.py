@@ -116,6 +116,7 @@ class ComTask(Task):
         if self.polygon is not None:
             return self._polygon_rows(self.polygon, point, jacobian, bound)
         axes = axis_numbers(self.axes)
+        # own minus wanted: the error's Jacobian is then that of the centre of mass, without a sign
         value = point[axes] if self.target is None else point[axes] - self.target
         return TaskRows.of(
             value,
@@ -135,6 +136,7 @@ class ComTask(Task):
         return TaskRows.of(
             value,
             jnp.matmul(polygon.normals, jacobian[:2], precision="highest"),
+            # normals point outward, so an edge binds on its upper side alone
             lower=jnp.full_like(value, -jnp.inf),
             upper=polygon.offsets,
             gain=self.gain,

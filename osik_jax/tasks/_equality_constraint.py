@@ -116,6 +116,7 @@ class EqualityConstraintTask(Task):
         parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
         counts = np.array([len(own) for own, _ in parts])
+        # one weight for each constraint, which its 3, 6 or 1 rows share
         weight = jnp.broadcast_to(self.weight, counts.shape)[np.repeat(np.arange(len(counts)), counts)]
         bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         rows = TaskRows.of(error, jacobian, gain=self.gain, weight=weight, curvature=bound)
@@ -155,6 +156,7 @@ class EqualityConstraintTask(Task):
         """Return the rotation rows of a weld."""
         first, second = turns
         wxyz = jaxlie.SO3.from_matrix(compose(second.T, compose(first, self.relative[weld]))).wxyz
+        # q and -q are one rotation; w >= 0 goes the short way round
         wxyz = jnp.where(wxyz[0] < 0.0, -wxyz, wxyz)
         rate = 0.5 * (wxyz[0] * jnp.eye(3, dtype=wxyz.dtype) - cross_matrix(wxyz[1:]))
         spin = jnp.matmul(compose(rate, second.T), angular[0] - angular[1], precision="highest")
@@ -168,6 +170,7 @@ class EqualityConstraintTask(Task):
             error, jacobian = qpos[_qpos(tree, name)] - constant, _column(tree, name, q.dtype)
             for other in leader:
                 x = qpos[_qpos(tree, other)]
+                # MuJoCo's sign: first joint minus the polynomial of the second
                 error = error - sum(c * x ** (k + 1) for k, c in enumerate(higher))
                 derivative = sum((k + 1) * c * x**k for k, c in enumerate(higher))
                 jacobian = jacobian - derivative * _column(tree, other, q.dtype)

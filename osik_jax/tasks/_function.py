@@ -119,6 +119,7 @@ class FunctionTask(Task):
 
         x, jacobian = jax.vmap(along, in_axes=-1, out_axes=(None, -1))(rates)
         return TaskRows.of(
+            # value minus target, so that the Jacobian is that of the function
             x if self.target is None else x - self.target,
             jacobian,
             gain=self.gain,
@@ -126,6 +127,7 @@ class FunctionTask(Task):
             lower=self.lower,
             upper=self.upper,
             feedforward=self.target_velocity,
+            # dofs that only translate bend no path
             curvature=partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0)),
         )
 

@@ -93,6 +93,7 @@ class JointCouplingTask(Task):
         dofs = np.array([robot.tree.dof_address[joint] for joint in self.joints])
         value = self._value(robot, q)
         return TaskRows.of(
+            # linear in q: the ratios are the Jacobian of value - target, and nothing bends
             value if self.target is None else value - self.target,
             jnp.zeros((1, robot.nv), self.ratios.dtype).at[0, dofs].set(self.ratios),
             gain=self.gain,

@@ -45,6 +45,7 @@ class VelocityTask(Task):
         self.priority, self.hard = check_priority(priority), hard
         dofs = dofs_of(robot, self.joints)
         self.row_count = len(dofs)
+        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
         self.weight = as_joint_weight(robot, background_weight(robot) if weight is None else weight, dofs)
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
@@ -58,6 +59,7 @@ class VelocityTask(Task):
         dofs = dofs_of(robot, self.joints)
         wanted = self.wanted(dofs)
         return TaskRows(
+            # no error of the configuration and no gain: the rows ask for the velocity itself
             error=jnp.zeros_like(wanted),
             jacobian=jnp.asarray(np.eye(robot.nv)[dofs], wanted.dtype),
             lower=wanted,

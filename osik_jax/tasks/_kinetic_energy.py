@@ -47,6 +47,7 @@ class KineticEnergyTask(Task):
         """Return nv rows: the square root of the mass matrix."""
         del q
         root = _root(mass_matrix(robot, kinematics))
+        # |U v|^2 = v' M v is twice the energy, and schemes halve squared rows: weight 1 counts the energy once
         zero = jnp.zeros(robot.nv, root.dtype)
         return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
 

@@ -119,6 +119,7 @@ class _Kept(LimitTask):
             own,
             lower=jnp.where(own.lower > 0.0, gain * own.lower, own.lower),
             upper=jnp.where(own.upper < 0.0, gain * own.upper, own.upper),
+            # an upper bound below 0 asks to come down: positive, as an error above its bound
             pull=jnp.maximum(-own.upper, 0.0) - jnp.maximum(own.lower, 0.0),
         )
 

@@ -69,6 +69,7 @@ class LookAtTask(PointingTask):
         sight = jnp.where(near, dot(rotation, unit(self.axis)), line / distance)
         narrowing = (jnp.eye(3, dtype=sight.dtype) - jnp.outer(sight, sight)) / distance
         turn = jnp.where(near, 0.0, rotation.T)
+        # the line follows the point and leaves the camera: minus its motion; seen from the turning camera, + sight x w
         rate = dot(narrowing, moves - jacobian[:3]) + dot(cross_matrix(sight), jacobian[3:])
         return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
 

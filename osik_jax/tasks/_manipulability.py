@@ -157,6 +157,7 @@ class ManipulabilityTask(Task):
 
     def _climb(self, robot: Robot, gradient: Float[Array, " nv"]) -> TaskRows:
         dofs = np.array(self.dofs)
+        # rows ask for -gain * error, so the joints go up where the error is minus the gradient
         error = -gradient[dofs]
         identity = jnp.asarray(np.eye(robot.nv)[dofs], error.dtype)
         weight = jnp.broadcast_to(self.weight, error.shape)

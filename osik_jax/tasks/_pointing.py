@@ -102,6 +102,7 @@ class PointingTask(FramedTask):
         error, derivative = deviation(unit(self.axis), direction)
         upper = None
         if self.half_angle is not None:
+            # the angle is the norm of the error, so its rate is the error's rate along the error
             derivative = dot(error, derivative)[None] / jnp.maximum(safe_norm(error), _TIP)
             error, upper = _rounded(jnp.sum(error**2))[None], _rounded(self.half_angle**2)[None]
         return TaskRows.of(
@@ -109,8 +110,10 @@ class PointingTask(FramedTask):
             dot(derivative, jacobian),
             gain=self.gain,
             weight=jnp.broadcast_to(self.weight, error.shape),
+            # an angle is never below 0: inside the cone nothing is asked
             lower=None if upper is None else jnp.full_like(upper, -jnp.inf),
             upper=upper,
+            # minus: the drift changes the error by itself, so the joints have to take it back
             feedforward=-dot(derivative, drift),
             curvature=partial(jacobian_curvature, jacobian=jacobian),
         )

@@ -135,6 +135,7 @@ def hull(points: np.ndarray) -> Polygon | None:
     if len(vertices) < 3:
         return None
     edges = np.roll(vertices, -1, 0) - vertices
+    # to the right of edges that go counter-clockwise: outward
     normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.linalg.norm(edges, axis=1, keepdims=True)
     return normals, np.sum(normals * vertices, 1), vertices
 

@@ -70,6 +70,7 @@ class PoseTask(FramedTask):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
         orientation_weight: ArrayLike | Array = RADIAN**2,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
@@ -155,10 +156,12 @@ class PoseTask(FramedTask):
         """Return error, Jacobian and feedforward of the logarithm of the pose in the target's frame."""
         wanted, own = self.target[1].T, rotation.T
         offset, between = dot(wanted, position - self.target[0]), dot(wanted, rotation)
+        # log(T*' T), the pose as seen from the target: it grows along the frame's own twist
         error, factor = pose_log(offset, between)
         twist = jnp.concatenate([dot(own, jacobian[:3]), dot(own, jacobian[3:])])
         target_twist = jnp.concatenate([dot(wanted, self.target_velocity[:3]), dot(wanted, self.target_velocity[3:])])
         feedforward = dot(factor, seen_from(offset, between, target_twist))
+        # the logarithm is in m and rad as well, so the same weights give a radian the same length
         weight = jnp.concatenate([self.position_weight, self.orientation_weight])
         return [(self.kept, (error, dot(factor, twist), feedforward, weight))], dot(_twice(rotation), factor.T)
 
@@ -185,11 +188,13 @@ class PoseTask(FramedTask):
 
     def _position_in_frame(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
         offset = position - self.target[0]
+        # the axes turn under the offset: d/dt R'(p - p*) = R'(p' + (p - p*) x w)
         turning = dot(cross_matrix(offset), jacobian[3:])
         own = rotation.T
         return dot(own, offset), dot(own, jacobian[:3] + turning), dot(own, self.target_velocity[:3])
 
     def _orientation_outside(self, rotation: Array, jacobian: Array) -> _Parts:
+        # R R*' is the turn from target to frame in the outer axes; R*' R is the same turn in the frame's axes
         between = dot(rotation, self.target[1].T)
         error = rotation_log(between)
         factor = self._factor(error)

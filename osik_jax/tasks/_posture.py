@@ -82,6 +82,7 @@ class PostureTask(Task):
         dofs = dofs_of(robot, self.joints)
         rows = len(dofs)
         if weight is None:
+            # a whole-body posture settles what goals leave open; named joints and bounds are goals themselves
             weight = background_weight(robot) if joints is None and lower is None and upper is None else 1.0
         self.weight = as_joint_weight(robot, weight, dofs)
         velocity = 0.0 if target_velocity is None else target_velocity
@@ -148,6 +149,7 @@ class PostureTask(Task):
             if kind in (FREE, BALL):
                 at, dof = row + width - 3, robot.tree.dof_address[joint] + width - 3
                 left = inverse_left_jacobian(error[at : at + 3])
+                # e = log(R*' R): its rate is left' w of the joint minus left w* of the target
                 jacobian = jacobian.at[at : at + 3, dof : dof + 3].set(left.T)
                 turned = jnp.matmul(left, self.target_velocity[at : at + 3], precision="highest")
                 feedforward = feedforward.at[at : at + 3].set(turned)

@@ -71,6 +71,7 @@ class RelativeFrameTask(PoseTask):
         lower: ArrayLike | Array | None = None,
         upper: ArrayLike | Array | None = None,
         position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
         orientation_weight: ArrayLike | Array = RADIAN**2,
         weight: ArrayLike | Array = 1.0,
         rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
@@ -119,6 +120,7 @@ class RelativeFrameTask(PoseTask):
         """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
         turn, (frame, root) = rotations[1].T, jacobians
         apart = positions[0] - positions[1]
+        # seen from a root that turns by w, a point at rest moves by apart x w
         linear = frame[:3] - root[:3] + dot(cross_matrix(apart), root[3:])
         jacobian = jnp.concatenate([dot(turn, linear), dot(turn, frame[3:] - root[3:])])
         return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian, backend)

@@ -39,6 +39,7 @@ class StayTask(Task):
         """Return the rows of the other task, whose error is the motion along them."""
         own = self.moving.rows(robot, kinematics, q)
         away = difference(robot, self.start, q)
+        # q minus q0 along the rows: 0 at the start, so the task asks for no motion there
         moved = away[jnp.array(own.dofs)] if own.dofs else jnp.matmul(own.jacobian, away, precision="highest")
         return TaskRows.of(
             moved,

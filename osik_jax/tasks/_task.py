@@ -113,11 +113,14 @@ class TaskRows(eqx.Module):
             no_curvature if dofs is not None else partial(jacobian_curvature, jacobian=jacobian)
         )
         if lower is None or upper is None:
+            # rows of weight 0 take no part, so their errors must not change an adaptive gain
             pull = evaluate_gain(gain, jnp.where(weight > 0.0, error, 0.0)) * error
+            # minus the pull: the velocity that takes the error to 0
             wanted = shift - pull
             return cls(
                 error, jacobian, wanted, wanted, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=True
             )
+        # signed like an error: positive above the interval, so that minus the pull leads back
         outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
         rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
         low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))

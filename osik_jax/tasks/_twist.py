@@ -34,4 +34,5 @@ def pose_log(
 def seen_from(position: Float[Array, "3"], rotation: Float[Array, "3 3"], twist: Float[Array, "6 ..."]) -> Array:
     """Return twists (6, ...) of a frame in its own axes as twists of a second frame, whose relative pose is given."""
     linear, angular = twist[:3], twist[3:]
+    # v + w x p at the second frame's origin, and w x p = -p x w
     return jnp.concatenate([dot(rotation.T, linear - dot(cross_matrix(position), angular)), dot(rotation.T, angular)])

@@ -101,10 +101,12 @@ class WheelTask(PlaneTask):
         del backend
         axle = dot(rotations[0], self.axis)
         ahead = unit(cross(axle, self.normal))
+        # axle x ahead points at the plane: for a level axle it is minus the normal
         spoke = self.radius * cross(axle, ahead)
         touching = jacobians[0, :3] + cross(jacobians[0, 3:], spoke[:, None], along=-2)
         directions = jnp.concatenate([self._rolling(ahead), self.normal[None]])
         height = dot(self.normal, positions[0] + spoke) - self.offset
+        # slip is a velocity without an error to feed back; only the height has one
         error = jnp.zeros(len(directions), height.dtype).at[-1].set(height)
         weight = jnp.broadcast_to(self.weight, error.shape)
         moves = jnp.concatenate([touching, jacobians[0, 3:]])

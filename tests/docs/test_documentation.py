@@ -62,7 +62,7 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
-IN_THE_GATE += ["reinforcement_learning", "porting", "jogging"]
+IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task"]
 AT_NIGHT = [
     "batches",
     "inverse_kinematics",
@@ -96,6 +96,13 @@ def test_code_runs(
         assert namespace["found"].converged
         assert abs(namespace["step"].error["hand"]).max() < 1e-4  # metres, after two seconds
         assert max(abs(namespace["step"].error[name]).max() for name in ("left foot", "right foot")) < 1e-4
+
+
+def test_the_lines_of_a_task_of_your_own_are_counted() -> None:
+    text = (ROOT / "docs" / "own_task.md").read_text()
+    lines = text.split("class DistanceTask")[1].split("```")[0].split("\n")
+    said = re.search(r"in (\d+) lines of one file", text)
+    assert said is not None and int(said[1]) == sum(bool(line.strip()) for line in lines)
 
 
 def test_readme_is_short() -> None:

@@ -16,7 +16,7 @@ from benchmarks.data_file import DATA, read_csv
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "features.md").read_text(encoding="utf-8")
 NONE = "—"
-COLUMNS = 11
+COLUMNS = 3
 
 
 def rows(page: str) -> list[tuple[str, list[str]]]:

@@ -154,3 +154,37 @@ def test_derivatives_are_finite_where_the_axis_is_not_known():
 
         for derivative in jax.jacrev(numbers, argnums=(0, 1))(q, 0.01):
             assert np.isfinite(derivative).all()
+
+
+@pytest.mark.slow
+def test_searches_turn_ball_joints_and_find_different_solutions():
+    """Two links on ball joints have a line of solutions for a pose; each is inside the ranges, and MuJoCo agrees."""
+    most, rng = 2.5, np.random.default_rng(3)
+    link = '<geom type="capsule" size=".02" fromto="0 0 0 .3 0 0"/>'
+    joint = f'<joint type="ball" range="0 {most}"/>{link}'
+    robot = osik.Robot.from_mjcf(f"""<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body>{joint}
+      <body pos=".4 0 0">{joint}<site name="tip" pos=".3 0 0"/></body></body></worldbody></mujoco>""")
+    data = mujoco.MjData(robot.mj_model)
+
+    def tip(turns: Rotation) -> tuple[np.ndarray, np.ndarray]:
+        data.qpos[:] = turns.as_quat(scalar_first=True).ravel()
+        mujoco.mj_kinematics(robot.mj_model, data)
+        return data.site("tip").xpos.copy(), data.site("tip").xmat.reshape(3, 3).copy()
+
+    axes = rng.normal(size=(4, 2, 3))
+    angles = np.broadcast_to([[2.4], [0.5]], (4, 2, 1))
+    turned = [Rotation.from_rotvec(own) for own in angles * axes / np.linalg.norm(axes, axis=-1, keepdims=True)]
+    position, rotation = (np.array(part) for part in zip(*map(tip, turned), strict=True))
+    found = osik.inverse_kinematics(robot, {"tip": (position, rotation)}, all=True, seeds=16, restarts=0, closest=False)
+    assert found.converged.all() and found.count is not None and found.solutions is not None
+    for at, (place, frame) in enumerate(zip(position, rotation, strict=True)):
+        count = int(found.count[at])
+        turns = Rotation.from_quat(np.asarray(found.solutions[at, :count]).reshape(-1, 4), scalar_first=True)
+        assert count >= 4 and turns.magnitude().max() <= most
+        first = turns[::2]
+        apart = [(first[i].inv() * first[j]).magnitude() for i in range(count) for j in range(i)]
+        assert min(apart) > 0.05
+        for own in range(count):
+            here, tilt = tip(turns[2 * own : 2 * own + 2])
+            assert np.linalg.norm(here - place) < 1e-3
+            assert (Rotation.from_matrix(tilt) * Rotation.from_matrix(frame).inv()).magnitude() < 1e-2
