@@ -42,7 +42,7 @@ class Runner:
         resident: of a batch, the configurations of all but so many robots stay on the device.
     """
 
-    packages = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
+    packages = ("osik-jax", "jax", "jaxlib", "mujoco", "numpy")
 
     def __init__(
         self,

@@ -62,7 +62,7 @@ def _print_system(console: Console) -> None:
 
     from ..core import _cuda, _library
 
-    packages = ", ".join(f"{name} {version(name)}" for name in ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx"))
+    packages = ", ".join(f"{name} {version(name)}" for name in ("osik-jax", "jax", "jaxlib", "mujoco"))
     nvrtc = _cuda.nvrtc() or "none; it comes with jax[cuda13] and jax[cuda12]"
     lines = (
         f"Python {platform.python_version()} on {platform.machine()}: {packages}",

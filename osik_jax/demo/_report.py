@@ -17,7 +17,7 @@ from ._figures import Figure
 from ._motion import Motion
 from ._run import TITLES, Run
 
-_PACKAGES = ("osik-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "equinox", "numpy", "scipy", "matplotlib")
+_PACKAGES = ("osik-jax", "jax", "jaxlib", "mujoco", "equinox", "numpy", "scipy", "matplotlib")
 
 
 def report(

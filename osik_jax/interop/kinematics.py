@@ -1,4 +1,4 @@
-"""Kinematics of other libraries in place of MJX's, for comparison and for robots of other libraries."""
+"""Kinematics of other libraries in place of our own, for comparison and for robots of other libraries."""
 
 from __future__ import annotations
 

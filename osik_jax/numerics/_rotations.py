@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikValueError
-from ._arguments import concrete
+from ._host import Numbers, module_of, to_jax
 
 ROUNDED = 0.02
 """Largest deviation from 1 of the length of a quaternion or a matrix column: numbers rounded to two or three digits."""
@@ -21,84 +22,86 @@ _ITERATIONS = 4
 """Number of Newton-Schulz iterations: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
 
 
-def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str], Array]:
-    """Decorate a function so that concrete arguments are evaluated during tracing and stay constants."""
-
-    @wraps(function)
-    def evaluated(given: Array, what: str) -> Array:
-        if concrete(given) is None:
-            return function(given, what)
-        with jax.ensure_compile_time_eval():
-            return function(given, what)
-
-    return evaluated
+_Result = tuple[Numbers, Bool[Numbers, "*B"]]
 
 
-@_evaluated
-def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:
-    """Return quaternions divided by their lengths, which must be 1 within 2 %.
+def _exact(function: Callable[[Any], _Result], given: Array, what: str, right: str) -> Array:
+    """Return the first result; concrete arguments are computed on the host and stay concrete while a program is traced.
+
+    Raises:
+        ValueError: as ``_refuse``, where the second result is false.
+    """
+    if isinstance(given, Tracer):
+        return jax.jit(function)(given)[0]
+    with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+        out, valid = function(np.asarray(given))
+        _refuse(valid, given, what, right)
+        return out if isinstance(given, np.ndarray) else to_jax(out)
+
+
+def exact_quaternion(given: Float[Numbers, "*B 4"], what: str) -> Float[Numbers, "*B 4"]:
+    """Return quaternions divided by their lengths, which must be 1 within 2 %; the result is an array of the same kind.
 
     Raises:
         ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
             length becomes NaN.
     """
-    quaternion, valid = _unit_quaternion(given)
-    _refuse(valid, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
-    return quaternion
+    return _exact(_unit_quaternion, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
 
 
-# compiled as one program, like _nearest_rotation: on a GPU, operations run one by one take milliseconds
-@jax.jit
-def _unit_quaternion(given: Float[Array, "*B 4"]) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
-    squared = jnp.sum(given**2, -1, keepdims=True)
+def _unit_quaternion(given: Float[Numbers, "*B 4"]) -> tuple[Float[Numbers, "*B 4"], Bool[Numbers, "*B"]]:
+    xp = module_of(given)
+    squared = (given**2).sum(-1, keepdims=True)
     valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
-    safe = jnp.where(valid, given, jnp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
-    length = jnp.sqrt(jnp.sum(safe**2, -1, keepdims=True))
-    return jnp.where(valid, safe / length, jnp.nan), valid[..., 0]
+    safe = xp.where(valid, given, np.eye(1, 4, dtype=given.dtype)[0])
+    length = xp.sqrt((safe**2).sum(-1, keepdims=True))
+    return xp.where(valid, safe / length, np.nan), valid[..., 0]
 
 
-@_evaluated
-def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B 3 3"]:
+def exact_rotation(given: Float[Numbers, "*B 3 3"], what: str) -> Float[Numbers, "*B 3 3"]:
     """Return the rotation matrices nearest to the given ones, whose columns must have length 1 within 2 %.
+
+    The result is an array of the same kind.
 
     Raises:
         ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
             becomes NaN if it is traced.
     """
-    rotation, valid = _nearest_rotation(given)
-    _refuse(valid, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
-    return rotation
+    return _exact(_nearest_rotation, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
 
 
-@jax.jit
-def _nearest_rotation(given: Float[Array, "*B 3 3"]) -> tuple[Float[Array, "*B 3 3"], Bool[Array, "*B"]]:
-    eye = jnp.eye(3, dtype=given.dtype)
-    residual = jnp.max(jnp.abs(_product(given, jnp.swapaxes(given, -1, -2)) - eye), (-1, -2), keepdims=True)
+def _nearest_rotation(given: Float[Numbers, "*B 3 3"]) -> tuple[Float[Numbers, "*B 3 3"], Bool[Numbers, "*B"]]:
+    xp = module_of(given)
+    eye = np.eye(3, dtype=given.dtype)
+    residual = abs(_product(given, given.swapaxes(-1, -2)) - eye).max((-1, -2), keepdims=True)
     first, second, third = (given[..., k, :] for k in range(3))
-    right_handed = jnp.sum(jnp.cross(first, second) * third, -1)[..., None, None] > 0.0
+    right_handed = (xp.cross(first, second) * third).sum(-1)[..., None, None] > 0.0
     valid = (residual <= (1.0 + ROUNDED) ** 2 - 1.0) & right_handed
     exact = residual <= _EXACT * float(jnp.finfo(given.dtype).eps)
-    safe = jnp.where(valid, given, eye)
-    rotation = jax.lax.cond(jnp.all(exact), lambda matrix: matrix, _nearest, safe)
-    return jnp.where(valid, jnp.where(exact, safe, rotation), jnp.nan), valid[..., 0, 0]
+    safe = xp.where(valid, given, eye)
+    if xp is np:
+        rotation = safe if exact.all() else _nearest(safe)
+    else:
+        rotation = jax.lax.cond(exact.all(), lambda matrix: matrix, _nearest, safe)
+    return xp.where(valid, xp.where(exact, safe, rotation), np.nan), valid[..., 0, 0]
 
 
-def _nearest(matrix: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
+def _nearest(matrix: Float[Numbers, "*B 3 3"]) -> Float[Numbers, "*B 3 3"]:
     """Return the orthogonal factor of the polar decomposition (Higham, "Functions of Matrices", 2008, section 8.3)."""
     for _ in range(_ITERATIONS):
-        gram = _product(jnp.swapaxes(matrix, -1, -2), matrix)
+        gram = _product(matrix.swapaxes(-1, -2), matrix)
         matrix = 1.5 * matrix - 0.5 * _product(matrix, gram)
     return matrix
 
 
-def _product(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
-    return jnp.matmul(a, b, precision="highest")
+def _product(a: Float[Numbers, "*B 3 3"], b: Float[Numbers, "*B 3 3"]) -> Float[Numbers, "*B 3 3"]:
+    return np.matmul(a, b) if module_of(a) is np else jnp.matmul(a, b, precision="highest")
 
 
-def _refuse(valid: Bool[Array, "*B"], given: Array, what: str, right: str) -> None:
-    """Raise ValueError with the first invalid concrete value and the indices of up to ten of them."""
-    seen, values = concrete(valid), concrete(given)
-    if seen is None or values is None or seen.all():
+def _refuse(valid: Any, given: Array, what: str, right: str) -> None:
+    """Raise ValueError with the first invalid value and the indices of up to ten of them."""
+    seen, values = np.asarray(valid), np.asarray(given)
+    if seen.all():
         return
     if seen.ndim == 0:
         raise OsikValueError(f"{what} is not one: {right}, got {values.tolist()}")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
+from ..numerics._host import module_of
 from ._load_report import LoadReport
 from ._tree import FREE, KinematicTree, ModelHolder, check_shape
 
@@ -121,4 +121,4 @@ class RobotModel(eqx.Module):
         """
         check_shape(self.tree, q, "q")
         index, coefficient = self.tree.qpos_source
-        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
+        return module_of(self.qpos_offset).asarray(q)[index] * coefficient + self.qpos_offset

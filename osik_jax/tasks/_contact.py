@@ -13,6 +13,7 @@ from .._errors import OsikTypeError
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..kinematics._rigid import cross
+from ..numerics._host import on_host
 from ..robot import Robot
 from ._curvature import jacobian_curvature, pose_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -103,10 +104,11 @@ class ContactTask(PlaneTask):
         self.point = as_vector(point, (3,), "point", dtype)
         self.normal = as_normal(normal, dtype)
         held = as_pose(home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor, dtype)
-        height = dot(self.normal, held[0] + dot(held[1], self.point)) if offset is None else offset
+        position, rotation, up, point = map(on_host, (*held, self.normal, self.point))
+        height = dot(up, position + dot(rotation, point)) if offset is None else offset
         self.offset = as_offset(height, dtype)
         self.anchor = None if sliding else held
-        standing = dot(held[1].T, self.normal) if axis is None else axis
+        standing = dot(rotation.T, up) if axis is None else axis
         self.axis = as_normal(standing, dtype) if contact == "plane" else None
 
     @property

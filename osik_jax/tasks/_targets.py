@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
+from ..kinematics._rigid import rotation_matrix
+from ..numerics._host import Numbers, is_traced, to_host, to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
@@ -39,29 +41,31 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
         value: the pose.
         dtype: of the result.
         rest: position and rotation where the value has only the other part; None: the value has to have that part.
-        numbers: module that makes arrays of what is not computed, ``jax.numpy`` or ``numpy``.
+        numbers: module of the result's arrays, ``jax.numpy`` or ``numpy``; of traced values always ``jax.numpy``.
 
     Raises:
         TypeError: no numbers.
         ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
     """
-    parts = pose_parts(value, dtype, numbers=numbers)
+    own = jnp if is_traced(value) else np
+    parts = pose_parts(value, dtype, numbers=own)
     if parts is None:
-        array = pose_array(value, dtype, numbers=numbers)
+        array = pose_array(value, dtype, numbers=own)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
             _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
-            parts = array, jnp.asarray(rest[1], dtype)
+            parts = array, rest[1].astype(dtype)
         elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
-            parts = jnp.asarray(rest[0], dtype), array
+            parts = rest[0].astype(dtype), array
         else:
             raise _unfit(f"an array of shape {array.shape}", rest)
     position, rotation = parts
     if position.shape != (3,) or rotation.shape not in ((3, 3), (4,)):
         raise _unfit(f"a pair of shapes {position.shape} and {rotation.shape}", rest)
     check_finite(position, "the target's position")
-    return position, _rotation(rotation)
+    rotation = _rotation(rotation)
+    return (position, rotation) if numbers is np else (to_jax(position), to_jax(rotation))
 
 
 def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Array, Array] | None:
@@ -71,13 +75,14 @@ def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
         TypeError: as ``pose_array``.
     """
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
-        return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
+        both = numbers.asarray(value.wxyz_xyz, dtype)
+        return both[..., 4:], both[..., :4]
     if isinstance(value, (tuple, list)) and len(value) == 2:
         return pose_array(value[0], dtype, accepted, numbers), pose_array(value[1], dtype, accepted, numbers)
     return None
 
 
-def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Array:
+def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Numbers:
     """Return the numbers of an array, or of an object that has a matrix.
 
     Raises:
@@ -88,7 +93,7 @@ def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
     elif hasattr(value, "homogeneous"):
         value = value.homogeneous
     try:
-        return numbers.asarray(value, dtype)
+        return to_host(value, dtype) if numbers is np else numbers.asarray(value, dtype)
     except (TypeError, ValueError):
         raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted}") from None
 
@@ -99,10 +104,10 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
     return OsikValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
 
 
-def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
+def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"]) -> Float[Numbers, "3 3"]:
     """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
-        return jaxlie.SO3(exact_quaternion(given, "the target's quaternion")).as_matrix()
+        return rotation_matrix(exact_quaternion(given, "the target's quaternion"))
     return exact_rotation(given, "the target's rotation")
 
 
