@@ -7,7 +7,7 @@ import mujoco
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
-from ..numerics._host import module_of
+from ..numerics._host import Numbers, module_of
 from ._load_report import LoadReport
 from ._tree import FREE, KinematicTree, ModelHolder, check_shape
 
@@ -113,7 +113,7 @@ class RobotModel(eqx.Module):
         """
         return self.tree.dof_address[self.tree.owner(name)]
 
-    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
+    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Numbers, " nqfull"]:
         """Return the configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,).
 
         Raises:
