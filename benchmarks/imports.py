@@ -1,4 +1,4 @@
-"""Time of ``import osik_jax`` beside what it cannot do without, jax and mujoco.mjx.
+"""Time of ``import osik_jax`` beside what it cannot do without.
 
     python -m benchmarks.imports [--runs 20]
 
@@ -15,7 +15,7 @@ import sys
 
 import numpy as np
 
-STATEMENTS = ("import jax, mujoco.mjx", "import jax, mujoco.mjx, equinox, jaxlie", "import osik_jax")
+STATEMENTS = ("import jax, mujoco", "import jax, mujoco, equinox, jaxlie", "import osik_jax")
 
 
 def seconds(statement: str) -> float:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import scipy.spatial
+import scipy  # loads its parts when they are used
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..numerics._arguments import concrete
+from ..numerics._host import to_jax
 from ..numerics._rotations import exact_rotation
 from ._geometry import Kind, UnitCore, convex_hull
 
@@ -49,7 +50,7 @@ class CollisionShape(eqx.Module):
         Raises:
             ValueError: a size that is not positive, or a wrong shape.
         """
-        return cls(Kind.SEGMENT, frame, _vector(position, "position"), jnp.eye(3), _sizes(radius))
+        return cls(Kind.SEGMENT, frame, _vector(position, "position"), _rotation(None), _sizes(radius))
 
     @classmethod
     def capsule(
@@ -144,11 +145,13 @@ class CollisionShape(eqx.Module):
             ValueError: as in ``box``; the points lie in a plane.
         """
         hull = convex_hull(np.asarray(points, float))
-        return cls(Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), jnp.ones(3), hull)
+        return cls(
+            Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), to_jax(np.ones(3), float), hull
+        )
 
 
 def _vector(value: Any, what: str) -> Float[Array, "3"]:
-    out = jnp.asarray(value, float)
+    out = to_jax(value, float)
     if out.shape != (3,):
         raise OsikValueError(f"{what} has shape {out.shape}, expected (3,)")
     return out
@@ -158,7 +161,7 @@ def _sizes(*sizes: Any) -> Float[Array, "3"]:
     """Return MuJoCo's sizes: the given ones, which have to be positive, then zeros."""
     for size in sizes:
         _check_positive(size, "a size")
-    return jnp.stack([jnp.asarray(size, float) for size in (*sizes, 0.0, 0.0)[:3]])
+    return to_jax([*sizes, 0.0, 0.0][:3], float)
 
 
 def _check_positive(value: Any, what: str) -> None:
@@ -169,8 +172,8 @@ def _check_positive(value: Any, what: str) -> None:
 
 def _rotation(value: Any) -> Float[Array, "3 3"]:
     if value is None:
-        return jnp.eye(3)
-    out = jnp.asarray(value, float)
+        return to_jax(np.eye(3), float)
+    out = to_jax(value, float)
     if out.shape != (3, 3):
         raise OsikValueError(f"rotation has shape {out.shape}, expected (3, 3)")
     return exact_rotation(out, "rotation")

@@ -74,8 +74,8 @@ class Clutch(Replaceable):
         self.engaged = jnp.asarray(False)
         self.scale = as_scalar(scale, "scale", dtype)
         origin = jnp.zeros(3, dtype)
-        self.axes = jnp.eye(3, dtype=dtype) if axes is None else as_pose((origin, axes), dtype, numbers=jnp)[1]
-        self.frame = self.anchor = self.target = as_pose(frame, dtype, numbers=jnp)
+        self.axes = jnp.eye(3, dtype=dtype) if axes is None else as_pose((origin, axes), dtype)[1]
+        self.frame = self.anchor = self.target = as_pose(frame, dtype)
         self.device = origin, jnp.eye(3, dtype=dtype)
         self._check()
 
@@ -98,7 +98,7 @@ class Clutch(Replaceable):
 
 @jax.jit
 def _step(clutch: _Own, engaged: Array, device: PoseLike, frame: PoseLike) -> tuple[_Own, Pose]:
-    device, frame = (as_pose(pose, clutch.scale.dtype, numbers=jnp) for pose in (device, frame))
+    device, frame = (as_pose(pose, clutch.scale.dtype) for pose in (device, frame))
     tracked = jnp.isfinite(device[0]).all() & jnp.isfinite(device[1]).all()
     pressed, device = engaged & tracked, _choose(tracked, device, clutch.device)
     here = _choose(_is_at_rest(frame, clutch.frame), clutch.target, frame)

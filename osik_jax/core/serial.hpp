@@ -223,7 +223,7 @@ template <class R> struct Serial {
   }
   // the first `count` numbers of a vector in memory, then zeros; the places of these zeros are read too
   OSIK_FN static Value first_of(const Real* a, int count) {
-    Mask m;
+    Mask m{};
     for (int k = 0; k < LANES; ++k) m[k] = k < count ? -1 : 0;
     return (Value)((Mask) * (const Loaded*)a & m);
   }

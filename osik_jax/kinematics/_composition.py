@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..execution._rules import custom_jvp
+from ..numerics._host import Numbers, module_of
 from ..robot._tree import KinematicTree
 from ._rigid import compose, cross, rotate
 
-Poses = tuple[Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]
+Poses = tuple[Float[Numbers, "nbody 3"], Float[Numbers, "nbody 3 3"]]
 
 
-def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation: Float[Array, "nbody 3 3"]) -> Poses:
+def world_poses(
+    tree: KinematicTree, position: Float[Numbers, "nbody 3"], rotation: Float[Numbers, "nbody 3 3"]
+) -> Poses:
     """Return the poses of all bodies in the world from their poses relative to their parents.
 
     Row 0 is the world: 0 and the identity. Rotations must be exact.
@@ -26,6 +29,8 @@ def world_poses(tree: KinematicTree, position: Float[Array, "nbody 3"], rotation
     The derivative sums velocities over each body's ancestors, by one product with a constant matrix. It costs the same
     in both modes and for any depth.
     """
+    if module_of(position) is np:
+        return reduce(_doubled, tree.doublings, (position, rotation))
     return _composer(tree)(position, rotation)
 
 
@@ -71,7 +76,7 @@ def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
     return poses
 
 
-def _doubled(poses: Poses, above: Array) -> Poses:
+def _doubled(poses: Poses, above: Numbers) -> Poses:
     """Return the poses of one round: each relative to an ancestor twice as far above."""
     position, rotation = poses
     turn = rotation[above]

@@ -19,6 +19,7 @@ from ..core import _cuda
 from ..execution._backends import Backend, takes
 from ..execution._computed import by_kernel
 from ..execution._platform import cuda_is_default
+from ..numerics._host import Numbers, is_traced, module_of, to_jax
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._made_for import check_robot
@@ -27,7 +28,7 @@ from ..robot.loading._mjmodel import LEAST_MASS
 from . import _kernels
 from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
-from ._rigid import compose, cross, rotate, rotation_matrix
+from ._rigid import compose, cross, rotate
 
 Moving = tuple[Float[Array, "k 3"], Float[Array, "k 3 3"], Float[Array, "k 6 nv"]]
 
@@ -44,11 +45,11 @@ class Kinematics(eqx.Module):
         backend: backend of these arrays, and of Jacobians made from them; see ``WeightedQP.backend`` (static).
     """
 
-    body_position: Float[Array, "nbody 3"]
-    body_rotation: Float[Array, "nbody 3 3"]
-    dof_linear: Float[Array, "nvfull 3"]
-    dof_angular: Float[Array, "nvfull 3"]
-    dof_anchor: Float[Array, "nvfull 3"]
+    body_position: Float[Numbers, "nbody 3"]
+    body_rotation: Float[Numbers, "nbody 3 3"]
+    dof_linear: Float[Numbers, "nvfull 3"]
+    dof_angular: Float[Numbers, "nvfull 3"]
+    dof_anchor: Float[Numbers, "nvfull 3"]
     backend: Backend = eqx.field(default="jax", static=True)
 
     def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
@@ -65,7 +66,8 @@ class Kinematics(eqx.Module):
         Raises:
             KeyError: no such frame.
         """
-        return _one(_poses_of(robot, self, (name,)))
+        poses = _poses_of(robot, self, (name,))
+        return _first(poses) if module_of(poses[0]) is np else _one(poses)
 
     def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
         """Return positions and rotations of several frames.
@@ -76,27 +78,33 @@ class Kinematics(eqx.Module):
         return _poses_of(robot, self, names)
 
 
-@jax.jit
-def _one(arrays: Any) -> Any:
+def _first(arrays: Any) -> Any:
     """Return the first of each array's rows."""
     return jax.tree.map(lambda a: a[0], arrays)
+
+
+_one = jax.jit(_first)
 
 
 # functions in place of methods: Equinox copies its object at each call of a method
 def _poses_of(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> tuple[Array, Array]:
     frames = tuple(robot.tree.frame(name) for name in names)
     poses, fixed = (kinematics.body_position, kinematics.body_rotation), (robot.frame_position, robot.frame_rotation)
+    if module_of(poses[0]) is np and not is_traced(fixed):
+        return _place_frames(robot.tree, frames, *map(np.asarray, (*poses, *fixed)))
     return _frame_poses(robot.tree, frames, *poses, *fixed)
 
 
-@partial(jax.jit, static_argnums=(0, 1), inline=True)
-def _frame_poses(
-    tree: KinematicTree, frames: tuple[int, ...], position: Array, rotation: Array, offset: Array, turn: Array
-) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+def _place_frames(
+    tree: KinematicTree, frames: tuple[int, ...], position: Numbers, rotation: Numbers, offset: Numbers, turn: Numbers
+) -> tuple[Float[Numbers, "k 3"], Float[Numbers, "k 3 3"]]:
     ids = np.array(frames, int)
     bodies = np.asarray(tree.frame_bodies, int)[ids]
     rotations = rotation[bodies]
     return position[bodies] + rotate(rotations, offset[ids]), compose(rotations, turn[ids])
+
+
+_frame_poses = jax.jit(_place_frames, static_argnums=(0, 1), inline=True)
 
 
 def check_kinematics(robot: Robot, kinematics: Any) -> None:
@@ -133,18 +141,20 @@ def forward_kinematics(robot: Robot, q: Num[ArrayLike, " nq"] | Sequence[float])
     return _forward_kinematics(robot, jnp.asarray(q))
 
 
-@jax.jit
-def _forward_kinematics(robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
+def kinematics_at(robot: Robot, q: Float[Numbers, " nq"]) -> Kinematics:
     local = joint_transforms(robot, robot.mujoco_qpos(q))
-    position, rotation = world_poses(robot.tree, local.xpos, rotation_matrix(local.xquat))
+    position, rotation = world_poses(robot.tree, local.position, local.rotation)
     joint_parents = robot.tree.parents[np.asarray(robot.tree.joint_bodies, int)]
     turn = rotation[joint_parents]
-    anchor = position[joint_parents] + rotate(turn, local.xanchor)
-    linear, angular = _motion_axes(robot.tree, rotate(turn, local.xaxis), rotation)
+    anchor = position[joint_parents] + rotate(turn, local.anchor)
+    linear, angular = _motion_axes(robot.tree, rotate(turn, local.axis), rotation)
     anchor = anchor[robot.tree.dof_joint]
-    if cuda_is_default():  # or XLA gathers them anew in each Jacobian
+    if module_of(q) is jnp and cuda_is_default():  # or XLA gathers them anew in each Jacobian
         linear, angular, anchor = jax.lax.optimization_barrier((linear, angular, anchor))
     return Kinematics(position, rotation, linear, angular, anchor)
+
+
+_forward_kinematics = jax.jit(kinematics_at)
 
 
 def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
@@ -214,13 +224,17 @@ def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = N
         ValueError: the subtree has no mass, or the scene has several trees that may be the robot.
     """
     check_kinematics(robot, kinematics)
-    mass = body_masses(robot, subtree)
-    return _center(mass, robot.body_com, kinematics.body_position, kinematics.body_rotation)
+    arrays = body_masses(robot, subtree), robot.body_com, kinematics.body_position, kinematics.body_rotation
+    if module_of(kinematics.body_position) is np and not is_traced(arrays):
+        return _mean(*map(np.asarray, arrays))
+    return _center(*arrays)
 
 
-@partial(jax.jit, inline=True)
-def _center(mass: Array, center: Array, position: Array, rotation: Array) -> Float[Array, "3"]:
-    return jnp.sum(_moments(mass, center, position, rotation), 0) / jnp.sum(mass)
+def _mean(mass: Numbers, center: Numbers, position: Numbers, rotation: Numbers) -> Float[Numbers, "3"]:
+    return _moments(mass, center, position, rotation).sum(0) / mass.sum()
+
+
+_center = jax.jit(_mean, inline=True)
 
 
 def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3 nv"]:
@@ -280,22 +294,22 @@ def independent_columns(tree: KinematicTree, jacobian: Float[Array, "... nvfull"
 
 
 def _motion_axes(
-    tree: KinematicTree, axis: Float[Array, "njoint 3"], rotation: Float[Array, "nbody 3 3"]
-) -> tuple[Float[Array, "nvfull 3"], Float[Array, "nvfull 3"]]:
+    tree: KinematicTree, axis: Float[Numbers, "njoint 3"], rotation: Float[Numbers, "nbody 3 3"]
+) -> tuple[Float[Numbers, "nvfull 3"], Float[Numbers, "nvfull 3"]]:
     """Return the linear and angular direction of each dof, in the world: MuJoCo's tangent convention."""
-    kinds, number = dof_kinds(tree)
+    xp, (kinds, number) = module_of(axis), dof_kinds(tree)
     hinge, slide = kinds == HINGE, kinds == SLIDE
     translates = (kinds == FREE) & (number < 3)
     turns = (kinds == BALL) | ((kinds == FREE) & (number >= 3))
     own = axis[tree.dof_joint]
-    angular = jnp.where(hinge[:, None], own, 0.0)
-    linear = jnp.where(slide[:, None], own, 0.0) + np.eye(3)[number % 3] * translates[:, None]
+    angular = xp.where(hinge[:, None], own, 0.0)
+    linear = xp.where(slide[:, None], own, 0.0) + np.eye(3)[number % 3] * translates[:, None]
     if turns.any():
-        angular = jnp.where(turns[:, None], rotation[tree.dof_body, :, number % 3], angular)
+        angular = xp.where(turns[:, None], rotation[tree.dof_body, :, number % 3], angular)
     return linear, angular
 
 
-def _moments(mass: Array, center: Array, position: Array, rotation: Array) -> Float[Array, "nbody 3"]:
+def _moments(mass: Numbers, center: Numbers, position: Numbers, rotation: Numbers) -> Float[Numbers, "nbody 3"]:
     """Return each body's mass times its centre of mass in the world [kg m]."""
     return mass[:, None] * (position + rotate(rotation, center))
 
@@ -314,11 +328,16 @@ def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbod
                 "the robot has no mass, so it has no centre of mass, momentum or kinetic energy: "
                 "give a link of its file an inertial"
             )
-        return mass if own[1:].all() else jnp.where(own, mass, 0.0)
+        return mass if own[1:].all() else _masked(mass, own)
     below = tree.descendants[tree.frame_bodies[tree.frame(subtree)]]
     if not isinstance(mass, Tracer) and not np.asarray(mass)[below].sum() > 0.0:
         raise OsikValueError(f"the subtree of {subtree!r} has no mass, so it has no centre of mass")
-    return jnp.where(below, mass, 0.0)
+    return _masked(mass, below)
+
+
+def _masked(mass: Float[Array, " nbody"], own: np.ndarray) -> Float[Array, " nbody"]:
+    """Return the masses, 0 where a body is not own."""
+    return jnp.where(own, mass, 0.0) if isinstance(mass, Tracer) else to_jax(np.where(own, np.asarray(mass), 0.0))
 
 
 def _fields(robot: Robot, q: Float[Array, " nq"]) -> tuple[Array, ...]:

@@ -9,38 +9,41 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
+
+from ..numerics._host import Numbers, module_of
 
 _GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)).mT
 """``[x]``, ``[y]`` and ``[z]``: the matrices of cross products with the axes."""
 
 
-def rotation_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
+def rotation_matrix(quaternion: Float[Numbers, "... 4"]) -> Float[Numbers, "... 3 3"]:
     """Return the rotation of a quaternion w, x, y, z of any length but 0.
 
     Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries.
     """
     dtype = quaternion.dtype
-    half = quaternion * jnp.sqrt(2.0 / jnp.sum(quaternion**2, -1, keepdims=True))  # its products are twice a unit one's
+    # its products are twice a unit one's
+    half = quaternion * module_of(quaternion).sqrt(2.0 / (quaternion**2).sum(-1, keepdims=True))
     (w, x, y, z), v = (half[..., i, None, None] for i in range(4)), half[..., 1:]
     turn = w * sum(a * generator for a, generator in zip((x, y, z), _GENERATORS.astype(dtype), strict=True))
     stretch = (1.0 - (x * x + y * y + z * z)) * np.eye(3, dtype=dtype)
     return stretch + v[..., :, None] * v[..., None, :] + turn
 
 
-def rotate(rotation: Float[Array, "... 3 3"], vector: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
+def rotate(rotation: Float[Numbers, "... 3 3"], vector: Float[Numbers, "... 3"]) -> Float[Numbers, "... 3"]:
     """Return R x."""
     x, y, z = (rotation[..., i] * vector[..., i, None] for i in range(3))
     return x + y + z
 
 
-def compose(a: Float[Array, "... 3 3"], b: Float[Array, "... 3 3"]) -> Float[Array, "... 3 3"]:
+def compose(a: Float[Numbers, "... 3 3"], b: Float[Numbers, "... 3 3"]) -> Float[Numbers, "... 3 3"]:
     """Return A B."""
     x, y, z = (a[..., i, None] * b[..., i, None, :] for i in range(3))
     return x + y + z
 
 
-def cross(a: Float[Array, "..."], b: Float[Array, "..."], *, along: int = -1) -> Float[Array, "..."]:
+def cross(a: Float[Numbers, "..."], b: Float[Numbers, "..."], *, along: int = -1) -> Float[Numbers, "..."]:
     """Return a x b, along an axis of length 3."""
     ax, ay, az = (jax.lax.index_in_dim(a, i, along, keepdims=False) for i in range(3))
     bx, by, bz = (jax.lax.index_in_dim(b, i, along, keepdims=False) for i in range(3))

@@ -87,7 +87,7 @@ class AccelerationLimit(Limit):
                 "the robot has no acceleration limits of its own: give acceleration, such as {'*': 10.0} in rad/s^2"
             )
         self.acceleration = dof_values(robot, acceleration, robot.acceleration_limit, "acceleration")
-        self.velocity = dof_values(robot, velocity, jnp.zeros(robot.nv), "velocity")
+        self.velocity = dof_values(robot, velocity, np.zeros(robot.nv), "velocity")
         ranges = ConfigurationLimit(robot, lower=lower, upper=upper, return_speed=return_speed)
         self.lower, self.upper, self.return_speed = ranges.lower, ranges.upper, ranges.return_speed
         self._check(dof_names(robot))

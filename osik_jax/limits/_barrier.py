@@ -12,6 +12,7 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics, frame_jacobian
 from ..numerics._arguments import as_bounds, as_scalar, check_bounds, concrete
 from ..numerics._guarded import at_most_inverse
+from ..numerics._host import on_host, to_jax
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -59,8 +60,8 @@ class PositionBarrier(Limit):
     ):
         robot.tree.frame(frame)
         self.frame, dtype = frame, robot.q0.dtype
-        given = jnp.asarray(np.eye(3) if normals is None else normals, dtype)
-        self.normals = jnp.atleast_2d(given)
+        given = on_host(to_jax(np.eye(3) if normals is None else normals, dtype))
+        self.normals = to_jax(given[None] if given.ndim == 1 else given)
         if self.normals.ndim != 2 or self.normals.shape[1] != 3:
             raise OsikValueError(f"normals has shape {given.shape}, expected (m, 3) or (3,)")
         low, high = as_bounds(lower, upper, len(self.normals), dtype)

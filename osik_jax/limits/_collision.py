@@ -23,6 +23,7 @@ from ..kinematics import Kinematics
 from ..kinematics._home import home_kinematics
 from ..numerics._arguments import as_scalar, as_vector, concrete
 from ..numerics._guarded import at_most_inverse
+from ..numerics._host import to_jax
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -307,14 +308,14 @@ def _assembled(
         *(_stacked([getattr(shapes[name], field) for name in added], like, dtype) for field, like in _PLACED)
     )
     cores = padded([hulls[k] for k in hulled]) if hulled else None
-    return scene, placed, jax.tree.map(lambda rows: jnp.asarray(rows, dtype), cores)
+    return scene, placed, jax.tree.map(lambda rows: to_jax(rows, dtype), cores)
 
 
 _PLACED = (("position", (3,)), ("rotation", (3, 3)), ("size", (3,)))
 
 
 def _stacked(values: Sequence[Array], shape: tuple[int, ...], dtype: Any) -> Array:
-    return jnp.stack([jnp.asarray(value, dtype) for value in values]) if values else jnp.zeros((0, *shape), dtype)
+    return to_jax(values if values else np.zeros((0, *shape)), dtype)
 
 
 def _taking_part(pairs: Sequence[tuple[int, int]]) -> list[int]:

@@ -15,6 +15,7 @@ from ..kinematics import Kinematics
 from ..numerics._arguments import check_bounds, concrete, entries
 from ..numerics._constants import RANGE_ROUNDOFF
 from ..numerics._guarded import rate_of_way
+from ..numerics._host import Numbers, module_of, on_host, to_jax
 from ..robot import Robot
 from ..robot._balls import independent_balls
 from ..robot._joint_selection import dof_names, dof_values, dofs_of, scalar_layout
@@ -135,7 +136,7 @@ class ConfigurationLimit(Limit):
 
     def _convert(self, name: str, value: Any) -> Any:
         if name == "gain" and np.shape(value) == self.lower.shape:
-            return jnp.asarray(value, self.gain.dtype)
+            return to_jax(value, self.gain.dtype)
         return super()._convert(name, value)
 
     def _check(self) -> None:
@@ -144,10 +145,11 @@ class ConfigurationLimit(Limit):
         check_return_speed(self.return_speed)
 
 
-def _own_return_speed(robot: Robot) -> Float[Array, " nv"]:
+def _own_return_speed(robot: Robot) -> Float[Numbers, " nv"]:
     """Return the speed limit of each joint, and a default speed for the joints that have none."""
-    default = jnp.where(robot.tree.turning, _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE)
-    return jnp.where(jnp.isfinite(robot.velocity_limit), robot.velocity_limit, default)
+    default = np.where(robot.tree.turning, _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE)
+    speed = on_host(robot.velocity_limit)
+    return module_of(speed).where(abs(speed) < np.inf, speed, default)
 
 
 def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None:
@@ -160,9 +162,9 @@ def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None
 def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Float[Array, ""] | Float[Array, " nv"]:
     """Return a scalar for a gain shared by all joints, and an array over v for others."""
     if isinstance(value, Mapping) or np.ndim(value):
-        gain = dof_values(robot, value, jnp.ones(robot.nv), "gain")
+        gain = dof_values(robot, value, np.ones(robot.nv), "gain")
     else:
-        gain = jnp.asarray(value, robot.q0.dtype)
+        gain = to_jax(value, robot.q0.dtype)
     _check_gain(gain)
     return gain
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
@@ -10,6 +9,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import as_bounds, check_bounds, concrete
+from ..numerics._host import to_jax
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -40,7 +40,7 @@ class LinearLimit(Limit):
         upper: ArrayLike | Array | None = None,
     ):
         dtype = robot.q0.dtype
-        self.matrix = jnp.asarray(matrix, dtype)
+        self.matrix = to_jax(matrix, dtype)
         if self.matrix.ndim != 2 or self.matrix.shape[1] != robot.nv:
             raise OsikValueError(f"matrix has shape {self.matrix.shape}, expected (m, {robot.nv}): a row acts on v")
         low, high = as_bounds(lower, upper, len(self.matrix), dtype)

@@ -12,6 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ._host import repeated, to_jax
 
 
 def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
@@ -55,7 +56,7 @@ def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Arra
         expected = "a scalar" if shape == () else f"{shape} or a scalar"
         raise OsikValueError(f"{what} has shape {out.shape}, expected {expected}. Batch with jax.vmap.")
     check_not_nan(out, what)
-    return jnp.broadcast_to(out, shape)
+    return repeated(out, shape)
 
 
 def check_not_nan(value: Array, what: str) -> None:
@@ -118,7 +119,7 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
         TypeError: the value is not numeric.
     """
     try:
-        return jnp.asarray(value, dtype)
+        return to_jax(value, dtype)
     except (TypeError, ValueError):
         shown = repr(value)
         raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
+
+from ._host import Numbers, module_of
 
 _FASTEST = 1e12
 """[1/s]: no joint moves so fast; a derivative by dt, the rate over dt, would soon be infinite in single precision."""
@@ -47,18 +50,19 @@ def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Flo
     return jnp.where(is_far, far, quotient(jnp.where(is_far, 0.0, way), jnp.where(is_far, 1.0, dt)))
 
 
-def safe_norm(vector: Float[Array, " m"]) -> Float[Array, ""]:
+def safe_norm(vector: Float[Numbers, " m"]) -> Float[Numbers, ""]:
     """Return the Euclidean norm without overflow or underflow of squares; its gradient at 0 is 0."""
     size = largest(vector)
-    squared = jnp.sum((vector / size) ** 2)
+    xp, squared = module_of(vector), ((vector / size) ** 2).sum()
     positive = squared > 0.0
-    return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    return size * xp.where(positive, xp.sqrt(xp.where(positive, squared, 1.0)), 0.0)
 
 
-def largest(vector: Float[Array, "..."]) -> Float[Array, ""]:
+def largest(vector: Float[Numbers, "..."]) -> Float[Numbers, ""]:
     """Return the largest absolute entry, 1 where all are 0; a constant for derivatives."""
-    found = jnp.max(jnp.abs(jax.lax.stop_gradient(vector)), initial=0.0)
-    return jnp.where((found > 0.0) & (found < jnp.inf), found, 1.0)
+    xp = module_of(vector)
+    found = xp.max(abs(vector if xp is np else jax.lax.stop_gradient(vector)), initial=0.0)
+    return xp.where((found > 0.0) & (found < jnp.inf), found, 1.0)
 
 
 def greatest(vectors: Float[Array, "*S m"]) -> Float[Array, "*S"]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from .._errors import OsikTypeError
 from ._arguments import as_vector
+from ._host import to_jax
 from ._quick_method import quick_method
 
 
@@ -42,7 +43,7 @@ class Replaceable(eqx.Module):
         new = copy.copy(self)  # ``equinox.tree_at`` takes the time of ten control steps
         kind = type(self)
         for name, value in changes.items():
-            vars(new)[name] = jax.tree.map(jnp.asarray, kind._convert(self, name, value))
+            vars(new)[name] = jax.tree.map(to_jax, kind._convert(self, name, value))
         kind._check(new)
         return new
 

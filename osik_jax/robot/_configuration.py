@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Num
 
 from .._errors import OsikTypeError, OsikValueError
+from ..numerics._host import on_host, replaced_at, to_jax
 from ._model import RobotModel
 from ._tree import BALL, FREE, QPOS_WIDTH, check_shape
 
@@ -20,8 +20,8 @@ _LEAST_QUATERNION = 1e-8
 
 def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
     """Return ``q0`` (or ``base``) with the named joints set, unchecked."""
-    q = robot.q0 if base is None else jnp.asarray(base, robot.q0.dtype)
-    coefficient = robot.tree.qpos_source[1]
+    q = on_host(robot.q0 if base is None else to_jax(base, robot.q0.dtype))
+    offset, coefficient = on_host(robot.qpos_offset), robot.tree.qpos_source[1]
     for name, value in joints.items():
         joint = robot.tree.joint(name)
         if robot.tree.joint_types[joint] in (FREE, BALL):
@@ -30,10 +30,10 @@ def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayL
             )
         if not isinstance(value, Tracer) and not _is_number(value):
             raise OsikTypeError(f"the value of joint {name!r} is {value!r}; it is one number, in radians or metres")
-        full = robot.tree.full_qpos_address[joint]
+        full, value = robot.tree.full_qpos_address[joint], on_host(value)
         index = robot.joint_qpos_index(name)
-        q = q.at[index].set((value - robot.qpos_offset[full]) / coefficient[full])
-    return q
+        q = replaced_at(q, index, (value - offset[full]) / coefficient[full])
+    return to_jax(q)
 
 
 def _is_number(value: Any) -> bool:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
+from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
@@ -43,8 +43,8 @@ def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
     else:
         q = _as_array(home, robot.q0.dtype)
     check_configuration(robot, q, "home")
-    q = _with_unit_quaternions(robot, jnp.asarray(q, robot.q0.dtype))
-    return q if isinstance(q, Tracer) else _without_roundings(robot, np.asarray(q))
+    q = _with_unit_quaternions(robot, on_host(to_jax(q, robot.q0.dtype)))
+    return q if isinstance(q, Tracer) else _without_roundings(robot, q)
 
 
 def _is_integer(home: Any) -> bool:
@@ -53,7 +53,7 @@ def _is_integer(home: Any) -> bool:
 
 def _as_array(home: Any, dtype: Any) -> Array:
     try:
-        return jnp.asarray(home, dtype)
+        return to_jax(home, dtype)
     except (TypeError, ValueError):
         raise OsikTypeError(
             f"home is {home!r}; it is a configuration (nq,), a mapping from joint names to values, or the name or "
@@ -73,9 +73,9 @@ def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
     return keyframe_home(robot, number)
 
 
-def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:
+def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Numbers:
     """Return ``q0`` with named joints set: a number each, or all entries of a free (7) or ball joint (4)."""
-    q = jnp.asarray(robot.q0)
+    q = robot.q0
     for name, value in values.items():
         width, entries = QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]], _as_array(value, q.dtype)
         if width == 1:
@@ -86,26 +86,26 @@ def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Array:
         if entries.shape != (width,):
             layout = "x, y, z, then the quaternion w, x, y, z" if width == 7 else "a quaternion w, x, y, z"
             raise OsikValueError(f"home of joint {name!r} has shape {entries.shape}, expected ({width},): {layout}")
-        q = q.at[start : start + width].set(entries)
+        q = replaced_at(q, slice(start, start + width), entries)
     return q
 
 
-def _with_unit_quaternions(robot: RobotModel, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
+def _with_unit_quaternions(robot: RobotModel, q: Float[Numbers, " nq"]) -> Float[Numbers, " nq"]:
     for joint, start in robot.tree.qpos_address.items():
         kind = robot.tree.joint_types[joint]
         if kind in (FREE, BALL):
             part = slice(start + QPOS_WIDTH[kind] - 4, start + QPOS_WIDTH[kind])
-            q = q.at[part].divide(jnp.linalg.norm(q[part]))
+            q = replaced_at(q, part, q[part] / module_of(q).linalg.norm(q[part]))
     return q
 
 
 def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
     """Return the configuration with roundoff beyond ranges removed; warn of joints farther outside."""
     if isinstance(robot.position_lower, Tracer):
-        return jnp.asarray(q)
+        return to_jax(q)
     lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
     out, inside = [], q.copy()
-    turned_back = np.asarray(with_balls_inside(robot.tree, jnp.asarray(q), robot.position_upper))
+    turned_back = with_balls_inside(robot.tree, q, upper)
     for joint, start in robot.tree.qpos_address.items():
         if robot.tree.joint_types[joint] in (HINGE, SLIDE):
             low, high = (bound[robot.tree.dof_address[joint]] for bound in (lower, upper))
@@ -115,7 +115,7 @@ def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
             else:
                 inside[start] = nearest
         elif robot.tree.joint_types[joint] == BALL:
-            angle = float(ball_rotation(jnp.asarray(q[start : start + 4]))[0])
+            angle = float(ball_rotation(q[start : start + 4])[0])
             greatest = upper[robot.tree.dof_address[joint]]
             if angle > greatest + _OUTSIDE:
                 out.append(f"{robot.tree.joint_names[joint]} is turned by {angle:g}, its range is [0, {greatest:g}]")
@@ -126,4 +126,4 @@ def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
             f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}. It is kept as given; the robot "
             "returns from there at the return_speed of ConfigurationLimit"
         )
-    return jnp.asarray(inside)
+    return to_jax(inside)

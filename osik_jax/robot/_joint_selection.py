@@ -6,12 +6,12 @@ import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..numerics._arguments import as_array
+from ..numerics._host import on_host, replaced_at, to_jax
 from ._robot import Robot
 from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
 
@@ -77,7 +77,7 @@ def dof_names(robot: Robot) -> list[str]:
     return [robot.tree.joint_names[j] for j in robot.tree.dof_joint[robot.tree.own_dofs]]
 
 
-def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str) -> Float[Array, " nv"]:
+def dof_values(robot: Robot, given: Any, default: Float[ArrayLike, " nv"], what: str) -> Float[Array, " nv"]:
     """Return an array over v from a user's input: None, an array (nv,), or a mapping from names or globs to values.
 
     Raises:
@@ -86,15 +86,15 @@ def dof_values(robot: Robot, given: Any, default: Float[Array, " nv"], what: str
     """
     dtype = robot.q0.dtype
     if given is None:
-        return jnp.asarray(default, dtype)
+        return to_jax(default, dtype)
     if isinstance(given, Mapping):
-        values = jnp.asarray(default, dtype)
+        values = on_host(to_jax(default, dtype))
         for pattern, value in given.items():
             for joint in select_joints(robot, pattern):
                 dof = robot.tree.dof_address[joint]
                 width = DOF_WIDTH[robot.tree.joint_types[joint]]
-                values = values.at[dof : dof + width].set(as_array(value, f"{what}[{pattern!r}]", dtype))
-        return values
+                values = replaced_at(values, slice(dof, dof + width), as_array(value, f"{what}[{pattern!r}]", dtype))
+        return to_jax(values)
     values = as_array(given, what, dtype)
     if values.shape != (robot.nv,):
         raise OsikValueError(

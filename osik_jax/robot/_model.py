@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikValueError
+from ..numerics._host import Numbers, module_of
 from ._load_report import LoadReport
 from ._tree import FREE, KinematicTree, ModelHolder, check_shape
 
@@ -113,7 +113,7 @@ class RobotModel(eqx.Module):
         """
         return self.tree.dof_address[self.tree.owner(name)]
 
-    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Array, " nqfull"]:
+    def mujoco_qpos(self, q: Num[ArrayLike, " nq"]) -> Float[Numbers, " nqfull"]:
         """Return the configuration of ``mj_model``: q with locked and follower joints filled in. (full nq,).
 
         Raises:
@@ -121,4 +121,4 @@ class RobotModel(eqx.Module):
         """
         check_shape(self.tree, q, "q")
         index, coefficient = self.tree.qpos_source
-        return jnp.asarray(q)[index] * coefficient + self.qpos_offset
+        return module_of(self.qpos_offset).asarray(q)[index] * coefficient + self.qpos_offset

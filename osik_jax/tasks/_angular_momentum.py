@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikTypeError
 from ..kinematics import Kinematics, centroidal_momentum_matrix
 from ..kinematics._forward import body_masses
+from ..numerics._host import on_host, to_jax
 from ..robot import Robot
 from ._com import check_axes
 from ._leaves import as_bounds, as_scalar, as_vector, as_weight, check_bounds
@@ -104,7 +105,7 @@ class AngularMomentumTask(Task):
 
     def _along_axes(self, value: Any) -> Float[Array, " m"]:
         """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
-        value = jnp.asarray(value, self.weight.dtype)
+        value = on_host(to_jax(value, self.weight.dtype))
         if value.shape == (3,) and len(self.axes) < 3:
             value = value[np.array(["xyz".index(axis) for axis in self.axes])]
         return as_vector(value, (len(self.axes),), "target", self.weight.dtype)

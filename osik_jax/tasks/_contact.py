@@ -13,6 +13,7 @@ from .._errors import OsikTypeError
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..kinematics._rigid import cross
+from ..numerics._host import on_host
 from ..robot import Robot
 from ._curvature import jacobian_curvature, pose_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -102,12 +103,12 @@ class ContactTask(PlaneTask):
         self.gain = as_gain(gain, dtype)
         self.point = as_vector(point, (3,), "point", dtype)
         self.normal = as_normal(normal, dtype)
-        given = home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor
-        held = as_pose(given, dtype, numbers=jnp)
-        height = dot(self.normal, held[0] + dot(held[1], self.point)) if offset is None else offset
+        held = as_pose(home_kinematics(robot).frame_pose(robot, frame) if anchor is None else anchor, dtype)
+        position, rotation, up, point = map(on_host, (*held, self.normal, self.point))
+        height = dot(up, position + dot(rotation, point)) if offset is None else offset
         self.offset = as_offset(height, dtype)
         self.anchor = None if sliding else held
-        standing = dot(held[1].T, self.normal) if axis is None else axis
+        standing = dot(rotation.T, up) if axis is None else axis
         self.axis = as_normal(standing, dtype) if contact == "plane" else None
 
     @property
@@ -129,7 +130,6 @@ class ContactTask(PlaneTask):
         arm = dot(turn, self.point)
         linear = jacobians[0, :3] + cross(jacobians[0, 3:], arm[:, None], along=-2)
         moves = jnp.concatenate([linear, jacobians[0, 3:]])
-        # a sliding contact keeps the normal row alone
         held = axes[2:] if self.sliding else axes
         error, jacobian = self._place(positions[0] + arm, axes)[3 - len(held) :], dot(held, linear)
         if self.axis is not None:
@@ -157,13 +157,11 @@ class ContactTask(PlaneTask):
     ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
         """Return the sines of the tilts (and of the spin if held), and their rates per unit angular velocity."""
         standing = dot(turn, axis)
-        # t . (w x s) = w . (s x t), for the two axes t of the plane
         error, derivative = dot(axes[:2], standing), cross(standing, axes[:2])
         if self.anchor is None:
             return error, derivative
         beside = across(axis)[0]
         ahead = dot(turn, beside)
-        # n x d, across the held direction d: the row is the sine of the spin, positive counter-clockwise
         wanted = cross(axes[2], unit(self._along(dot(self.anchor[1], beside), axes[2])))
         return jnp.append(error, dot(wanted, ahead)), jnp.concatenate([derivative, cross(ahead, wanted)[None]])
 

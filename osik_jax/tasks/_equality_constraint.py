@@ -19,6 +19,7 @@ from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..kinematics import Kinematics, frame_jacobian
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose, cross, rotate
+from ..numerics._host import to_jax
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of
 from ..robot._tree import KinematicTree
@@ -105,10 +106,10 @@ class EqualityConstraintTask(Task):
         welds = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "weld"]
         joints = [e for e, kind in zip(chosen, kinds, strict=True) if kind == "joint"]
         ends = {e: constraint_ends(model, robot.frame_names, e) for e in spatial}
-        self.anchors = jnp.asarray(np.reshape([own.anchors for own in ends.values()], (-1, 2, 3)), dtype)
-        self.relative = jnp.asarray(np.reshape([ends[e].relative for e in welds], (-1, 3, 3)), dtype)
-        self.torque_scale = jnp.asarray([model.eq_data[e, 10] for e in welds], dtype)
-        self.coefficients = jnp.asarray(np.reshape([model.eq_data[e, :5] for e in joints], (-1, 5)), dtype)
+        self.anchors = to_jax(np.reshape([own.anchors for own in ends.values()], (-1, 2, 3)), dtype)
+        self.relative = to_jax(np.reshape([ends[e].relative for e in welds], (-1, 3, 3)), dtype)
+        self.torque_scale = to_jax([model.eq_data[e, 10] for e in welds], dtype)
+        self.coefficients = to_jax(np.reshape([model.eq_data[e, :5] for e in joints], (-1, 5)), dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return 3, 6 or 1 rows per connect, weld or joint constraint."""

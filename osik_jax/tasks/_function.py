@@ -18,6 +18,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..batching._structure import Static, put_together, taken_apart
 from ..kinematics import Kinematics, forward_kinematics, integrate
 from ..kinematics._rates import kinematics_rates
+from ..numerics._host import to_jax
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
@@ -87,7 +88,7 @@ class FunctionTask(Task):
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         numbers, self.structure = taken_apart(function)
-        self.numbers = jax.tree.map(lambda a: jnp.asarray(a, dtype if isinstance(a, float) else None), numbers)
+        self.numbers = jax.tree.map(lambda a: to_jax(a, dtype if isinstance(a, float) else None), numbers)
         self.gain = as_gain(gain, dtype)
         rows = _length(robot, function)
         self.weight = as_weight(weight, rows, dtype)
@@ -167,7 +168,7 @@ class FunctionTask(Task):
                 "the function's structure differs, not its numbers alone (an integer is structure: write 0.0 for 0); "
                 "make another FunctionTask of it"
             )
-        new = jax.tree.map(lambda old, a: jnp.asarray(a, old.dtype), self.numbers, numbers)
+        new = jax.tree.map(lambda old, a: to_jax(a, old.dtype), self.numbers, numbers)
         for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
             if a.shape != old.shape:
                 raise OsikValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")

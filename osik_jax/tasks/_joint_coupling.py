@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import concrete
+from ..numerics._host import to_jax
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, is_scalar, select_joints
 from ._curvature import no_curvature
@@ -75,7 +76,7 @@ class JointCouplingTask(Task):
         self.joints = tuple(by_joint)
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        self.ratios = jnp.asarray(list(by_joint.values()), dtype)
+        self.ratios = to_jax(list(by_joint.values()), dtype)
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
         velocity = 0.0 if target_velocity is None else target_velocity

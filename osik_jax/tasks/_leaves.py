@@ -21,6 +21,7 @@ from ..numerics._arguments import check_bounds as check_bounds
 from ..numerics._arguments import check_finite as check_finite
 from ..numerics._arguments import check_not_negative as check_not_negative
 from ..numerics._arguments import concrete as concrete
+from ..numerics._host import on_host, repeated
 from ..robot import Robot
 from ..robot._joint_selection import dof_values
 
@@ -54,7 +55,7 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
         each = "" if rows is None else f", or ({rows},): one for each row"
         raise OsikValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
     check_not_negative(out, "weight")
-    return out if out.shape else jnp.broadcast_to(out, like)
+    return out if out.shape else repeated(out, like)
 
 
 def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "..."]:
@@ -68,5 +69,5 @@ def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "
     """
     dtype = robot.q0.dtype
     if isinstance(value, Mapping) or (np.shape(value) == (robot.nv,) and len(dofs) != robot.nv):
-        value = dof_values(robot, value, jnp.zeros(robot.nv), "weight")[np.array(dofs, int)]
+        value = on_host(dof_values(robot, value, np.zeros(robot.nv), "weight"))[np.array(dofs, int)]
     return as_weight(value, len(dofs), dtype)

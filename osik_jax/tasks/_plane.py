@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..numerics._host import on_host, to_jax
 from ._framed import FramedTask
 from ._leaves import as_vector
 from ._pointing import across, as_direction, unit
@@ -40,7 +41,7 @@ def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:
     Raises:
         ValueError: it is not such a vector.
     """
-    return unit(as_direction(value, "normal", dtype))
+    return to_jax(unit(on_host(as_direction(value, "normal", dtype))))
 
 
 def as_offset(value: Any, dtype: Any) -> Float[Array, ""]:

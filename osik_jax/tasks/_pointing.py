@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..numerics._constants import POINTING_SINE_SQUARED
 from ..numerics._guarded import safe_norm
+from ..numerics._host import Numbers, module_of
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
@@ -157,10 +158,10 @@ def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
     return out
 
 
-def unit(vector: Float[Array, "3"]) -> Float[Array, "3"]:
+def unit(vector: Float[Numbers, "3"]) -> Float[Numbers, "3"]:
     """Return the vector scaled to length 1; 0 stays 0."""
     length = safe_norm(vector)
-    return vector / jnp.where(length > 0.0, length, 1.0)
+    return vector / module_of(vector).where(length > 0.0, length, 1.0)
 
 
 def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Float[Array, "2"], Float[Array, "2 3"]]:

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
+import scipy  # loads its parts when they are used
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics import forward_kinematics
+from ..kinematics._home import kinematics_on_host
 from ..numerics._guarded import greatest
+from ..numerics._host import to_jax
 from ..robot import Robot
 
 _COLLINEAR = 1e-6
@@ -85,7 +86,7 @@ def support_polygon(
         raise OsikValueError(
             f"a margin of {margin} m leaves nothing of the support polygon with vertices\n{polygon[2]}"
         )
-    normals, offsets, vertices = (jnp.asarray(x, robot.q0.dtype) for x in drawn_in)
+    normals, offsets, vertices = (to_jax(x, robot.q0.dtype) for x in drawn_in)
     return SupportPolygon(normals, offsets, vertices)
 
 
@@ -97,7 +98,7 @@ def _ground_points(robot: Robot, q: Array, frame: str, corners: ArrayLike | None
     """Return the corners of one frame, projected to the ground [m]. (k, 2)."""
     robot.tree.frame(frame)
     robot.check_configuration(q)
-    kinematics = forward_kinematics(robot, q)
+    kinematics = kinematics_on_host(robot, q)
     if corners is None:
         names = _corner_names(robot, frame)
         return np.asarray(kinematics.frame_poses(robot, names)[0])[:, :2]

@@ -94,8 +94,8 @@ class PoseTask(FramedTask):
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         home = self._held(robot, home_kinematics(robot), robot.q0)["target"]
-        pose = as_pose(home if target is None else target, dtype, rest=_rest(home, self.kept, self.coupled))
-        self.target = jnp.asarray(pose[0], dtype), jnp.asarray(pose[1], dtype)
+        rest = _rest(home, self.kept, self.coupled)
+        self.target = as_pose(home if target is None else target, dtype, rest=rest)
         self.target_velocity = as_vector(
             0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
         )
@@ -215,7 +215,7 @@ class PoseTask(FramedTask):
         own = vars(self)  # Equinox looks at each attribute that is asked for
         if name == "target":
             rest = _rest(own["target"], own["kept"], own["error"] == "se3")
-            return as_pose(value, own["weight"].dtype, rest=rest)
+            return as_pose(value, own["weight"].dtype, rest=rest, numbers=np)
         if name in ("position_weight", "orientation_weight"):
             return _row_weight(value, name, self.weight.dtype)
         return super()._convert(name, value)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..execution._platform import cuda_is_default
 from ..kinematics._rigid import compose, rotate
 from ..numerics._constants import SMALL_ANGLE_SQUARED, SMALL_SINE_SQUARED
+from ..numerics._host import Numbers, module_of
 
 
 def rotation_log(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -56,12 +58,14 @@ def cross_matrix(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])
 
 
-def dot(a: Array, b: Array) -> Array:
+def dot(a: Numbers, b: Numbers) -> Numbers:
     """Return the matrix product, in full precision on every device.
 
     On a GPU, products over three entries are written out as sums, because its matrix library is slow for batches of
     such small matrices. On a CPU this would make gradients slower.
     """
+    if module_of(a) is np and module_of(b) is np:
+        return np.matmul(a, b)
     if cuda_is_default() and a.ndim == 2 and a.shape[1] == 3:
         return compose(a, b) if b.ndim == 2 else rotate(a, b)
     return jnp.matmul(a, b, precision="highest")

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..numerics._rotations import exact_quaternion, exact_rotation, matrix_of
+from ..kinematics._rigid import rotation_matrix
+from ..numerics._host import Numbers, is_traced, to_host, to_jax
+from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
 Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
@@ -32,7 +32,7 @@ _ACCEPTED = (
 )
 
 
-def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = None) -> Pose:
+def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = jnp) -> Pose:
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
@@ -42,32 +42,35 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
         value: the pose.
         dtype: of the result.
         rest: position and rotation where the value has only the other part; None: the value has to have that part.
-        numbers: module that makes the arrays, ``jax.numpy`` or ``numpy``. Default: ``numpy`` unless a number is traced.
+        numbers: module of the result's arrays, ``jax.numpy`` or ``numpy``; of traced values always ``jax.numpy``.
 
     Raises:
         TypeError: no numbers.
         ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
     """
-    if numbers is None:
-        numbers = jnp if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value)) else np
-    parts = pose_parts(value, dtype, numbers=numbers)
+    own = jnp if is_traced(value) else np
+    parts = pose_parts(value, dtype, numbers=own)
     if parts is None:
-        array = pose_array(value, dtype, numbers=numbers)
+        array = pose_array(value, dtype, numbers=own)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
             _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
             check_finite(array, _POSITION)
-            return array, rest[1]
+            return _made(numbers, array, rest[1])
         elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
-            return rest[0], _rotation(array)
+            return _made(numbers, rest[0], _rotation(array))
         else:
             raise _unfit(f"an array of shape {array.shape}", rest)
     position, rotation = parts
     if position.shape != (3,) or rotation.shape not in ((3, 3), (4,)):
         raise _unfit(f"a pair of shapes {position.shape} and {rotation.shape}", rest)
     check_finite(position, _POSITION)
-    return position, _rotation(rotation)
+    return _made(numbers, position, _rotation(rotation))
+
+
+def _made(numbers: Any, position: Any, rotation: Any) -> Pose:
+    return (position, rotation) if numbers is np else (to_jax(position), to_jax(rotation))
 
 
 def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Array, Array] | None:
@@ -77,13 +80,14 @@ def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
         TypeError: as ``pose_array``.
     """
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
-        return numbers.asarray(value.translation(), dtype), numbers.asarray(value.rotation().wxyz, dtype)
+        both = numbers.asarray(value.wxyz_xyz, dtype)
+        return both[..., 4:], both[..., :4]
     if isinstance(value, (tuple, list)) and len(value) == 2:
         return pose_array(value[0], dtype, accepted, numbers), pose_array(value[1], dtype, accepted, numbers)
     return None
 
 
-def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Array:
+def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Numbers:
     """Return the numbers of an array, or of an object that has a matrix.
 
     Raises:
@@ -94,9 +98,7 @@ def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
     elif hasattr(value, "homogeneous"):
         value = value.homogeneous
     try:
-        if numbers is np and np.asarray(value).dtype.kind not in "biuf":  # NumPy reads texts, and None as NaN
-            raise TypeError
-        return numbers.asarray(value, dtype)
+        return to_host(value, dtype) if numbers is np else numbers.asarray(value, dtype)
     except (TypeError, ValueError):
         raise OsikTypeError(f"got {type(value).__name__}, which is no pose; {accepted}") from None
 
@@ -107,11 +109,10 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
     return OsikValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
 
 
-def _rotation(given: Any) -> Any:
+def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"]) -> Float[Numbers, "3 3"]:
     """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
-        quaternion = exact_quaternion(given, "the target's quaternion")
-        return matrix_of(quaternion) if isinstance(quaternion, np.ndarray) else jaxlie.SO3(quaternion).as_matrix()
+        return rotation_matrix(exact_quaternion(given, "the target's quaternion"))
     return exact_rotation(given, "the target's rotation")
 
 

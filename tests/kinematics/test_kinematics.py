@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.kinematics import _composition
+from osik_jax.kinematics._home import kinematics_on_host
 
 NAMES = ("toy", "nao", "arm7")
 
@@ -161,6 +162,24 @@ def test_everything_equals_mujoco_c(robots, evaluators, name):
     q = random_configurations(robot, seed=1)
     expected = stacked([mujoco_everything(robot, SUBTREES[name], row) for row in q])
     assert_trees_close(evaluators[name](robot, q), expected, 1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_host_finds_the_same_without_a_program(robots, name):
+    """Default targets are made so."""
+    robot = robots[name]
+    for q in random_configurations(robot, seed=7, count=2):
+        expected = mujoco_everything(robot, SUBTREES[name], q)
+        kin = kinematics_on_host(robot, q)
+        found = {
+            "poses": kin.frame_poses(robot, robot.frame_names),
+            "com": osik.center_of_mass(robot, kin),
+            "subtree_com": osik.center_of_mass(robot, kin, SUBTREES[name]),
+        }
+        assert {type(leaf) for leaf in jax.tree.leaves((kin, found))} == {np.ndarray}
+        assert_trees_close(found, {name: expected[name] for name in found}, 1e-12)
+        whole = osik.forward_kinematics(robot, q)  # axes too
+        assert_trees_close(jax.tree.leaves(kin), jax.tree.leaves(whole), 1e-12)
 
 
 @pytest.mark.variants(release=["toy"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 import osik_jax as osik
@@ -11,7 +11,7 @@ import osik_jax as osik
 def all_tasks(arm: osik.Robot) -> dict[str, osik.Task]:
     normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
     corners = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    square = osik.SupportPolygon(jnp.asarray(normals), jnp.ones(4), jnp.asarray(corners))
+    square = osik.SupportPolygon(*jax.device_put((normals, np.ones(4), corners)))
     return {
         "frame": osik.FrameTask(arm, "hand", gain=osik.AdaptiveGain(9.0, 2.0, 1.0), error="se3", priority=2),
         "bounds": osik.FrameTask(arm, "link4", rows="position", lower=-np.inf, upper=0.3, hard=True),

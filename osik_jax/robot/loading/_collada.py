@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads its parts when they are used
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError
 
@@ -195,7 +195,7 @@ def _translation(shift: np.ndarray) -> Float[np.ndarray, "4 4"]:
 def _rotation(axis_angle: np.ndarray) -> Float[np.ndarray, "4 4"]:
     """Return the rotation about an axis by an angle [deg]."""
     axis, out = axis_angle[:3] / np.linalg.norm(axis_angle[:3]), np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(axis_angle[3] * axis, degrees=True).as_matrix()
+    out[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(axis_angle[3] * axis, degrees=True).as_matrix()
     return out
 
 

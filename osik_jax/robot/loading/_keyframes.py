@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.core import Tracer
@@ -61,4 +60,4 @@ def inside(qpos: np.ndarray, tree: KinematicTree, lower: np.ndarray, upper: np.n
         if tree.joint_types[joint] in (HINGE, SLIDE):
             dof = tree.dof_address[joint]
             q[start] = np.clip(q[start], lower[dof], upper[dof])
-    return np.asarray(with_balls_inside(tree, jnp.asarray(q), jnp.asarray(upper)))
+    return with_balls_inside(tree, q, upper)

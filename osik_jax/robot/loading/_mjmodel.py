@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..._errors import OsikTypeError, OsikValueError, warn
+from ...numerics._host import to_jax
 from .._load_report import LoadNote, LoadReport
 from .._model import RobotModel
 from .._plausible import first_of, warn_of_fast_joints
@@ -148,7 +148,7 @@ def from_mjmodel(
         q0=q0,
     )
     holder = ModelHolder(model, report, tuple(named.mesh for named in meshes))
-    return RobotModel(tree=tree, holder=holder, **{k: _float_array(v) for k, v in arrays.items()})
+    return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
 
 
 def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "equality"]) -> tuple[str, ...]:
@@ -188,10 +188,6 @@ def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, np.asarray(quaternion, float))
     return out.reshape(3, 3)
-
-
-def _float_array(value: ArrayLike) -> Any:
-    return jnp.asarray(np.asarray(value, float))
 
 
 def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str, ...]) -> None:

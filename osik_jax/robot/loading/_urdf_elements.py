@@ -9,11 +9,12 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple, TypeVar
 
+import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError, unknown_name
 from .._load_report import LoadNote
+from ._mjmodel import rotation_matrix
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
 SCALAR = ("revolute", "continuous", "prismatic")
@@ -209,9 +210,11 @@ def _origin(element: ElementTree.Element, where: str) -> Pose:
         quaternion = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
         if not quaternion.any():
             raise OsikValueError(f"{where}: the quaternion is zero")
-        return Pose(position, Rotation.from_quat(quaternion).as_matrix())
+        return Pose(position, rotation_matrix(np.roll(quaternion / np.linalg.norm(quaternion), 1)))
     angles = _numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")
-    return Pose(position, Rotation.from_euler("xyz", angles).as_matrix())
+    turn = np.zeros(4)
+    mujoco.mju_euler2Quat(turn, angles, "XYZ")  # about fixed axes
+    return Pose(position, rotation_matrix(turn))
 
 
 def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: list[LoadNote]) -> Link:

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+import scipy  # loads its parts when they are used
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ..._errors import OsikValueError
 from .._describe import model_name
@@ -141,7 +141,7 @@ def _motion(robot: RobotModel, place: _JointPlace) -> Pose:
     moved = float(values[0]) - _reference(robot, place.joint)
     if kind == SLIDE:
         return Pose(moved * place.axis, np.eye(3))
-    return _about(place.anchor, Rotation.from_rotvec(moved * place.axis).as_matrix())
+    return _about(place.anchor, scipy.spatial.transform.Rotation.from_rotvec(moved * place.axis).as_matrix())
 
 
 def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:

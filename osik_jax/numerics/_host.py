@@ -1,0 +1,75 @@
+"""Numbers of the host: what is known while a robot or a task is made is computed by NumPy, and XLA compiles nothing."""
+
+from __future__ import annotations
+
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+if TYPE_CHECKING:
+    Numbers: TypeAlias = Any  # an operator of both is none of their union's
+else:
+    Numbers = jax.Array | np.ndarray
+"""An array of JAX, or of NumPy for what is computed on the host."""
+
+
+def module_of(array: Any) -> ModuleType:
+    """Return ``numpy`` for an array of NumPy, else ``jax.numpy``: one text computes on the host and in a program."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def is_traced(tree: Any) -> bool:
+    """Return whether a leaf of the tree is traced."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def to_host(value: Any, dtype: Any = None) -> np.ndarray:
+    """Return a copy of real numbers as an array of NumPy.
+
+    Raises:
+        TypeError, ValueError: no real numbers, or some that are traced.
+    """
+    host = np.array(value)
+    if host.dtype != bool and not any(jnp.issubdtype(host.dtype, kind) for kind in (jnp.floating, jnp.integer)):
+        raise TypeError(f"{host.dtype} is no type of real numbers")
+    return host if dtype is None else host.astype(dtype, copy=False)
+
+
+def to_jax(value: Any, dtype: Any = None) -> Array:
+    """Return ``jnp.asarray(value, dtype)`` without compiling: that compiles a program for each shape of NumPy's arrays.
+
+    Raises:
+        TypeError, ValueError: as ``jnp.asarray``.
+    """
+    if isinstance(value, jax.Array):
+        return jnp.asarray(value, dtype)
+    try:
+        return jax.device_put(to_host(value, dtype))  # a copy: the device may keep the memory that it is given
+    except (TypeError, ValueError):  # parts are traced, or the message is that of JAX
+        return jnp.asarray(value, dtype)
+
+
+def repeated(array: Array, shape: tuple[int, ...]) -> Array:
+    """Return ``jnp.broadcast_to(array, shape)`` without compiling."""
+    if array.shape == shape:
+        return array
+    return jnp.broadcast_to(array, shape) if is_traced(array) else to_jax(np.broadcast_to(np.asarray(array), shape))
+
+
+def on_host(array: Any) -> Numbers:
+    """Return an array as one of NumPy, a traced one as it is."""
+    return array if isinstance(array, Tracer) else np.asarray(array)
+
+
+def replaced_at(array: Numbers, index: Any, value: Any) -> Numbers:
+    """Return the array with other numbers at an index; on the host, unless one of both is traced."""
+    if is_traced((array, value)):
+        return jnp.asarray(array).at[index].set(value)
+    out = np.array(array)
+    out[index] = value
+    return out
