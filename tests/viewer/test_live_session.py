@@ -71,6 +71,16 @@ def test_a_session_comes_back_from_its_file_to_the_last_bit(tmp_path: Path) -> N
     assert load_session(tmp_path / "session.json").limits_off == {1}  # the older file
 
 
+def test_an_argument_that_is_missing_in_its_file_is_the_default(tmp_path: Path) -> None:
+    content = json.loads(session().to_json())
+    content |= {"tasks": {"foot": {"kind": "FrameTask", "frame": "l_sole"}}, "scheme": {"kind": "WeightedQP"}}
+    del content["off"], content["limits_off"]
+    (path := tmp_path / "session.json").write_text(json.dumps(content))
+    loaded = load_session(path)
+    assert not loaded.off and not loaded.limits_off
+    assert eqx.tree_equal((loaded.tasks, loaded.scheme), ({"foot": osik.FrameTask(ROBOT, "l_sole")}, osik.WeightedQP()))
+
+
 def test_its_lines_of_python_make_the_same_controller() -> None:
     wanted = session()
     names: dict[str, Any] = {}
@@ -140,6 +150,9 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
         session(source=None).save(tmp_path / "session.json")
     hull = osik.CollisionShape.convex(np.random.default_rng(0).normal(size=(9, 3)), frame="l_wrist")
     kept = osik.CollisionAvoidanceLimit(ROBOT, shapes={"stone": hull}, pairs=[("stone", "torso:0")])
+    one = session(limits=(kept,))
+    one.save(tmp_path / "session.json")
+    assert eqx.tree_equal(load_session(tmp_path / "session.json").limits, one.limits)
     with pytest.raises(ValueError, match="no program can make the shape 'stone'"):
         session(limits=(kept,)).to_python()
 
