@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any, cast
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from every_class import all_limits, all_tasks
 from small_files import files_of_at_most
 
 import osik_jax as osik
@@ -20,6 +22,7 @@ from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._python import python
 from osik_jax.viewer.live._session import Session
 from osik_jax.viewer.live._source import RobotSource
 from osik_jax.viewer.live._step import Controller, compile_step
@@ -90,6 +93,15 @@ def test_its_lines_of_python_make_the_same_controller() -> None:
     expected = osik.solve(ROBOT, jnp.asarray(wanted.q), wanted.active_tasks, **options)
     assert expected.status == osik.Status.SOLVED and np.abs(expected.velocity).max() > 0.05
     np.testing.assert_array_equal(names["solution"].velocity, expected.velocity)
+
+
+def test_lines_of_python_make_every_task_and_limit(arm: osik.Robot) -> None:
+    limits = [limit for limit in all_limits(arm) if not isinstance(limit, osik.CollisionAvoidanceLimit)]
+    for part in (*all_tasks(arm).values(), *limits, osik.NullSpace(method="saturated", margin=0.2)):
+        made = eval(python(part, arm), {"osik": osik, "np": np, "robot": arm})
+        assert jax.tree.structure(made) == jax.tree.structure(part), part
+        for own, given in zip(jax.tree.leaves(made), jax.tree.leaves(part), strict=True):
+            np.testing.assert_allclose(own, given, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.release
