@@ -30,7 +30,7 @@ def converted(data: Any) -> Any:
     kind = data["class"].rpartition(".")[2]
     if kind == "NoLimits":
         return {"kind": "no_limits"}
-    fields = {{"kept": "rows"}.get(name, name): one for name, one in data["fields"].items()}
+    fields = {"rows" if name == "kept" else name: one for name, one in data["fields"].items()}
     joints = converted(fields.pop("joints")) if kind == "JointCouplingTask" else ()
     arguments = inspect.signature(getattr(osik_jax, kind)).parameters if hasattr(osik_jax, kind) else {}
     if lost := fields.keys() - arguments.keys() - _DERIVED:

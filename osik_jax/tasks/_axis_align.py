@@ -10,9 +10,11 @@ from numpy.typing import ArrayLike
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ._pointing import PointingTask, as_direction, unit
+from ._gain import AdaptiveGain
+from ._leaves import home_kinematics
+from ._pointing import PointingTask, as_direction, check_frames, unit
 from ._rotation import cross_matrix, dot
-from ._task import TaskRows
+from ._task import DEFAULT_GAIN, TaskRows
 
 
 class AxisAlignTask(PointingTask):
@@ -42,6 +44,38 @@ class AxisAlignTask(PointingTask):
         ValueError: frame and target frame are the same, a wrong shape, a direction of length 0, a negative weight.
     """
 
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
+        target: ArrayLike | Array | None = None,
+        target_frame: str | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        half_angle: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        check_frames(robot, frame, target_frame)
+        home = home_kinematics(robot)
+        direction = _pointed(robot, home, frame, target_frame, axis) if target is None else target
+        super().__init__(
+            robot,
+            frame,
+            target_frame,
+            axis=axis,
+            target=as_direction(direction, "target", robot.q0.dtype),
+            target_velocity=0.0 if target_velocity is None else target_velocity,
+            half_angle=half_angle,
+            weight=weight,
+            gain=gain,
+            priority=priority,
+            hard=hard,
+        )
+
     def rows_at(
         self,
         positions: Float[Array, "k 3"],
@@ -65,8 +99,10 @@ class AxisAlignTask(PointingTask):
         del q
         return dict(target=_pointed(robot, kinematics, self.frame, self.target_frame, self.axis))
 
-    def _as_target(self, value: Any, dtype: Any) -> Float[Array, "3"]:
-        return as_direction(value, "target", dtype)
+    def _convert(self, name: str, value: Any) -> Any:
+        if name == "target":
+            return as_direction(value, name, self.weight.dtype)
+        return super()._convert(name, value)
 
 
 def _pointed(

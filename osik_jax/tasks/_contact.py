@@ -130,6 +130,7 @@ class ContactTask(PlaneTask):
         arm = dot(turn, self.point)
         linear = jacobians[0, :3] + cross(jacobians[0, 3:], arm[:, None], along=-2)
         moves = jnp.concatenate([linear, jacobians[0, 3:]])
+        # a sliding contact keeps the normal row alone
         held = axes[2:] if self.sliding else axes
         error, jacobian = self._place(positions[0] + arm, axes)[3 - len(held) :], dot(held, linear)
         if self.axis is not None:
@@ -157,11 +158,13 @@ class ContactTask(PlaneTask):
     ) -> tuple[Float[Array, " m"], Float[Array, "m 3"]]:
         """Return the sines of the tilts (and of the spin if held), and their rates per unit angular velocity."""
         standing = dot(turn, axis)
+        # t . (w x s) = w . (s x t), for the two axes t of the plane
         error, derivative = dot(axes[:2], standing), cross(standing, axes[:2])
         if self.anchor is None:
             return error, derivative
         beside = across(axis)[0]
         ahead = dot(turn, beside)
+        # n x d, across the held direction d: the row is the sine of the spin, positive counter-clockwise
         wanted = cross(axes[2], unit(self._along(dot(self.anchor[1], beside), axes[2])))
         return jnp.append(error, dot(wanted, ahead)), jnp.concatenate([derivative, cross(ahead, wanted)[None]])
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..execution._backends import Backend
 from ..execution._computed import by_kernel, side_by_side
@@ -16,8 +18,11 @@ from ..kinematics._forward import moving_frames
 from ..kinematics._kernels import Call, dof_columns
 from ..robot import Robot
 from ._core_rows import Fields, equality_rows, fields_by_core
-from ._pose import PoseTask, goal_arguments, pose_fields
-from ._task import TaskRows
+from ._gain import AdaptiveGain
+from ._leaves import home_kinematics
+from ._pose import RADIAN, PoseTask, goal_arguments, pose_fields
+from ._targets import PoseLike
+from ._task import DEFAULT_GAIN, TaskRows
 
 
 class FrameTask(PoseTask):
@@ -68,6 +73,49 @@ class FrameTask(PoseTask):
         KeyError: no such frame.
         ValueError: a wrong shape, a rotation that is not one, a negative weight, lower > upper, an unknown option.
     """
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        target: PoseLike | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
+        orientation_weight: ArrayLike | Array = RADIAN**2,
+        weight: ArrayLike | Array = 1.0,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
+        axes: Literal["world", "frame"] | None = None,
+        error: Literal["decoupled", "se3"] = "decoupled",
+        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        robot.tree.frame(frame)
+        super().__init__(
+            robot,
+            frame,
+            home=home_kinematics(robot).frame_pose(robot, frame),
+            target=target,
+            target_velocity=target_velocity,
+            lower=lower,
+            upper=upper,
+            position_weight=position_weight,
+            orientation_weight=orientation_weight,
+            weight=weight,
+            rows=rows,
+            axes=axes,
+            outer_axes="world",
+            error=error,
+            orientation_jacobian=orientation_jacobian,
+            gain=gain,
+            priority=priority,
+            hard=hard,
+        )
 
     @property
     def frames(self) -> tuple[str, ...]:

@@ -32,21 +32,12 @@ class VelocityTask(Task):
     joints: tuple[int, ...] = eqx.field(static=True)
     row_count: int = eqx.field(static=True)
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        joints: Iterable[str] | None = None,
-        weight: WeightLike | None = None,
-        priority: int = 1,
-        hard: bool = False,
-    ):
+    def __init__(self, robot: Robot, joints: Iterable[str] | None, *, weight: WeightLike, priority: int, hard: bool):
         self.joints = tuple(select_all(robot, joints))
         self.priority, self.hard = check_priority(priority), hard
         dofs = dofs_of(robot, self.joints)
         self.row_count = len(dofs)
-        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
-        self.weight = as_joint_weight(robot, background_weight(robot) if weight is None else weight, dofs)
+        self.weight = as_joint_weight(robot, weight, dofs)
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
     @abc.abstractmethod
@@ -108,6 +99,19 @@ class DampingTask(VelocityTask):
         ValueError: a negative weight.
     """
 
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: WeightLike | None = None,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
+        weight = background_weight(robot) if weight is None else weight
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
         """Return 0 for each dof."""
         return jnp.zeros(len(dofs), self.weight.dtype)
@@ -143,7 +147,7 @@ class FreezeTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         if not self.joints:
             raise OsikValueError("a FreezeTask needs at least one joint")
 
@@ -184,7 +188,7 @@ class JointVelocityTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         self.target = as_vector(target, (self.row_count,), "target", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
@@ -229,7 +233,9 @@ class LowAccelerationTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
+        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
+        weight = background_weight(robot) if weight is None else weight
+        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:

@@ -11,9 +11,11 @@ from numpy.typing import ArrayLike
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
-from ._pointing import PointingTask, as_direction, unit
+from ._gain import AdaptiveGain
+from ._leaves import home_kinematics
+from ._pointing import PointingTask, as_direction, check_frames, unit
 from ._rotation import cross_matrix, dot
-from ._task import TaskRows
+from ._task import DEFAULT_GAIN, TaskRows
 
 NEAREST = 1e-3
 """Distance [m] below which there is no line of sight."""
@@ -46,6 +48,38 @@ class LookAtTask(PointingTask):
         KeyError: no such frame.
         ValueError: frame and target frame are the same, a wrong shape, an axis of length 0, a negative weight.
     """
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
+        target: ArrayLike | Array | None = None,
+        target_frame: str | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        half_angle: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        check_frames(robot, frame, target_frame)
+        if target is None:
+            target = 0.0 if target_frame is not None else _ahead(robot, home_kinematics(robot), frame, axis)
+        super().__init__(
+            robot,
+            frame,
+            target_frame,
+            axis=axis,
+            target=target,
+            target_velocity=0.0 if target_velocity is None else target_velocity,
+            half_angle=half_angle,
+            weight=weight,
+            gain=gain,
+            priority=priority,
+            hard=hard,
+        )
 
     def rows_at(
         self,
@@ -81,9 +115,6 @@ class LookAtTask(PointingTask):
             position, rotation = kinematics.frame_pose(robot, self.target_frame)
             point = dot(rotation.T, point - position)
         return dict(target=point)
-
-    def _home_target(self, robot: Robot) -> ArrayLike | Array:
-        return 0.0 if self.target_frame is not None else super()._home_target(robot)
 
 
 def _ahead(robot: Robot, kinematics: Kinematics, frame: str, axis: ArrayLike | Array) -> Float[Array, "3"]:

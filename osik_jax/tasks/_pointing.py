@@ -20,9 +20,9 @@ from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_scalar, as_vector, concrete, home_kinematics
+from ._leaves import as_scalar, as_vector, concrete
 from ._rotation import dot
-from ._task import DEFAULT_GAIN, TaskRows, check_priority
+from ._task import TaskRows, check_priority
 
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
@@ -60,25 +60,23 @@ class PointingTask(FramedTask):
         self,
         robot: Robot,
         frame: str,
+        target_frame: str | None,
         *,
-        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
-        target: ArrayLike | Array | None = None,
-        target_frame: str | None = None,
-        target_velocity: ArrayLike | Array | None = None,
-        half_angle: ArrayLike | Array | None = None,
-        weight: ArrayLike | Array = 1.0,
-        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
-        priority: int = 1,
-        hard: bool = False,
+        axis: ArrayLike | Array,
+        target: ArrayLike | Array,
+        target_velocity: ArrayLike | Array,
+        half_angle: ArrayLike | Array | None,
+        weight: ArrayLike | Array,
+        gain: ArrayLike | Array | AdaptiveGain,
+        priority: int,
+        hard: bool,
     ):
-        _check_frames(robot, frame, target_frame)
         self.frame, self.target_frame = frame, target_frame
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
         self.axis = as_direction(axis, "axis", dtype)
-        self.target = self._as_target(self._home_target(robot) if target is None else target, dtype)
-        velocity = 0.0 if target_velocity is None else target_velocity
-        self.target_velocity = as_vector(velocity, (3,), "target_velocity", dtype)
+        self.target = as_vector(target, (3,), "target", dtype)
+        self.target_velocity = as_vector(target_velocity, (3,), "target_velocity", dtype)
         self.half_angle = None if half_angle is None else _as_half_angle(half_angle, dtype)
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
@@ -119,16 +117,7 @@ class PointingTask(FramedTask):
             curvature=partial(jacobian_curvature, jacobian=jacobian),
         )
 
-    def _home_target(self, robot: Robot) -> ArrayLike | Array:
-        """Return the default target: what the axis points at or along at ``robot.q0``."""
-        return self._held(robot, home_kinematics(robot), robot.q0)["target"]
-
-    def _as_target(self, value: Any, dtype: Any) -> Float[Array, "3"]:
-        return as_vector(value, (3,), "target", dtype)
-
     def _convert(self, name: str, value: Any) -> Any:
-        if name == "target":
-            return self._as_target(value, self.weight.dtype)
         if name == "axis":
             return as_direction(value, name, self.weight.dtype)
         if name == "half_angle":
@@ -136,7 +125,7 @@ class PointingTask(FramedTask):
         return super()._convert(name, value)
 
 
-def _check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
+def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
     """Raise KeyError if a frame does not exist, ValueError if both are the same."""
     robot.tree.frame(frame)
     if target_frame is not None:

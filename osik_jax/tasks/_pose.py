@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,10 +21,10 @@ from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative, home_kinematics
+from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._targets import Pose, PoseLike, as_pose
-from ._task import DEFAULT_GAIN, TaskRows, check_priority
+from ._task import TaskRows, check_priority
 from ._twist import pose_log, seen_from
 
 RADIAN = 0.1
@@ -46,8 +46,6 @@ _Wrench = Float[Array, "6 6"] | None
 class PoseTask(FramedTask):
     """Base of tasks on a pose, in the world or in another frame; ``FrameTask`` states the formulas."""
 
-    outer_axes: ClassVar[str] = "world"
-    """Name of the axes that the pose is in."""
     frame: str = eqx.field(static=True)
     kept: tuple[bool, ...] = eqx.field(static=True)
     axes: str = eqx.field(static=True)
@@ -65,27 +63,27 @@ class PoseTask(FramedTask):
         robot: Robot,
         frame: str,
         *,
-        target: PoseLike | None = None,
-        target_velocity: ArrayLike | Array | None = None,
-        lower: ArrayLike | Array | None = None,
-        upper: ArrayLike | Array | None = None,
-        position_weight: ArrayLike | Array = 1.0,
-        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
-        orientation_weight: ArrayLike | Array = RADIAN**2,
-        weight: ArrayLike | Array = 1.0,
-        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
-        axes: Literal["world", "root", "frame"] | None = None,
-        error: Literal["decoupled", "se3"] = "decoupled",
-        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
-        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
-        priority: int = 1,
-        hard: bool = False,
+        home: Pose,
+        target: PoseLike | None,
+        target_velocity: ArrayLike | Array | None,
+        lower: ArrayLike | Array | None,
+        upper: ArrayLike | Array | None,
+        position_weight: ArrayLike | Array,
+        orientation_weight: ArrayLike | Array,
+        weight: ArrayLike | Array,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool],
+        axes: str | None,
+        outer_axes: str,
+        error: Literal["decoupled", "se3"],
+        orientation_jacobian: Literal["analytic", "geometric"],
+        gain: ArrayLike | Array | AdaptiveGain,
+        priority: int,
+        hard: bool,
     ):
-        robot.tree.frame(frame)
         self.frame = frame
         self.kept = row_mask(rows)
         self.error = option("error", error, ("decoupled", "se3"))
-        self.axes = _axes(axes, self.outer_axes, self.error)
+        self.axes = _axes(axes, outer_axes, self.error)
         self.orientation_jacobian = option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
         if self.coupled and self.orientation_jacobian == "geometric":
             raise OsikValueError(
@@ -93,9 +91,7 @@ class PoseTask(FramedTask):
             )
         self.priority, self.hard = check_priority(priority), hard
         dtype = robot.q0.dtype
-        home = self._held(robot, home_kinematics(robot), robot.q0)["target"]
-        rest = _rest(home, self.kept, self.coupled)
-        self.target = as_pose(home if target is None else target, dtype, rest=rest)
+        self.target = as_pose(home if target is None else target, dtype, rest=_rest(home, self.kept, self.coupled))
         self.target_velocity = as_vector(
             0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
         )

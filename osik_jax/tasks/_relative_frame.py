@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from ..execution._backends import Backend
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._gain import AdaptiveGain
+from ._leaves import home_kinematics
 from ._pose import RADIAN, PoseTask
 from ._rotation import cross_matrix, dot
 from ._targets import Pose, PoseLike
@@ -57,7 +58,6 @@ class RelativeFrameTask(PoseTask):
             lower > upper, an unknown option.
     """
 
-    outer_axes: ClassVar[str] = "root"
     root: str = eqx.field(static=True)
 
     def __init__(
@@ -82,6 +82,7 @@ class RelativeFrameTask(PoseTask):
         priority: int = 1,
         hard: bool = False,
     ):
+        robot.tree.frame(frame)
         robot.tree.frame(root)
         if frame == root:
             raise OsikValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
@@ -89,6 +90,7 @@ class RelativeFrameTask(PoseTask):
         super().__init__(
             robot,
             frame,
+            home=_pose_in(robot, home_kinematics(robot), frame, root),
             target=target,
             target_velocity=target_velocity,
             lower=lower,
@@ -98,6 +100,7 @@ class RelativeFrameTask(PoseTask):
             weight=weight,
             rows=rows,
             axes=axes,
+            outer_axes="root",
             error=error,
             orientation_jacobian=orientation_jacobian,
             gain=gain,
