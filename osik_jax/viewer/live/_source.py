@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import suppress
 from pathlib import Path
 
 from ...robot import Robot, load_robot
-from ...robot.loading import ELSEWHERE, EXAMPLES, NAMES, ROBOTS, example_urdf, is_mjcf, urdf_of_description
-from .._look import Look, read_look
+from ...robot.loading import NAMES, is_mjcf
 
 _SUFFIX = "_description"
 
@@ -56,16 +54,3 @@ def load_source(source: RobotSource) -> Robot:
         raise FileNotFoundError(f"no such file: {source.robot}")
     load = Robot.from_mjcf if source.is_mjcf else Robot.from_urdf
     return load(source.robot, floating_base=source.floating_base)
-
-
-def source_look(source: RobotSource) -> Look | None:
-    """Return the visual shapes of the robot's URDF; None if its model already has shapes."""
-    if source.is_file:
-        return None if source.is_mjcf else read_look(source.robot)
-    if source.robot in ROBOTS:
-        return None
-    if source.robot in EXAMPLES:
-        with suppress(FileNotFoundError):
-            return read_look(example_urdf(source.robot))
-    urdf = urdf_of_description(ELSEWHERE.get(source.robot, source.robot))
-    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])
