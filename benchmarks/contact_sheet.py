@@ -81,10 +81,8 @@ def demonstrate(name: str, folder: Path) -> Row:
 
 def tile(row: Row, folder: Path) -> Image.Image:
     """The robot in the middle of its motion."""
-    middle, look = row.path[len(row.path) // 2], file_of(row.name)
-    picture = viewer.hero_picture(
-        folder / f"{row.name}.png", row.motion.robot, [middle], look=look, labels=(row.name,), size=TILE
-    )
+    middle = row.path[len(row.path) // 2]
+    picture = viewer.hero_picture(folder / f"{row.name}.png", row.motion.robot, [middle], labels=(row.name,), size=TILE)
     with Image.open(picture) as image:
         return image.convert("RGB")
 

@@ -33,7 +33,6 @@ viewer.hero_picture(
     "allegro_grasp.png",
     hand,
     [closing.q[0], closing.q[25], closing.q[-1]],
-    look="allegro",
     shapes=[osik.CollisionShape.sphere(radius, center)],
     azimuth=40.0,
     elevation=15.0,

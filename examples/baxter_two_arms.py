@@ -46,7 +46,6 @@ viewer.hero_picture(
     "baxter_two_arms.png",
     robot,
     [motion.q[310]],
-    look="baxter",
     shapes=[box],
     trails=[at[:, 0]],
     azimuth=35.0,

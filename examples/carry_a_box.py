@@ -53,5 +53,5 @@ turns = Rotation.from_quat(box[:, 3:], scalar_first=True)
 viewer.hero_picture(
     "carry_a_box.png", robot, [result.q[k] for k in shown], labels=[f"{k / motion.fps:.1f} s" for k in shown],
     trails=[box[k, :3] + turns[k].apply(scale * HALF * EDGES) for k in shown],
-    look="g1", azimuth=35.0, size=(1400, 520),
+    azimuth=35.0, size=(1400, 520),
 )  # fmt: skip

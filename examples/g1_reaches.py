@@ -47,7 +47,6 @@ viewer.hero_picture(
     "g1_reaches.png",
     robot,
     [robot.q0, motion.q[-1], bent_down.q[-1]],
-    look="g1",
     support=[polygon.vertices] * 3,
     shapes=[osik.CollisionShape.sphere(0.03, goal) for goal in (near, far)],
     labels=["home", "25 cm ahead, 15 cm down", "45 cm ahead, 27 cm down"],

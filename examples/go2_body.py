@@ -48,7 +48,6 @@ viewer.hero_picture(
     "go2_body.png",
     dog,
     [motion.q[k] for k in (0, 400, 550)],
-    look="go2",
     trails=[where[100:, 4]] * 3,
     azimuth=30.0,
     size=(1400, 480),

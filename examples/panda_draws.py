@@ -38,7 +38,6 @@ viewer.hero_picture(
     "panda_draws.png",
     arm,
     [motion.q[k] for k in (steps // 4, steps // 2, 3 * steps // 4)],
-    look="panda",
     shapes=[osik.CollisionShape.box([0.25, 0.35, 0.01], start - jnp.array([0.0, 0.0, 0.03]))],
     trails=[drawn] * 3,
     azimuth=35.0,

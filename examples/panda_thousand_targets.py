@@ -43,7 +43,6 @@ viewer.hero_picture(
     "panda_thousand_targets.png",
     arm,
     shown,
-    look="panda",
     spacing=0.0,
     azimuth=40.0,
     size=(1000, 640),

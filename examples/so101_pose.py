@@ -41,7 +41,6 @@ viewer.hero_picture(
     "so101_pose.png",
     arm,
     [whole.q, place.q, above.q, far.q],
-    look="so101",
     targets=[position[None]] * 3 + [away[None]],
     labels=["whole pose", "position", "position and axis", "out of reach"],
     azimuth=50.0,

@@ -43,7 +43,6 @@ viewer.hero_picture(
     "tiago_drives.png",
     robot,
     [motion.q[k] for k in (0, 120, 1000)],
-    look="tiago",
     shapes=[osik.CollisionShape.sphere(0.05, goal)],
     trails=[path[:, 0], path[:, 1]],
     spacing=0.0,

@@ -43,7 +43,6 @@ viewer.hero_picture(
     "ur5_keeps_off_a_post.png",
     arm,
     [motion.q[k] for k in (0, 60, 400)],
-    look="ur5",
     shapes=[shapes["post"]],
     trails=[path] * 3,
     azimuth=40.0,

@@ -35,7 +35,6 @@ viewer.hero_picture(
     "ur5_pose.png",
     arm,
     ways,
-    look="ur5",
     shapes=[osik.CollisionShape.sphere(0.025, position)],
     spacing=0.62,
     size=(1600, 320),

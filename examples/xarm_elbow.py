@@ -41,7 +41,6 @@ viewer.hero_picture(
     "xarm_elbow.png",
     arm,
     list(motions.q[:, -1]),
-    look="xarm7",
     shapes=[osik.CollisionShape.sphere(0.03, hand)],
     labels=["elbow to the right", "in the middle", "elbow to the left"],
     azimuth=15.0,

@@ -20,7 +20,6 @@ from osik_jax.viewer._stage import Camera, Stage, frame_camera
 
 from ..peers.ours import places, standing
 from ..robots import workload
-from ..robots_table import file_of
 from ..workload import DT, Workload
 from ._cases import Case, cases, without_turning
 from ._motion import Entrant, Motion, motions
@@ -57,7 +56,7 @@ def _motion(solver: str, work: Workload, case: Case) -> Motion:
 def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[np.ndarray]:
     """Each with both robots, their target, who they are and how fast their fastest joints turn."""
     robot = standing(work)
-    shape = robot_parts(robot, look=file_of("g1"))
+    shape = robot_parts(robot)
     order = places(robot, work)
     paths = [_own(motion.path, order)[: STEPS + 1] for motion in found.values()]
     across = Camera((0.0, 0.0, 0.0), 1.0, AZIMUTH, 0.0, 1.0).axes[0]

@@ -80,7 +80,6 @@ def demo_motion(command: Demo) -> Motion:
     """Return the motion that the options ask for."""
     from ..demo._file import file_motion
     from ..demo._nao import double_support, single_support
-    from ..viewer.live._source import RobotSource, source_look
 
     _check(command)
     if command.robot is not None:
@@ -92,7 +91,6 @@ def demo_motion(command: Demo) -> Motion:
                 frame=command.frame,
                 support=command.support,
                 duration=command.duration,
-                look=source_look(RobotSource(command.robot)),
             )
     make = single_support if command.motion == "single-support" else double_support
     return make(command.duration)

@@ -121,7 +121,7 @@ class Retarget:
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
             result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
-            figures = write_folder(result, motion.name, self.out, animation=self.animation, **page)
+            figures = write_folder(result, motion.name, self.out, animation=self.animation, page=page)
         _print_retargeted(console, figures, self)
         return 0
 
@@ -204,7 +204,7 @@ def _retarget_folder(command: Retarget) -> int:
             _reader(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
-            **_page(command),
+            page=_page(command),
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
@@ -284,7 +284,7 @@ def _retarget_live(command: Retarget) -> None:
         command.out.mkdir(parents=True, exist_ok=True)
         console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
         result, frames = replay(make, motion)
-        figures = write_folder(result, motion.name, command.out, animation=command.animation, **page)
+        figures = write_folder(result, motion.name, command.out, animation=command.animation, page=page)
     spent = 1e3 * np.array([frame.seconds for frame in frames])
     ahead = max(1, round(command.look_ahead * motion.fps))
     waiting = 1e3 * ahead / motion.fps
@@ -337,15 +337,13 @@ def _profile(file: str | None) -> Profile | None:
     return None if file is None else load_profile(file)
 
 
-def _page(command: Retarget) -> dict[str, Any]:
-    """Return whether a page is written, and what the robot's URDF shows; the extra has to be installed."""
-    if not command.report:
-        return {}
-    from ..viewer.live._server import import_viser
-    from ..viewer.live._source import RobotSource, source_look
+def _page(command: Retarget) -> bool:
+    """Return whether a page is written; the extra has to be installed then."""
+    if command.report:
+        from ..viewer.live._server import import_viser
 
-    import_viser()
-    return {"page": True, "look": source_look(RobotSource(command.robot))}
+        import_viser()
+    return command.report
 
 
 def _number_or_name(text: str) -> str | float:

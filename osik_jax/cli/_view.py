@@ -62,12 +62,12 @@ class View:
                 robot = read_robot(source.robot, self.base)
                 options: Any = dict(host=self.host, port=self.port)
                 if self.file is not None and self.html is not None:
-                    _open.write_motion(self.file, robot, source, self.html)
+                    _open.write_motion(self.file, robot, self.html)
                     print(f"written: {self.html}")
                     return 0
                 if self.file is not None:
                     opened = _open.open_map if _open.is_map(self.file) else _open.open_motion
-                    view = opened(self.file, robot, source, **options)
+                    view = opened(self.file, robot, **options)
                 else:
                     feet = self.support or _feet(robot)
                     view = _open.open_robot(robot, source, feet, **options)

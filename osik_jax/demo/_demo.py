@@ -111,7 +111,6 @@ def _film(
         run.q,
         dt=dt,
         renderer=renderer,
-        look=motion.look,
         support=seen.support or None,
         trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
         curves=values,
@@ -127,4 +126,4 @@ def _draw_picture(path: Path, motion: Motion, run: Run) -> None:
     shown = [round(part * (len(run.q) - 1)) for part in (0.0, 0.26, 0.45)]
     support = [run.seen.support[k] for k in shown] if run.seen.support else None
     labels = [f"{run.seen.time[k]:.1f} s" for k in shown]
-    hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels, look=motion.look)
+    hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels)

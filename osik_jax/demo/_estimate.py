@@ -44,5 +44,5 @@ def estimate_seconds(
     compiling = (time.perf_counter() - start) * sum(_COMPILE[scheme] for scheme in schemes)
     steps = len(schemes) * motion.duration / dt * (_SIMULATED_STEP if physics else _STEP)
     pictures = min(_PICTURES_PER_SECOND, 1.0 / dt) * motion.duration if animation else 0.0
-    drawing = pictures * (_PICTURE if motion.look is None else _MESH_PICTURE)
+    drawing = pictures * (_PICTURE if motion.robot.holder.look is None else _MESH_PICTURE)
     return compiling + steps + drawing / (os.cpu_count() or 1)

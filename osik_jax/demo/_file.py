@@ -15,7 +15,6 @@ from ..robot._feet import guess_feet
 from ..robot._hands import find_hands
 from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
 from ..viewer._crouch import crouched
-from ..viewer._look import Look
 from ..viewer._outline import robot_outline
 from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
 from ._start import dexterous_start
@@ -29,7 +28,6 @@ def file_motion(
     frame: str | None = None,
     support: Sequence[str] = (),
     duration: float = 8.0,
-    look: Look | None = None,
 ) -> Motion:
     """Return a motion in which a frame goes 5 cm to its left and back while the supporting frames stay.
 
@@ -42,7 +40,6 @@ def file_motion(
         frame: what moves; ``None``: the floating base, or the tip of a robot that is bolted down.
         support: frames on the ground; none: those of a floating robot that look like feet.
         duration: [s].
-        look: what the robot's URDF shows.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.
@@ -53,11 +50,11 @@ def file_motion(
     _check_frames(robot, moving, standing)
     # one or two feet are flat, more feet are points
     rows: Rows = "pose" if len(standing) <= 2 else "position"
-    outline = robot_outline(robot, robot.q0, look)
+    outline = robot_outline(robot, robot.q0)
     if robot.floating_base:
         q0 = crouched(robot, standing)
         height = robot.tree.qpos_address[robot.tree.free_bases[0]] + 2
-        q0 = q0.at[height].add(-robot_outline(robot, q0, look).lowest)
+        q0 = q0.at[height].add(-robot_outline(robot, q0).lowest)
     else:
         q0 = dexterous_start(robot, outline, moving)
     kinematics = forward_kinematics(robot, q0)
@@ -83,8 +80,9 @@ def file_motion(
     elif standing:
         known = f"no contact corners are known of {', '.join(standing)} (sites NAME_corner_0, NAME_corner_1, ...)"
         notes.append(f"{known}, so balance is neither asked for nor reported")
-    if look is not None and look.missing:
-        first, *others = look.missing
+    look = robot.holder.look
+    if look is not None and look.read.missing:
+        first, *others = look.read.missing
         more = f" and {len(others)} more" if others else ""
         notes.append(f"the pictures do without mesh files that cannot be read: {first}{more}")
     goal = sway(robot, q0, moving, size=outline.size, duration=duration)
@@ -100,7 +98,6 @@ def file_motion(
         goals={label: goal},
         balanced=balanced,
         notes=tuple(notes),
-        look=look,
         scale=sway_of(outline.size) / SWAY,
     )
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from ..robot import Robot
 from ..tasks import FrameTask, Task
-from ..viewer._look import Look
 from ._references import Path
 
 GAIN = 20.0
@@ -75,7 +74,6 @@ class Motion:
         goals: label to moving frame; pictures show the first one.
         balanced: whether a task keeps the centre of mass over the support polygon.
         notes: remarks for the user.
-        look: visual shapes for pictures; ``None``: those of the model.
         scale: size of the motion relative to 5 cm; required errors grow with it.
     """
 
@@ -89,7 +87,6 @@ class Motion:
     goals: Mapping[str, Goal]
     balanced: bool = True
     notes: tuple[str, ...] = ()
-    look: Look | None = None
     scale: float = 1.0
 
 

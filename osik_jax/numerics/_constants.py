@@ -2,8 +2,7 @@
 
 Numbers that depend on the precision of the data have one value for each precision. Most are relative: to machine
 epsilon, to roundoff (a tolerance times the scale of a constraint, ``constraint_scales``), or to the quantity named in
-their line. The compiled core has the same numbers in ``core/constants.hpp``, and GPU kernels get them as constants, so
-that plain JAX and the kernels decide alike.
+their line. ``core/constants.hpp`` has the same numbers for the kernels, which decide alike, and those of kernels alone.
 
 Not here, because they are no tolerances of a solver:
 
@@ -81,34 +80,6 @@ BOUND_DISTANCE = 1e-9
 """Distance relative to the bound, above which a joint is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
 """Largest residual of the active bounds of an accepted answer, relative to the terms that add up to x."""
-SATURATION_LOSS = 1e-8
-"""Two limits of an accepted answer in kernels. The scale may be larger by at most this much, according to the change by
-the null space of the combination of joints that stops the motion. A joint may leave its bound according to its
-multiplier by at most this much, relative to the terms that add up to x.
-"""
-SATURATION_RANK = 1e-9
-"""A joint is dependent in kernels if the part of its unit vector in the null space and outside the span of the
-saturated joints is below this. A joint whose entry in a combination is below this share of the largest does not stop
-the motion.
-"""
-SATURATION_COMPLIANCE, STIFFER_SATURATION_COMPLIANCE = 1e-12, 1e-13
-"""Compliance (in kernels) of the missing part of the motion in the second and third attempt, which follow if nearly
-dependent joints spoil the first answer. It is the squared length of x that the missing part outweighs. A larger
-compliance makes it more certain that no larger scale is possible.
-"""
-SOFT_SATURATION_RANK = 1e-11
-"""``SATURATION_RANK`` in these attempts: the missing part is a coordinate there, so few joints depend on others."""
-SIGN_CHECKS = 3
-"""Number of times (in kernels) that a search resumes because rounding gave a multiplier of the wrong sign at its end.
-"""
-MAX_SATURATION_CHANGES = 5
-"""Changes (in kernels) of the active set per variable after which the first attempt ends, because rounding makes it
-cycle. Later attempts may use all remaining iterations.
-"""
-LARGEST_RATE = 10.0
-"""Factor (in kernels) by which a joint's coefficient in a dependent combination must exceed the entering joint's to
-take its place.
-"""
 
 # ---- answers and certificates
 
@@ -152,8 +123,6 @@ DEPENDENCE_TOL = 100.0
 """Part of a constraint's diagonal left by the active constraints, in units of machine epsilon, below which it is
 dependent.
 """
-KERNEL_DEPENDENCE = 1e-14
-"""The same in the core, whose factors are orthogonal: relative to the square of the constraint's normal."""
 REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
 """Violation in units of roundoff, below which a dependent constraint is redundant and above which the problem is
 infeasible.
@@ -197,32 +166,12 @@ GRADIENT_STEPS = 100
 
 # ---- weighted QPs in kernels: double precision is the core's, single precision CUDA's
 
-KERNEL_REFINEMENTS = 10
-"""Largest number of corrections."""
-KERNEL_CORRECTION = 1e-20
-"""Predicted next correction of a kernel, relative to the answer, below which none follows; in single precision it is
-``LAST_CORRECTION``. With weak dampings the correction itself is up to 10^4 times larger: the prediction assumes that
-corrections shrink alike, and the first one is small by chance in a few problems of 10,000.
-"""
-MIN_DECREASE, SMALL_CORRECTION = 0.25, 1e-3
-"""Ratio of two corrections above which the second one was roundoff, if it was also below that part of the answer. A
-larger one follows where the first was small by chance, or where weak directions shrink slowly. From the third on, one
-that is not smaller than the one before is the last.
-"""
-KERNEL_PIVOT = 1e2
-"""Pivot in units of machine epsilon times the diagonal element, below which rows are dependent."""
 BOUND_MULTIPLIER = {jnp.dtype("float64"): 1.0, jnp.dtype("float32"): 0.03}
 """Multiplier of the wrong sign in units of machine epsilon times the gradient's terms, above which a variable leaves
 its bound. A tolerance relative to the cost's curvature would be too large: a weak task such as a posture pulls with
 less. In single precision the sum of all terms would be too, as their roundoff mostly cancels. A row leaves its bound if
 its multiplier exceeds this in an entry of the gradient (double precision).
 """
-VIOLATION_TOL = 10.0
-"""Violation in units of roundoff, in single precision, below which a bound holds."""
-MAX_EXCHANGES = 2
-"""Exchanges without fewer wrong labels, before the dual active-set method starts."""
-MAX_DUAL_STARTS = 8
-"""Starts and restarts of the dual active-set method: its answer, solved anew, may violate another bound slightly."""
 
 # ---- projected Newton
 
@@ -283,16 +232,10 @@ the rank tolerance left out.
 WORKING_SET_SOLVES = 2
 """Solves per factorisation, each against exact residuals: the first, and one refinement."""
 MAX_STALLED = 20
-"""Consecutive steps of zero length after which the least index decides; shared with kernels, as are the next two."""
-MAX_ATTEMPTS = 4
-"""Solves and corrections of a kernel on a guessed working set, before the primal active-set method."""
-FACTOR_RIDGE = 1e-14
-"""Ridge relative to the square of the longest row; it keeps a kernel's factor of a damped level positive."""
+"""Consecutive steps of zero length after which the least index decides; shared with kernels."""
 
 # ---- null spaces
 
-INDEPENDENT_ROWS = 1e-7
-"""Least eigenvalue (in kernels) of a Gram matrix relative to its trace, above which its factors are accurate enough."""
 NULL_SPACE_RANK = {jnp.dtype("float64"): 1e-10, jnp.dtype("float32"): 1e-5}
 """Part of a row outside the span of other rows relative to the level's Frobenius norm, below which it is dependent. In
 single precision roundoff makes dependent rows look independent, so the value is larger.
@@ -331,8 +274,6 @@ SMALL_SINE_SQUARED = 1e-6
 """Squared sine of half an angle, below which a series for the logarithm of a rotation is exact to roundoff."""
 SMALL_ANGLE_SQUARED = 1e-2
 """Squared angle [rad^2] below which a series for the derivative of that logarithm is exact to roundoff."""
-SMALL_TURN_SQUARED = 1e-6
-"""Squared angle [rad^2] below which a kernel integrates a rotation by a series."""
 PARALLEL = 1e-6
 """Squared sine of the angle between segments, below which they count as parallel."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .._whole_file import write_text
 from ..robot import Robot
@@ -17,9 +17,6 @@ from ._profile import Profile
 from ._profile_file import save_profile
 from ._report import report
 from ._retargeted import Retargeted
-
-if TYPE_CHECKING:
-    from ..viewer._look import Look
 
 _HELD_OUT = 4
 """Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
@@ -59,26 +56,22 @@ def fit_to_file(
     return found, len(learned), len(held_out)
 
 
-def write_folder(
-    result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False, look: Look | None = None
-) -> dict[str, Any]:
-    """Write motion (.npz and .csv), report, profile and optionally GIF and page (with ``look``); return the report."""
+def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False) -> dict[str, Any]:
+    """Write motion (.npz and .csv), report, profile and optionally GIF and page; return the report."""
     figures = {"clip": name, **report(result)}
-    write_motion(result, figures, out, page, look)
+    write_motion(result, figures, out, page)
     save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
     return figures
 
 
-def write_motion(
-    result: Retargeted, figures: dict[str, Any], out: Path, page: bool = False, look: Look | None = None
-) -> None:
+def write_motion(result: Retargeted, figures: dict[str, Any], out: Path, page: bool = False) -> None:
     """Write ``motion.npz``, ``motion.csv``, the page and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
     result.motion.save_csv(out / "motion.csv")
     if page:
-        write_report(result, figures, out / "motion.npz", out / "report.html", look=look)
+        write_report(result, figures, out / "motion.npz", out / "report.html")
     write_json(figures, out / "report.json")
 
 

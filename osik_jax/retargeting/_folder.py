@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -27,9 +27,6 @@ from ._profile_file import find_profile, profile_text, save_profile
 from ._report import FIGURES, picked, report
 from ._retarget import Retargeter, Source
 
-if TYPE_CHECKING:
-    from ..viewer._look import Look
-
 _JOB = "job.json"
 _COMPILING = 30_000
 """Frames that a CPU plans in the time of one compilation."""
@@ -46,7 +43,6 @@ def retarget_folder(
     chunk: int = 32,
     progress: Progress = True,
     page: bool = False,
-    look: Look | None = None,
 ) -> dict[str, Any]:
     """Retarget every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` file directly inside a folder.
 
@@ -65,7 +61,6 @@ def retarget_folder(
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
         page: whether each clip gets a page, ``report.html``, and ``out`` an ``index.html`` with links to them.
-        look: that of the pages.
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
@@ -86,7 +81,7 @@ def retarget_folder(
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
         sources = {name: _source(path, job) for name, path in files.items()}
-        work = _Work(retargeter, out, sources, chunk, page, look)
+        work = _Work(retargeter, out, sources, chunk, page)
         with reported(len(files), len(work.found), progress, "clips") as advance:
             # longest first: shorter clips can then use the program compiled for longer ones
             todo = [name for name in files if name not in work.found]
@@ -118,9 +113,8 @@ class _Work:
         sources: Mapping[str, dict[str, str]],
         chunk: int,
         page: bool,
-        look: Look | None,
     ):
-        self._retargeter, self._out, self._sources, self._page = retargeter, out, sources, (page, look)
+        self._retargeter, self._out, self._sources, self._page = retargeter, out, sources, page
         found = {name: _finished(out / name, of, page) for name, of in sources.items()}
         self.found = {name: own for name, own in found.items() if own is not None}
         self.failed: dict[str, str] = {}
@@ -162,7 +156,7 @@ class _Work:
                 continue
             self.found[name] = {"clip": name, **self._sources[name], **report(result)}
             (self._out / name).mkdir(exist_ok=True)
-            write_motion(result, self.found[name], self._out / name, *self._page)
+            write_motion(result, self.found[name], self._out / name, self._page)
         return len(clips)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -13,9 +13,6 @@ import numpy as np
 from ._contact import stretches
 from ._report import AT_SPEED, FIGURES, at_ends, joint_tracks, picked
 from ._retargeted import Retargeted
-
-if TYPE_CHECKING:
-    from ..viewer._look import Look
 
 _OFF, _MOST_JOINTS = 1e-3, 8
 """Distance from the plan that counts [rad or m], and number of joints that the panel lists."""
@@ -51,9 +48,7 @@ document.querySelectorAll('#osik .now').forEach(e=>e.style.left=100*now+'%')},50
 </script>"""
 
 
-def write_report(
-    result: Retargeted, figures: Mapping[str, Any], motion: Path, out: Path, *, look: Look | None = None
-) -> None:
+def write_report(result: Retargeted, figures: Mapping[str, Any], motion: Path, out: Path) -> None:
     """Write one HTML file that shows a retargeted motion without server or network.
 
     Args:
@@ -61,7 +56,6 @@ def write_report(
         figures: its report.
         motion: the ``motion.npz`` that it was saved to.
         out: the page.
-        look: what the robot's URDF shows; None: the model's own shapes.
 
     Raises:
         ImportError: viser is not installed (the extra ``viewer``).
@@ -71,7 +65,7 @@ def write_report(
 
     panel = _STYLE + _panel(result, figures) + _SCRIPT
     title = str(figures.get("clip", motion.stem))
-    write_page(result.robot, read_motion(motion, result.robot), out, look=look, title=title, beside=panel)
+    write_page(result.robot, read_motion(motion, result.robot), out, title=title, beside=panel)
 
 
 def write_index(summary: Mapping[str, Any], out: Path) -> None:

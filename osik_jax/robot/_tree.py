@@ -15,6 +15,7 @@ from jaxtyping import ArrayLike, Num
 
 from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
+from ._look import UnreadLook
 
 FREE, BALL, SLIDE, HINGE = (
     int(t)
@@ -63,11 +64,13 @@ class ModelHolder:
         model: the MuJoCo model; None in a stack of robots whose models differ.
         report: what the file asks for and the robot does not keep.
         meshes: collision meshes whose files are not read; they are the last of the tree's geoms.
+        look: visual shapes of a URDF, read when they are drawn; None: those of the model.
     """
 
     model: mujoco.MjModel | None
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
     meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
+    look: UnreadLook | None = dataclasses.field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         if self is other:

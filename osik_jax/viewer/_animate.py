@@ -18,7 +18,6 @@ from PIL import Image
 
 from .._errors import OsikValueError
 from ..robot import Robot
-from ._look import Look
 from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
@@ -41,7 +40,6 @@ def animate(
     size: tuple[int, int] = (720, 405),
     renderer: RendererName = "auto",
     style: Style = "auto",
-    look: str | Path | Look | None = None,
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
     curves: Values | None = None,
@@ -64,8 +62,7 @@ def animate(
         frames_per_second: at most so many pictures a second are taken from ``q``.
         size: width and height [pixels].
         renderer: ``"mujoco"`` (OpenGL), ``"raycast"`` (CPU), or ``"auto"``: the first of them that works.
-        style: ``"geoms"``, ``"sticks"``, or ``"auto"``: the look, else geoms, else sticks.
-        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
+        style: ``"geoms"``, ``"sticks"``, or ``"auto"``: what its URDF shows, else geoms, else sticks.
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
             centre of mass is drawn too, and a panel shows both from above.
         trails: frames whose paths are drawn.
@@ -96,7 +93,7 @@ def animate(
         frames * dt,
         size,
         renderer,
-        robot_parts(robot, style=style, look=look),
+        robot_parts(robot, style=style),
         _each(support, frames),
         trails,
         curves,

@@ -13,7 +13,6 @@ from ..collision import CollisionShape
 from ..robot import Robot
 from ._animate import paint_over
 from ._fixed import fixed_parts
-from ._look import Look
 from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
@@ -35,7 +34,6 @@ def hero_picture(
     labels: Sequence[str] = (),
     targets: Sequence[Float[np.ndarray, "k 3"]] = (),
     trails: Sequence[Float[np.ndarray, "n 3"]] = (),
-    look: str | Path | Look | None = None,
     spacing: float | None = None,
     size: tuple[int, int] = (1600, 720),
     azimuth: float = 20.0,
@@ -53,14 +51,13 @@ def hero_picture(
         labels: a line below each.
         targets: points of each that are marked with a cross, world axes [m]. Each (k, 3)
         trails: path of a point of each, drawn as a line, world axes [m]. Each (n, 3)
-        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         spacing: between neighbours' middles [m]; ``None``: a little more than the widest is wide; 0: all in one place.
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
         renderer: as in ``animate``.
     """
-    shape = robot_parts(robot, look=look)
+    shape = robot_parts(robot)
     sources = [next(mujoco_poses(robot, q)) for q in configurations]
     floor = floor_height(robot, shape, sources)
     corners = [shape.corners(source) for source in sources]

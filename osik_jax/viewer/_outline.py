@@ -11,7 +11,6 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..robot import Robot
-from ._look import Look
 from ._mujoco import mujoco_poses
 from ._parts import RobotParts, robot_parts
 from ._shapes import lowest_points
@@ -31,9 +30,9 @@ class Outline(NamedTuple):
     base: float
 
 
-def robot_outline(robot: Robot, q: ArrayLike, look: Look | None = None) -> Outline:
+def robot_outline(robot: Robot, q: ArrayLike) -> Outline:
     """Return the dimensions of a robot at a configuration, (nq,)."""
-    shape = robot_parts(robot, look=look)
+    shape = robot_parts(robot)
     data = next(mujoco_poses(robot, q))
     heights = lowest_points(shape, data)
     size = float(np.linalg.norm(np.ptp(shape.corners(data), axis=0)))

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Literal
 
 import mujoco
@@ -16,8 +15,8 @@ from scipy.spatial import ConvexHull, QhullError
 
 from .._errors import OsikValueError
 from ..robot import Robot
+from ..robot._look import Look
 from ..robot.loading._mjmodel import rotation_matrix
-from ._look import Look, given_look
 from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
@@ -121,21 +120,21 @@ class RobotParts:
         return data.xpos[self.bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
 
 
-def robot_parts(robot: Robot, *, style: Style = "auto", look: str | Path | Look | None = None) -> RobotParts:
+def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
     """Return the shapes of a robot for pictures.
 
     Args:
         robot: the robot.
-        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the look
-            if there is one, else the geoms if most moving bodies have a visible one, else sticks.
-        look: shapes and colours of its links, as its URDF gives them, or that URDF.
+        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the
+            visual shapes of its URDF, else the geoms if most moving bodies have a visible one, else sticks.
 
     Raises:
-        ValueError: ``style="geoms"`` of a model that has no visible geom, or a look of another robot.
+        ValueError: ``style="geoms"`` of a model that has no visible geom.
     """
-    model, look = robot.mj_model, given_look(look)
-    if look is not None and style == "auto":
-        bodies = _link_bodies(model, look)
+    model, unread = robot.mj_model, robot.holder.look
+    if unread is not None and style == "auto":
+        look = unread.read
+        bodies = [model.body(shape.link).id for shape in look.shapes]
         if _cover(model, bodies):
             return _look_parts(model, look, bodies)
     geoms = [] if style == "sticks" else _visible_geoms(model)
@@ -146,15 +145,6 @@ def robot_parts(robot: Robot, *, style: Style = "auto", look: str | Path | Look 
     if style == "geoms":
         raise OsikValueError("the model has no geom to draw; use style='sticks'")
     return _sticks(robot)
-
-
-def _link_bodies(model: mujoco.MjModel, look: Look) -> list[int]:
-    """Return MuJoCo's body index of each shape."""
-    bodies = {name: mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in {s.link for s in look.shapes}}
-    strange = sorted(name for name, body in bodies.items() if body < 0)
-    if strange:
-        raise OsikValueError(f"the look is another robot's: this one has no links {', '.join(strange)}")
-    return [bodies[shape.link] for shape in look.shapes]
 
 
 def _look_parts(model: mujoco.MjModel, look: Look, bodies: list[int]) -> RobotParts:

@@ -15,7 +15,6 @@ from osik_jax.demo._run import TITLES, run_scheme
 from osik_jax.demo._sway import JointPath, strides, sway_of
 from osik_jax.robot._feet import guess_feet
 from osik_jax.viewer._crouch import crouched
-from osik_jax.viewer._look import read_look
 from osik_jax.viewer._mujoco import mujoco_frame_pose
 from osik_jax.viewer._outline import robot_outline
 
@@ -150,9 +149,9 @@ def test_legs_bend_over_feet_that_stay(file, nao):
 def test_a_walker_stands_on_the_floor():
     """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
     path = example_file("solo_description/robots/solo12.urdf")
-    robot, look = osik.Robot.from_urdf(path, floating_base=True), read_look(path)
-    motion = file_motion(robot, name="solo12", look=look)
-    assert robot_outline(robot, motion.q0, look).lowest == pytest.approx(0.0, abs=1e-9)
+    robot = osik.Robot.from_urdf(path, floating_base=True)
+    motion = file_motion(robot, name="solo12")
+    assert robot_outline(robot, motion.q0).lowest == pytest.approx(0.0, abs=1e-9)
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
     assert motion.notes == ()

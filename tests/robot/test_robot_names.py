@@ -11,7 +11,7 @@ import osik_jax as osik
 from osik_jax.cli import CommandError, read_robot
 from osik_jax.cli._retarget import _robot_to_retarget
 from osik_jax.robot.loading import NAMES, example_urdf
-from osik_jax.viewer.live._source import RobotSource, source_look
+from osik_jax.viewer.live._source import RobotSource
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -27,11 +27,11 @@ def test_every_way_loads_the_same_robot(name: str):
 
 @pytest.mark.parametrize("name", ["g1", "talos", "ur5", "so101"])
 def test_urdfs_of_example_robot_data(name: str):
-    """The same as its file, with a base as asked; the page finds the meshes' shapes."""
+    """The same as its file, with a base as asked; meshes stay unread."""
     robot = osik.Robot.from_urdf(example_urdf(name), floating_base=False)
     assert osik.load_robot(name, floating_base=False).tree == robot.tree
     assert read_robot(name, "fixed").tree == robot.tree
-    assert source_look(RobotSource(name)) is not None
+    assert robot.holder.look is not None and "read" not in vars(robot.holder.look)
 
 
 def test_without_the_packages_both_are_named(monkeypatch):

@@ -22,7 +22,6 @@ from osik_jax.viewer import serve_reach
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer.live._open import is_map, open_map
 from osik_jax.viewer.live._reach import _FAINT, ReachView, slice_picture, slice_words
-from osik_jax.viewer.live._source import RobotSource
 
 ARM = osik.load_robot("arm7")
 
@@ -138,7 +137,7 @@ def test_the_command_opens_a_map(found: ReachabilityMap, tmp_path: Path, capsys:
     path = tmp_path / "map.npz"
     found.save(path)
     assert is_map(path) and not is_map(tmp_path / "nowhere.npz")
-    with open_map(path, ARM, RobotSource("arm7"), host="127.0.0.1", port=0) as view:
+    with open_map(path, ARM, host="127.0.0.1", port=0) as view:
         np.testing.assert_array_equal(view.map.reached, found.reached)
     for arguments, told in (
         ([str(path)], "the map is of another robot"),  # NAO

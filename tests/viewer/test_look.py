@@ -15,7 +15,6 @@ import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.robot.loading._collada import read_collada
 from osik_jax.robot.loading._meshes import read_mesh
-from osik_jax.viewer._look import read_look
 from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._shapes import lowest_points
@@ -32,6 +31,12 @@ def written(path, text):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path
+
+
+def look_of(robot):
+    """The visual shapes of a robot's URDF."""
+    assert robot.holder.look is not None
+    return robot.holder.look.read
 
 
 def area(part):
@@ -98,9 +103,10 @@ def test_stl_and_obj_hold_the_same_box(tmp_path):
 def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
     written(tmp_path / "meshes" / "box.obj", CUBE_OBJ)
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://any_name/meshes/box.obj"))
-    robot, look = osik.Robot.from_urdf(path, floating_base=False), read_look(path)
+    robot = osik.Robot.from_urdf(path, floating_base=False)
+    look = look_of(robot)
     assert look.missing == () and [shape.link for shape in look.shapes] == ["base", "upper"]
-    shape, data = robot_parts(robot, look=look), next(mujoco_poses(robot, [0.5]))
+    shape, data = robot_parts(robot), next(mujoco_poses(robot, [0.5]))
     assert shape.style == "look"
     placed = zip(shape.parts, *shape.poses(data), strict=True)
     points = np.concatenate([part_triangles(part).vertices @ R.T + p for part, p, R in placed])
@@ -110,13 +116,12 @@ def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
     np.testing.assert_allclose(high[[0, 2]], np.maximum(corners.max(0), [0.1, 0.2]), atol=1e-6)
     np.testing.assert_allclose(low[[0, 2]], np.minimum(corners.min(0), [0.0, 0.0]), atol=1e-6)
     np.testing.assert_allclose(lowest_points(shape, data), [0.0, corners[:, 1].min()], atol=1e-6)
-    with pytest.raises(ValueError, match="another robot's: this one has no links base, upper"):
-        robot_parts(osik.load_robot("nao"), look=look)
+    assert robot_parts(robot, style="sticks").style == "sticks" and osik.load_robot("nao").holder.look is None
 
 
 def test_collision_shapes_stand_in_for_meshes_that_are_gone(tmp_path):
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="package://gone/box.stl"))
-    look = read_look(path)
+    look = look_of(osik.Robot.from_urdf(path, floating_base=False))
     assert look.missing == ("package://gone/box.stl",)
     assert [shape.kind for shape in look.shapes] == [mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX]
 
@@ -136,7 +141,7 @@ def test_the_icubs_meshes_are_turned():
     """All of them say that y is up, and mean it: left as they are, its joints are 6 cm away from them."""
     path = example_file("robots/icub.urdf")
     robot = osik.Robot.from_urdf(path, floating_base=True)
-    away = from_joints(robot, read_look(path))
+    away = from_joints(robot, look_of(robot))
     assert len(away) > 30 and away.mean() < 0.02
 
 
@@ -147,7 +152,7 @@ def test_y_up_is_followed_where_that_brings_meshes_to_joints(tmp_path, elbow):
     blade = blade.replace("100 0 0</translate>", "0 0 0</translate>").replace("0 0 1 50 0 0 0 1", "0 0 1 0 0 0 0 1")
     written(tmp_path / "meshes" / "blade.dae", blade)
     text = ARM.format(mesh="meshes/blade.dae").replace("0.1 0.1 0.1", "1 1 1").replace("0 0 0.2", elbow)
-    look = read_look(written(tmp_path / "arm.urdf", text))
+    look = look_of(osik.Robot.from_urdf(written(tmp_path / "arm.urdf", text), floating_base=False))
     (mesh,) = (shape.mesh[0] for shape in look.shapes if shape.mesh is not None)
     end = np.array([float(x) for x in elbow.split()])
     assert (mesh @ end).max() == pytest.approx(1.0) and (mesh @ end).min() == pytest.approx(0.0, abs=1e-12)
@@ -170,7 +175,7 @@ def test_no_instant_is_cut_and_no_head_is_under_the_title(tmp_path):
     path = written(tmp_path / "arm.urdf", ARM.format(mesh="none.stl").replace("0.1 0.2 0.3", "1.6 0.2 0.3"))
     robot = osik.Robot.from_urdf(path, floating_base=False)
     q = np.linspace(-0.4, 0.4, 9)[:, None]
-    picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144), look=path)
+    picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144))
     film = viewer.animate(tmp_path / "f.gif", robot, q, dt=0.1, size=(240, 136), renderer="raycast", caption="a title")
     pictures = [np.asarray(Image.open(picture).convert("RGB"), float)]
     with Image.open(film) as frames:

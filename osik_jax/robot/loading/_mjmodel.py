@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikTypeError, OsikValueError, warn
 from ...numerics._host import to_jax
 from .._load_report import LoadNote, LoadReport
+from .._look import UnreadLook
 from .._model import RobotModel
 from .._plausible import first_of, warn_of_fast_joints
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, UnreadMesh
@@ -79,6 +80,7 @@ def from_mjmodel(
     fixed: Iterable[str] = (),
     notes: Iterable[LoadNote] = (),
     meshes: Sequence[NamedMesh] = (),
+    look: UnreadLook | None = None,
 ) -> RobotModel:
     """Return names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
@@ -88,6 +90,7 @@ def from_mjmodel(
         fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
         notes: what the file that the model was made from asks for and the model does not have.
         meshes: collision meshes that the model does not hold; they become the last of the robot's geoms.
+        look: visual shapes of a URDF.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
@@ -147,7 +150,7 @@ def from_mjmodel(
         acceleration_limit=_rate_limits(tree, followers, accelerations),
         q0=q0,
     )
-    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes))
+    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
 
 

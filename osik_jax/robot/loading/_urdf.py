@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ import numpy as np
 from ..._errors import OsikValueError, warn
 from .._feet import find_feet
 from .._load_report import LoadNote
+from .._look import UnreadLook
 from .._model import RobotModel
 from .._tree import UnreadMesh
+from ._look import GEOMS, geom_size, read_look
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
     INERTIA,
@@ -37,12 +40,6 @@ from ._urdf_notes import urdf_notes
 WORLD = "world"
 FLOATING_BASE = "floating_base"
 
-GEOMS = {
-    "box": mujoco.mjtGeom.mjGEOM_BOX,
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
-    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
-    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-}
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
 _BALANCED = 1e-6
 """Relative change of a link's moments of inertia from which a note tells of it: less is roundoff."""
@@ -76,7 +73,8 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     }
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
-    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread)
+    look = UnreadLook(partial(read_look, description, packages, source.path))
+    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look)
 
 
 def _inertia_notes(urdf: Urdf, model: mujoco.MjModel) -> Iterator[LoadNote]:
@@ -253,14 +251,6 @@ def _unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Itera
             position, rotation = tuple(shape.pose.position.tolist()), tuple(map(tuple, shape.pose.rotation.tolist()))
             mesh = UnreadMesh(link.name, shape.file, shape.size, position, rotation, urdf_path, folders)
             yield NamedMesh(shape.name, mesh)
-
-
-def geom_size(shape: Shape) -> list[float]:
-    """Return MuJoCo's sizes: radius first, then half lengths."""
-    if shape.kind == "box":
-        return [edge / 2.0 for edge in shape.size]
-    radius, *length = shape.size
-    return [radius, *(value / 2.0 for value in length), 0.0, 0.0][:3]
 
 
 def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:

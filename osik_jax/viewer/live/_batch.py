@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -19,7 +18,6 @@ from ...robot import Robot
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import FrameTask, Task
-from .._look import Look, given_look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -48,7 +46,6 @@ class BatchView(Served):
         q0: Float[np.ndarray, "B nq"],
         *,
         dt: float,
-        look: Look | None,
         host: str,
         port: int,
     ) -> None:
@@ -56,7 +53,7 @@ class BatchView(Served):
         self.names, self._robot = tuple(controllers), robot
         self.loop = ControlLoop(robot, stacked(tuple(controllers.values())), dt=dt, q0=jnp.asarray(q0))
         super().__init__(host, port, "osik-jax")
-        shapes = robot_parts(robot, look=look)
+        shapes = robot_parts(robot)
         span = np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, q0)])
         size = float(np.linalg.norm(np.ptp(span, axis=0)))
         offsets = side_by_side(span, len(q0), least=_APART * size)
@@ -65,7 +62,7 @@ class BatchView(Served):
         self._nodes, self._gizmos = [], []
         for lane, (name, offset) in enumerate(zip(self.names, offsets, strict=True)):
             node = f"robot {name}"
-            self._nodes.append(RobotNodes(self._server.scene, robot, look=look, name=node, offset=offset))
+            self._nodes.append(RobotNodes(self._server.scene, robot, name=node, offset=offset))
             add_label(self._server.scene, name, span + offset)
             drag = self._dragging(lane)
             self._gizmos.append(Gizmos(self._server.scene, size, drag, below=f"/{node}"))
@@ -203,7 +200,6 @@ def serve_batch(
     limits: Limits | None = None,
     dt: float = 0.005,
     q0: Float[Array, "B nq"] | Float[Array, " nq"] | None = None,
-    look: str | Path | Look | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -241,5 +237,5 @@ def serve_batch(
         scheme = scheme_for(next(iter(tasks.values())), robot.q0.dtype)
     controllers = {name: Controller(dict(own), scheme, given) for name, own in tasks.items()}
     q0s = np.broadcast_to(start, (len(tasks), robot.nq)).copy()
-    view = BatchView(robot, controllers, q0s, dt=dt, look=given_look(look), host=host, port=port)
+    view = BatchView(robot, controllers, q0s, dt=dt, host=host, port=port)
     return view.opened(open_browser)

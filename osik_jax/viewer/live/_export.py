@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikValueError
 from ...control import Trajectory
 from ...robot import Robot
-from .._look import Look, given_look
 from ._playback import Cast, Motion
 from ._server import close_server, open_server
 
@@ -28,7 +27,6 @@ def export_html(
     path: str | os.PathLike[str],
     *,
     dt: float | None = None,
-    look: str | Path | Look | None = None,
     title: str = "osik-jax",
 ) -> Path:
     """Write a motion as one self-contained page with time slider, speeds and a mouse-controlled camera.
@@ -41,7 +39,6 @@ def export_html(
         trajectory: of ``rollout``, or configurations (T, nq), or several of them by name, side by side.
         path: of the page.
         dt: time between configurations [s]; default: that of the trajectory, or 0.005.
-        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         title: of the page.
 
     Returns:
@@ -51,16 +48,14 @@ def export_html(
         ImportError: viser is not installed (the extra ``viewer``).
         ValueError: configurations of another robot, or none.
     """
-    return write_page(robot, _motion(robot, trajectory, dt), Path(path), look=given_look(look), title=title)
+    return write_page(robot, _motion(robot, trajectory, dt), Path(path), title=title)
 
 
-def write_page(
-    robot: Robot, motion: Motion, out: Path, *, look: Look | None, title: str, beside: str | None = None
-) -> Path:
+def write_page(robot: Robot, motion: Motion, out: Path, *, title: str, beside: str | None = None) -> Path:
     """Write the page of an already loaded motion; ``beside`` is HTML that is shown beside it."""
     server = open_server("127.0.0.1", 0, title)
     try:
-        cast = Cast(server, robot, motion, look, panel=False)
+        cast = Cast(server, robot, motion, panel=False)
         serializer = server.get_scene_serializer()
         count = max(int(np.ceil(motion.duration * _PICTURES)), 1)
         for now in np.linspace(0.0, motion.duration, count + 1):

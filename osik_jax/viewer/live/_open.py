@@ -19,7 +19,7 @@ from ._page import LiveView, serve
 from ._playback import Player, read_motion
 from ._reach import ReachView, check_map, serve_reach
 from ._session import load_session
-from ._source import RobotSource, source_look
+from ._source import RobotSource
 from ._stance import sole_polygon, standing
 
 
@@ -27,20 +27,19 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
     """Open a page with a robot to drag; ``feet`` are the frames that stand on the ground."""
     for foot in feet:
         robot.tree.frame(foot)
-    look = source_look(source)
-    if look is not None and look.missing:
-        warn(f"the page does without mesh files that cannot be read: {', '.join(look.missing[:3])}")
-    shapes = robot_parts(robot, look=look)
+    shapes, look = robot_parts(robot), robot.holder.look
+    if look is not None and look.read.missing:
+        warn(f"the page does without mesh files that cannot be read: {', '.join(look.read.missing[:3])}")
     q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
     session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
-    return serve(session, look=look, host=host, port=port)
+    return serve(session, host=host, port=port)
 
 
-def open_motion(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> Player:
+def open_motion(path: Path, robot: Robot, *, host: str, port: int) -> Player:
     """Open a page that plays a motion."""
     motion = read_motion(path, robot)
-    return Player(robot, motion, look=source_look(source), host=host, port=port, title=path.name)
+    return Player(robot, motion, host=host, port=port, title=path.name)
 
 
 def is_map(path: Path) -> bool:
@@ -52,23 +51,21 @@ def is_map(path: Path) -> bool:
         return False  # what is wrong with it is told where it is read
 
 
-def open_map(path: Path, robot: Robot, source: RobotSource, *, host: str, port: int) -> ReachView:
+def open_map(path: Path, robot: Robot, *, host: str, port: int) -> ReachView:
     """Open a page with a reachability map."""
     found = load_map(path)
     try:
         check_map(robot, found)
     except ValueError as error:
         raise OsikValueError(f"{path}: {error}; say which with --robot") from None
-    return serve_reach(robot, found, look=source_look(source), host=host, port=port)
+    return serve_reach(robot, found, host=host, port=port)
 
 
-def write_motion(path: Path, robot: Robot, source: RobotSource, page: Path) -> None:
+def write_motion(path: Path, robot: Robot, page: Path) -> None:
     """Write a page that plays a motion without a server."""
-    write_page(robot, read_motion(path, robot), page, look=source_look(source), title=path.stem)
+    write_page(robot, read_motion(path, robot), page, title=path.stem)
 
 
 def open_session(path: Path, *, host: str, port: int) -> LiveView:
     """Open a page that resumes a saved session."""
-    session = load_session(path)
-    look = None if session.source is None else source_look(session.source)
-    return serve(session, look=look, host=host, port=port)
+    return serve(load_session(path), host=host, port=port)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from ...robot import Robot
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
-from .._look import Look, given_look
 from .._mujoco import mujoco_poses, robot_com
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -40,16 +38,16 @@ if TYPE_CHECKING:
 class LiveView(Served):
     """Page that runs a session; ``serve`` says what it has."""
 
-    def __init__(self, session: Session, *, look: Look | None, host: str, port: int) -> None:
+    def __init__(self, session: Session, *, host: str, port: int) -> None:
         """Start the server and the loop."""
         super().__init__(host, port, "osik-jax")
         robot = session.robot
-        shapes, data = robot_parts(robot, look=look), next(mujoco_poses(robot, session.q))
+        shapes, data = robot_parts(robot), next(mujoco_poses(robot, session.q))
         self._desk = Desk(session, shapes)
         seen, floor = shapes.corners(data), floor_height(robot, shapes, [data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         add_surroundings(self._server, seen, floor)
-        self._robot = RobotNodes(self._server.scene, robot, look=look)
+        self._robot = RobotNodes(self._server.scene, robot)
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
         self._obstacles = ObstacleNodes(self._server.scene, size, self._desk.move_obstacle)
@@ -139,7 +137,6 @@ def serve(
     limits: Limits | None = None,
     dt: float | None = None,
     q0: Float[Array, " nq"] | None = None,
-    look: str | Path | Look | None = None,
     source: RobotSource | str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
@@ -151,13 +148,12 @@ def serve(
     ``view.wait()`` keeps a program going until Ctrl-C.
 
     Args:
-        robot: the robot; or a session, alone with ``look`` and the page's address: it has the rest.
+        robot: the robot; or a session, alone with the page's address: it has the rest.
         tasks: by name. Frame tasks and centres of mass that have a target get a handle to drag.
         scheme: as in ``osik_jax.solve``.
         limits: as in ``osik_jax.solve``.
         dt: time of a step, and period of the loop [s]. Default: 0.005.
         q0: configuration at the start [m, rad]; default: ``robot.q0``. (nq,)
-        look: visual shapes of a URDF, by its file or a name such as ``"ur5"``; None: the model's own shapes.
         source: name or file of the robot, which sessions then keep.
         host: address to listen at; 127.0.0.1 is this machine alone.
         port: TCP port; 0 for any that is free.
@@ -198,7 +194,7 @@ def serve(
     check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
     check_tasks(session.tasks, session.robot)
     checked_limits(session.robot, session.limits)
-    return LiveView(session, look=given_look(look), host=host, port=port).opened(open_browser)
+    return LiveView(session, host=host, port=port).opened(open_browser)
 
 
 def _check_alone(**parts: Any) -> None:

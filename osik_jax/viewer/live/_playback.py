@@ -14,7 +14,6 @@ from jaxtyping import Float
 from ..._errors import OsikValueError
 from ..._npz import open_npz
 from ...robot import Robot
-from .._look import Look
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -123,9 +122,9 @@ def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.
 class Cast:
     """Robots of a motion, side by side in one scene, and on their left the person, as large as a robot."""
 
-    def __init__(self, server: Any, robot: Robot, motion: Motion, look: Look | None, *, panel: bool) -> None:
+    def __init__(self, server: Any, robot: Robot, motion: Motion, *, panel: bool) -> None:
         """Add a robot per run, the floor and a camera, optionally with room for a panel."""
-        shapes, self._robot, self._motion = robot_parts(robot, look=look), robot, motion
+        shapes, self._robot, self._motion = robot_parts(robot), robot, motion
         spans = np.concatenate([_span(robot, shapes, q) for q in motion.runs.values()])
         first = next(iter(motion.runs.values()))
         floor = floor_height(robot, shapes, mujoco_poses(robot, first[:1]))
@@ -142,7 +141,7 @@ class Cast:
             add_label(server.scene, "person", person.points.reshape(-1, 3) + offsets.pop(0))
         self._nodes: dict[str, RobotNodes] = {}
         for name, offset in zip(motion.runs, offsets, strict=True):
-            self._nodes[name] = RobotNodes(server.scene, robot, look=look, name=f"robot {name}", offset=offset)
+            self._nodes[name] = RobotNodes(server.scene, robot, name=f"robot {name}", offset=offset)
             if len(motion.runs) > 1:
                 add_label(server.scene, name, spans + offset)
 
@@ -163,10 +162,10 @@ def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.n
 class Player(Served):
     """Page that plays a motion in a loop."""
 
-    def __init__(self, robot: Robot, motion: Motion, *, look: Look | None, host: str, port: int, title: str) -> None:
+    def __init__(self, robot: Robot, motion: Motion, *, host: str, port: int, title: str) -> None:
         """Start the server and the playback."""
         super().__init__(host, port, title)
-        self._cast, self._motion = Cast(self._server, robot, motion, look, panel=True), motion
+        self._cast, self._motion = Cast(self._server, robot, motion, panel=True), motion
         gui = self._server.gui
         self._time = gui.add_slider("Time [s]", 0.0, max(motion.duration, 1e-3), step=1e-3, initial_value=0.0)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")

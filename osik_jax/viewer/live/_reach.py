@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import mujoco
@@ -14,7 +13,6 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 from ...reachability._map import ReachabilityMap
 from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
 from ...robot import Robot
-from .._look import Look, given_look
 from .._mujoco import mujoco_poses
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes
@@ -51,15 +49,15 @@ class Slice(NamedTuple):
 class ReachView(Served):
     """Page that shows a slice of a map; ``serve_reach`` says what it has."""
 
-    def __init__(self, robot: Robot, found: ReachabilityMap, *, look: Look | None, host: str, port: int) -> None:
+    def __init__(self, robot: Robot, found: ReachabilityMap, *, host: str, port: int) -> None:
         """Start the server."""
         super().__init__(host, port, f"Reach of {found.frame}")
         self.map, self._robot = found, robot
         self._axes = found.axes
-        corners = robot_parts(robot, look=look).corners(next(mujoco_poses(robot, np.asarray(robot.q0))))
+        corners = robot_parts(robot).corners(next(mujoco_poses(robot, np.asarray(robot.q0))))
         seen = np.concatenate([corners, found.positions[found.reached.any(-1)]])
         add_surroundings(self._server, seen, float(seen[:, 2].min()))
-        self._nodes = RobotNodes(self._server.scene, robot, look=look)
+        self._nodes = RobotNodes(self._server.scene, robot)
         self._picture: ImageHandle | None = None
         self._drawn: tuple[int, int] | None = None
         self._cell: tuple[int, int, int] | None = None
@@ -237,7 +235,6 @@ def serve_reach(
     robot: Robot,
     found: ReachabilityMap,
     *,
-    look: str | Path | Look | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -265,7 +262,7 @@ def serve_reach(
         ValueError: the map is of another robot.
     """
     check_map(robot, found)
-    return ReachView(robot, found, look=given_look(look), host=host, port=port).opened(open_browser)
+    return ReachView(robot, found, host=host, port=port).opened(open_browser)
 
 
 def check_map(robot: Robot, found: ReachabilityMap) -> None:

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ...robot import Robot
-from .._look import Look
 from .._mujoco import mujoco_poses
 from .._parts import RobotParts, robot_parts
 from ._surfaces import Surface, part_triangles
@@ -31,12 +30,11 @@ class RobotNodes:
         scene: SceneApi,
         robot: Robot,
         *,
-        look: Look | None = None,
         name: str = "robot",
         offset: Float[np.ndarray, "3"] | None = None,
     ) -> None:
         """Add the robot at ``robot.q0``, moved by an offset [m], as a node of this name."""
-        shapes = robot_parts(robot, look=look)
+        shapes = robot_parts(robot)
         data = next(mujoco_poses(robot, np.asarray(robot.q0)))
         scene.add_frame(f"/{name}", show_axes=False, position=np.zeros(3) if offset is None else offset)
         self._frames: dict[int, FrameHandle] = {}

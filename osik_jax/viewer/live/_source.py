@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import suppress
 
 from ...robot import Robot
 from ...robot._load_robot import is_file, read_robot
-from ...robot.loading import ELSEWHERE, EXAMPLES, ROBOTS, example_urdf, is_mjcf, urdf_of_description
-from .._look import Look, read_look
+from ...robot.loading import is_mjcf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,16 +45,3 @@ class RobotSource:
         if not self.is_file:
             return f"osik.load_robot({self.robot!r}{base})"
         return f"osik.Robot.{'from_mjcf' if self.is_mjcf else 'from_urdf'}({self.robot!r}{base})"
-
-
-def source_look(source: RobotSource) -> Look | None:
-    """Return the visual shapes of the robot's URDF; None if its model already has shapes."""
-    if source.is_file:
-        return None if source.is_mjcf else read_look(source.robot)
-    if source.robot in ROBOTS:
-        return None
-    if source.robot in EXAMPLES:
-        with suppress(FileNotFoundError):
-            return read_look(example_urdf(source.robot))
-    urdf = urdf_of_description(ELSEWHERE.get(source.robot, source.robot))
-    return None if urdf is None else read_look(urdf[0], package_dirs=urdf[1])

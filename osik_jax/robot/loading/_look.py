@@ -1,92 +1,54 @@
-"""Appearance of a URDF's links: visual shapes and mesh files, which ``Robot.from_urdf`` does not keep."""
+"""Appearance of a URDF's links: visual shapes and mesh files, which are not read before the robot is drawn."""
 
 from __future__ import annotations
 
-import dataclasses
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
 
-from ..robot.loading import EXAMPLES, example_urdf
-from ..robot.loading._collada import Triangles
-from ..robot.loading._meshes import read_mesh
-from ..robot.loading._packages import Packages
-from ..robot.loading._source import check_root, parse_xml, read_source
-from ..robot.loading._urdf import GEOMS, geom_size
-from ..robot.loading._urdf_elements import Link, Shape, Urdf, read_urdf
+from .._look import LinkShape, Look
+from ._collada import Triangles
+from ._meshes import read_mesh
+from ._packages import Packages
+from ._urdf_elements import Link, Shape, Urdf
 
+GEOMS = {
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+}
 _NEAR = 3
 """Number of folders above a URDF that are searched for a mesh whose package has another name there."""
 _Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-@dataclasses.dataclass(frozen=True)
-class LinkShape:
-    """A shape of a link, in the link's frame.
-
-    Attributes:
-        link: name of the link.
-        kind: MuJoCo's geom type.
-        size: MuJoCo's geom sizes [m]. (3,)
-        position: centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame. (3,)
-        rotation: rotation of a simple shape in the link's frame. (3, 3)
-        color: red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none.
-        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
-    """
-
-    link: str
-    kind: mujoco.mjtGeom
-    size: Float[np.ndarray, "3"]
-    position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    color: tuple[float, ...] | None
-    mesh: tuple[np.ndarray, np.ndarray] | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Look:
-    """Visual shapes of a robot's links.
-
-    Attributes:
-        shapes: of all links.
-        missing: addresses of mesh files that were not found or could not be read.
-    """
-
-    shapes: tuple[LinkShape, ...]
-    missing: tuple[str, ...]
-
-
-def given_look(look: str | Path | Look | None) -> Look | None:
-    """Return the look that a URDF's file or name stands for; return a ``Look`` or None unchanged."""
-    return read_look(look) if isinstance(look, str | os.PathLike) else look
-
-
-def read_look(urdf: str | os.PathLike[str], *, package_dirs: Iterable[str | os.PathLike[str]] = ()) -> Look:
+def read_look(urdf: Urdf, packages: Packages, beside: Path | None) -> Look:
     """Return the visual shapes of a URDF with their meshes (DAE, STL, OBJ, MSH).
 
     Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
     both ways that one is taken that puts the meshes nearer to the joints of their links.
 
     Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
-    shapes are taken.
+    shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
+    whatever the package is called there.
 
     Args:
-        urdf: path of the file, or a name of ``load_robot`` whose URDF comes with example-robot-data, such as ``"ur5"``.
-        package_dirs: as in ``Robot.from_urdf``. Last of all, the rest of a ``package://`` address is looked for in the
-            folders above the file, whatever the package is called there.
-
-    Raises:
-        FileNotFoundError: no such URDF.
-        ValueError: the URDF is broken.
+        urdf: links and joints.
+        packages: folders for ``package://`` addresses.
+        beside: path of the URDF; None if it was given as text.
     """
-    source = read_source(example_urdf(str(urdf)) if str(urdf) in EXAMPLES else urdf, "URDF")
-    root = parse_xml(source)
-    check_root(root, "robot", source)
-    return _Reader(read_urdf(root), Packages(package_dirs), source.path).look()
+    return _Reader(urdf, packages, beside).look()
+
+
+def geom_size(shape: Shape) -> list[float]:
+    """Return MuJoCo's sizes: radius first, then half lengths."""
+    if shape.kind == "box":
+        return [edge / 2.0 for edge in shape.size]
+    radius, *length = shape.size
+    return [radius, *(value / 2.0 for value in length), 0.0, 0.0][:3]
 
 
 class _Reader:

@@ -1,0 +1,63 @@
+"""Visual shapes of a robot's links, which are read when the robot is drawn."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+
+@dataclasses.dataclass(frozen=True)
+class LinkShape:
+    """A shape of a link, in the link's frame.
+
+    Attributes:
+        link: name of the link.
+        kind: MuJoCo's geom type.
+        size: MuJoCo's geom sizes [m]. (3,)
+        position: centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame. (3,)
+        rotation: rotation of a simple shape in the link's frame. (3, 3)
+        color: red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none.
+        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
+    """
+
+    link: str
+    kind: mujoco.mjtGeom
+    size: Float[np.ndarray, "3"]
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    color: tuple[float, ...] | None
+    mesh: tuple[np.ndarray, np.ndarray] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """Visual shapes of a robot's links.
+
+    Attributes:
+        shapes: of all links.
+        missing: addresses of mesh files that were not found or could not be read.
+    """
+
+    shapes: tuple[LinkShape, ...]
+    missing: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class UnreadLook:
+    """Visual shapes whose files are not read yet.
+
+    Attributes:
+        reader: function that reads them.
+    """
+
+    reader: Callable[[], Look]
+
+    @cached_property
+    def read(self) -> Look:
+        """Return the shapes; the files are read once."""
+        return self.reader()
