@@ -52,7 +52,7 @@ class Kinematics(eqx.Module):
     dof_anchor: Float[Numbers, "nvfull 3"]
     backend: Backend = eqx.field(default="jax", static=True)
 
-    def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    def frame_pose(self, robot: Robot, name: str) -> tuple[Float[Numbers, "3"], Float[Numbers, "3 3"]]:
         """Return the pose of a body, link, site or geom, in the form of a task's target.
 
         Args:
@@ -69,7 +69,7 @@ class Kinematics(eqx.Module):
         poses = _poses_of(robot, self, (name,))
         return _first(poses) if module_of(poses[0]) is np else _one(poses)
 
-    def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"]]:
+    def frame_poses(self, robot: Robot, names: Sequence[str]) -> tuple[Float[Numbers, "k 3"], Float[Numbers, "k 3 3"]]:
         """Return positions and rotations of several frames.
 
         Raises:
@@ -87,7 +87,7 @@ _one = jax.jit(_first)
 
 
 # functions in place of methods: Equinox copies its object at each call of a method
-def _poses_of(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> tuple[Array, Array]:
+def _poses_of(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> tuple[Numbers, Numbers]:
     frames = tuple(robot.tree.frame(name) for name in names)
     poses, fixed = (kinematics.body_position, kinematics.body_rotation), (robot.frame_position, robot.frame_rotation)
     if module_of(poses[0]) is np and not is_traced(fixed):
@@ -213,7 +213,7 @@ def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) ->
     return _moving_frames(robot, replace(kinematics, backend="jax"), names=tuple(names))
 
 
-def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Array, "3"]:
+def center_of_mass(robot: Robot, kinematics: Kinematics, subtree: str | None = None) -> Float[Numbers, "3"]:
     """Return the centre of mass in the world [m], of the robot or of the body ``subtree`` with its descendants.
 
     Bodies fixed to the world (an arm's base) do not count, as in Pinocchio and unlike MuJoCo; nor do loose bodies of a

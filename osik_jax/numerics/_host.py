@@ -14,13 +14,13 @@ from jaxtyping import Array
 if TYPE_CHECKING:
     Numbers: TypeAlias = Any  # an operator of both is none of their union's
 else:
-    Numbers = jax.Array | np.ndarray
+    Numbers = jax.Array | np.ndarray | np.generic
 """An array of JAX, or of NumPy for what is computed on the host."""
 
 
 def module_of(array: Any) -> ModuleType:
-    """Return ``numpy`` for an array of NumPy, else ``jax.numpy``: one text computes on the host and in a program."""
-    return np if isinstance(array, np.ndarray) else jnp
+    """Return ``numpy`` for NumPy's arrays and numbers, else ``jax.numpy``: one text serves the host and programs."""
+    return np if isinstance(array, np.ndarray | np.generic) else jnp
 
 
 def is_traced(tree: Any) -> bool:

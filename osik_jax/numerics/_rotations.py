@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
 from ._host import Numbers, module_of, to_jax
@@ -25,7 +25,7 @@ _ITERATIONS = 4
 _Result = tuple[Numbers, Bool[Numbers, "*B"]]
 
 
-def _exact(function: Callable[[Any], _Result], given: Array, what: str, right: str) -> Array:
+def _exact(function: Callable[[Any], _Result], given: Numbers, what: str, right: str) -> Numbers:
     """Return the first result; concrete arguments are computed on the host and stay concrete while a program is traced.
 
     Raises:
@@ -98,7 +98,7 @@ def _product(a: Float[Numbers, "*B 3 3"], b: Float[Numbers, "*B 3 3"]) -> Float[
     return np.matmul(a, b) if module_of(a) is np else jnp.matmul(a, b, precision="highest")
 
 
-def _refuse(valid: Any, given: Array, what: str, right: str) -> None:
+def _refuse(valid: Any, given: Numbers, what: str, right: str) -> None:
     """Raise ValueError with the first invalid value and the indices of up to ten of them."""
     seen, values = np.asarray(valid), np.asarray(given)
     if seen.all():

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
+from ..numerics._host import Numbers, on_host
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
@@ -107,9 +108,9 @@ class AxisAlignTask(PointingTask):
 
 def _pointed(
     robot: Robot, kinematics: Kinematics, frame: str, target_frame: str | None, axis: ArrayLike | Array
-) -> Float[Array, "3"]:
+) -> Float[Numbers, "3"]:
     """Return the direction of the axis, in the world or in the target frame."""
     names = (frame,) if target_frame is None else (frame, target_frame)
     _, rotations = kinematics.frame_poses(robot, names)
-    direction = dot(rotations[0], unit(as_direction(axis, "axis", rotations.dtype)))
+    direction = dot(rotations[0], unit(on_host(as_direction(axis, "axis", rotations.dtype))))
     return direction if target_frame is None else dot(rotations[1].T, direction)

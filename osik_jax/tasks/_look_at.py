@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
+from ..numerics._host import Numbers, on_host
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
@@ -65,14 +66,14 @@ class LookAtTask(PointingTask):
         hard: bool = False,
     ):
         check_frames(robot, frame, target_frame)
-        if target is None:
-            target = 0.0 if target_frame is not None else _ahead(robot, home_kinematics(robot), frame, axis)
+        if target is None and target_frame is None:
+            target = _ahead(robot, home_kinematics(robot), frame, axis)
         super().__init__(
             robot,
             frame,
             target_frame,
             axis=axis,
-            target=target,
+            target=0.0 if target is None else target,
             target_velocity=0.0 if target_velocity is None else target_velocity,
             half_angle=half_angle,
             weight=weight,
@@ -117,7 +118,7 @@ class LookAtTask(PointingTask):
         return dict(target=point)
 
 
-def _ahead(robot: Robot, kinematics: Kinematics, frame: str, axis: ArrayLike | Array) -> Float[Array, "3"]:
+def _ahead(robot: Robot, kinematics: Kinematics, frame: str, axis: ArrayLike | Array) -> Float[Numbers, "3"]:
     """Return the point 1 m along the axis [m]."""
     position, rotation = kinematics.frame_pose(robot, frame)
-    return position + dot(rotation, unit(as_direction(axis, "axis", position.dtype)))
+    return position + dot(rotation, unit(on_host(as_direction(axis, "axis", position.dtype))))

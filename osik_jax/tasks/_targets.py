@@ -16,7 +16,7 @@ from ..numerics._host import Numbers, is_traced, to_host, to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
-Pose = tuple[Float[Array, "3"], Float[Array, "3 3"]]
+Pose = tuple[Float[Numbers, "3"], Float[Numbers, "3 3"]]
 """Position [m] and rotation matrix (frame axes to world axes)."""
 PoseLike = tuple[ArrayLike | Array, ArrayLike | Array] | ArrayLike | Array | jaxlie.SE3 | Any
 """Accepted forms of a pose: ``(p (3,), R (3, 3))``, ``(p (3,), quaternion w x y z (4,))``, a (4, 4) matrix, a
@@ -73,7 +73,7 @@ def _made(numbers: Any, position: Any, rotation: Any) -> Pose:
     return (position, rotation) if numbers is np else (to_jax(position), to_jax(rotation))
 
 
-def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Array, Array] | None:
+def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Numbers, Numbers] | None:
     """Return position and rotation of a pair or of an SE3, None of anything else.
 
     Raises:

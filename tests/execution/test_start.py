@@ -27,6 +27,7 @@ for name in ("nao", "arm7", "ur5", "panda", "g1"):
     pose = np.array([0.2, 0.1, 0.3]), np.array([0.0, 0.71, 0.71, 0.0])
     osik.FrameTask(robot, frame, target=pose)
     osik.ComTask(robot, target=[0.0, 0.0, 0.3])
+    osik.LookAtTask(robot, frame), osik.AxisAlignTask(robot, frame)
     osik.PostureTask(robot, target=np.asarray(robot.q0)).replace(weight=2.0, gain=3)
     osik.FrameTask(robot, frame, rows="position").replace(target=[0.3, 0.1, 0.2])
     count(name)
