@@ -25,15 +25,13 @@ from ..robot._made_for import check_made_for, check_robot
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
 from ..schemes._default import priorities
-from ..tasks import DampingTask, LowAccelerationTask, Task, TaskRows
+from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 
 _DIVERGES = 2.0
 """An error e becomes (1 - gain dt) e in a step."""
 _SPAN = 1e-3
 """Singular value of rows of length 1 below which they leave a direction free, and what then counts as 0."""
-CALMING = (LowAccelerationTask, DampingTask)
-"""Tasks that are asked to calm a motion, which they cannot beneath tasks that leave no freedom."""
 _DEGREES = 6.5
 """Configurations without larger numbers are not looked at for degrees: those would be less than a turn in radians."""
 
@@ -202,7 +200,7 @@ def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme
 
     The rank of the tasks above decides, not the number of their rows.
     """
-    calming = [name for name, task in tasks.items() if type(task) in CALMING and not task.hard]
+    calming = [name for name, task in tasks.items() if task.calms and not task.hard]
     if not calming:
         return
     strict = not isinstance(scheme, WeightedQP)

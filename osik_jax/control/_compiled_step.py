@@ -31,17 +31,16 @@ from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, Vel
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
-from ..robot._joint_selection import dofs_of, is_scalar, scalar_layout
+from ..robot._joint_selection import scalar_layout
 from ..schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ..solvers.hqp import Tolerances
-from ..tasks import AdaptiveGain, ComTask, FrameTask, PostureTask, RelativeFrameTask, Task, TaskRows
-from ..tasks._com import axis_numbers
+from ..tasks import AdaptiveGain, PostureTask, Task, TaskRows
 from ..tasks._rows import rows_of
+from ..tasks._task import GIVEN, POSTURE, CoreCard
 from ._solution import Solution
 
 _SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
 _LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
-_POSE, _CENTER, _POSTURE, _GIVEN = range(4)
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
 
@@ -107,15 +106,19 @@ def _kind(scheme: Scheme) -> int | None:
 
 
 def _unknown(robot: Robot, task: Task) -> str | None:
-    if type(task) not in (FrameTask, RelativeFrameTask, ComTask, PostureTask):
-        return f"is of the class {type(task).__name__}"
+    """Return why JAX computes the rows of a task, in words; None if the core does."""
     if task.hard:
         return "is hard"
-    if isinstance(task.gain, AdaptiveGain):
+    card = task.core(robot)
+    if not isinstance(card, str) and isinstance(task.gain, AdaptiveGain):
         return "has an AdaptiveGain"
-    if isinstance(task, PostureTask):
-        return None if all(is_scalar(robot, joint) for joint in task.joints) else "has joints that turn as a ball"
-    return "has error='se3'" if isinstance(task, FrameTask | RelativeFrameTask) and task.coupled else None
+    return card if isinstance(card, str) else None
+
+
+def _card(robot: Robot, task: Task) -> CoreCard:
+    card = task.core(robot)
+    assert not isinstance(card, str), card
+    return card
 
 
 def given_rows(
@@ -207,20 +210,20 @@ class Layout:
         self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, given: Mapping[str, TaskRows] | None = None
     ) -> None:
         self.robot, self.tasks, self.kind, self.given = robot, tasks, _kind(scheme), given or {}
+        own = self.given
         nv, by_weight = robot.nv, self.kind == _WEIGHTED
         self.parts = {
-            name: (_GIVEN, self.given[name].error.shape[-1], []) if name in self.given else _rows_of(robot, task)
+            name: CoreCard(GIVEN, own[name].error.shape[-1], []) if name in own else _card(robot, task)
             for name, task in tasks.items()
         }
         self.count = count = {name: rows for name, (_, rows, _) in self.parts.items()}
         self.rows = sum(count.values())
-        own = self.given
         self.bounded = bounded = {
-            name: not own[name].is_equality if name in own else task.lower is not None or _polygon(task)  # pyright: ignore[reportAttributeAccessIssue]
+            name: not own[name].is_equality if name in own else task.core_leaves()[4] is not None
             for name, task in tasks.items()
         }
         of_dofs = {
-            name: own[name].dofs is not None if name in own else kind == _POSTURE
+            name: own[name].dofs is not None if name in own else kind == POSTURE
             for name, (kind, _, _) in self.parts.items()
         }
         self.single = single = {name: by_weight and of_dofs[name] and not bounded[name] for name in tasks}
@@ -282,8 +285,10 @@ class Layout:
         out = _offsets(self.count, sorted(tasks))
         for name, (kind, rows, options) in self.parts.items():
             numbers += [kind, rows, first[name], out[name], self.level[name], self.bounded[name], self.single[name]]
-            leaves = _leaves_of_task(tasks[name]) if kind != _GIVEN else (given or {})[name]
-            options = options if kind != _GIVEN else self._options_of_given(name, tasks[name])
+            if kind == GIVEN:
+                leaves, options = (given or {})[name], self._options_of_given(name, tasks[name])
+            else:
+                leaves = [-1 if leaf is None else leaf for leaf in tasks[name].core_leaves()]
             numbers += [len(options), *leaves, *options]
         return np.array(numbers, np.int32)
 
@@ -313,17 +318,6 @@ def _leaves_of_limit(limit: Any) -> list[Any]:
     return [0, *[limit.velocity] * 4]
 
 
-def _leaves_of_task(task: Any) -> list[Any]:
-    """Return the leaves of a task in the order of ``StepRows::add_task``, -1 for none."""
-    lower, upper, own = task.lower, task.upper, task.target
-    if _polygon(task):
-        upper, own = task.polygon.offsets, (task.polygon.normals, task.polygon.vertices)
-    own = own if isinstance(own, tuple) else (own, None)
-    weights = [task.position_weight, task.orientation_weight] if isinstance(task, FrameTask | RelativeFrameTask) else []
-    leaves = [task.gain, task.weight, task.target_velocity, lower, upper, *own, *weights, None, None]
-    return [-1 if leaf is None else leaf for leaf in leaves[:9]]
-
-
 def _placed(
     rows: Mapping[str, TaskRows], places: dict[int, tuple[int, int, int]], array: int
 ) -> tuple[dict[str, list[int]], list[Array]]:
@@ -350,29 +344,6 @@ def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:
     """Return where the rows of each task begin, if the tasks stand in this order."""
     ends = np.cumsum([0, *(count[name] for name in order)])
     return dict(zip(order, ends.tolist(), strict=False))
-
-
-def _polygon(task: Task) -> bool:
-    return isinstance(task, ComTask) and task.polygon is not None
-
-
-def _rows_of(robot: Robot, task: Any) -> tuple[int, int, list[int]]:
-    """Return the kind of a task, its number of rows, and its indices and flags."""
-    tree = robot.tree
-    if isinstance(task, PostureTask):
-        places, dofs = [tree.qpos_address[joint] for joint in task.joints], dofs_of(robot, task.joints)
-        return _POSTURE, len(dofs), [*places, *dofs]
-    if isinstance(task, ComTask):
-        rows = task.polygon.offsets.shape[-1] if task.polygon is not None else len(task.axes)
-        axes = [0] * rows if _polygon(task) else axis_numbers(task.axes).tolist()
-        below = tree.is_own if task.subtree is None else tree.descendants[tree.frame_bodies[tree.frame(task.subtree)]]
-        counts = np.asarray(below) | (task.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
-        return _CENTER, rows, [int(number) for number in (_polygon(task), *axes, *counts)]
-    options = [task.axes == "frame", task.orientation_jacobian == "geometric", *task.kept, len(task.frames)]
-    for frame in map(tree.frame, task.frames):
-        carrier = tree.frame_bodies[frame]
-        options += [frame, carrier, *tree.moves[carrier]]
-    return _POSE, sum(task.kept), [int(number) for number in options]
 
 
 def compiled(plain: Step) -> Step:
