@@ -26,15 +26,13 @@ from ..robot._made_for import check_made_for, check_robot
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
 from ..schemes._default import priorities
-from ..tasks import DampingTask, LowAccelerationTask, Task, TaskRows
+from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 
 LARGEST_GAIN = 2.0
 """Largest gain times dt that nothing is said of: an error e becomes (1 - gain dt) e in a step."""
 _SPAN = 1e-3
 """Singular value of rows of length 1 below which they leave a direction free, and what then counts as 0."""
-CALMING = (LowAccelerationTask, DampingTask)
-"""Tasks that are asked to calm a motion, which they cannot beneath tasks that leave no freedom."""
 _SHORT = 1e-8
 """Squared length of a quaternion below which it is looked at again."""
 _DEGREES = 6.5
@@ -228,7 +226,7 @@ def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme
 
     The rank of the tasks above decides, not the number of their rows.
     """
-    calming = [name for name, task in tasks.items() if type(task) in CALMING and not task.hard]
+    calming = [name for name, task in tasks.items() if task.calms and not task.hard]
     if not calming:
         return
     strict = not isinstance(scheme, WeightedQP)

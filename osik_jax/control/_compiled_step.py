@@ -1,13 +1,17 @@
-"""A control step in one call of the compiled core (``core/step.hpp``), for the tasks and limits that it knows.
+"""A control step in one call of the compiled core (``core/step.hpp``).
 
-``_step.py`` is the definition, the derivative, and what runs for all other tasks, limits, schemes and platforms. No
-search of plain JAX stands beside the call: XLA makes place for all of its numbers in every step, searched or not, which
-costs more than the call.
+The core computes the rows of the tasks that it knows. JAX computes those of all other tasks and hands them over as
+arrays: they are GIVEN.
+
+``_step.py`` is the definition, the derivative, and what runs for hard tasks, limits with rows, other schemes and other
+platforms. No search of plain JAX stands beside the call: XLA makes place for all of its numbers in every step, searched
+or not, which costs more than the call.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,21 +25,22 @@ from ..execution._backends import cuda_is_default, on_platforms, takes
 from ..execution._computed import in_shared_lanes, over_lanes, side_by_side
 from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
+from ..kinematics._forward import kinematics_by
 from ..kinematics._kernels import dof_columns, tree_integers
 from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
+from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
-from ..robot._balls import independent_balls
-from ..robot._joint_selection import dofs_of, is_scalar, scalar_layout
+from ..robot._joint_selection import scalar_layout
 from ..schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ..solvers.hqp import Tolerances
-from ..tasks import AdaptiveGain, ComTask, FrameTask, PostureTask, RelativeFrameTask, Task
-from ..tasks._com import axis_numbers
+from ..tasks import AdaptiveGain, PostureTask, Task, TaskRows
+from ..tasks._rows import rows_of
+from ..tasks._task import GIVEN, POSTURE, CoreCard
 from ._solution import Solution
 
 SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
 _LIMITS = (*SIMPLE_LIMITS, AccelerationLimit)
-_POSE, _CENTER, _POSTURE = range(3)
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
 
@@ -49,27 +54,45 @@ def is_compiled(
     dt: Any,
     warm_start: Any,
 ) -> bool:
-    """Return whether the core knows steps of this kind and is there."""
-    if cuda_is_default() or unknown_part(robot, tasks, scheme, limits) is not None:
+    """Return whether the core takes steps of this kind and is there.
+
+    It takes none on a GPU, where XLA runs each part of a step by a kernel of its own.
+    """
+    apart = any(task.hard for task in tasks.values()) or any(limit.has_rows(robot) for limit in limits)
+    if cuda_is_default() or apart or unknown_scheme(scheme) is not None:
         return False
     kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
     one_precision = {kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)} == {jnp.result_type(float)}
-    labels = Layout(robot, tasks, scheme).labels
-    same = warm_start is None or [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == labels
-    return one_precision and same and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
+    return (
+        one_precision
+        and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
+        and (warm_start is None or _fits(warm_start, robot, q, tasks, scheme, dt))
+    )
 
 
-def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
-    """Return the first part of a step that the core does not know, in words; None if it knows all."""
+def _fits(warm_start: Any, robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, dt: Any) -> bool:
+    rows = jax.eval_shape(given_rows, robot, q, tasks, scheme, dt)
+    return [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == Layout(robot, tasks, scheme, rows).labels
+
+
+def unknown_scheme(scheme: Scheme) -> str | None:
+    """Return a scheme that the core does not know in words; None if it knows it."""
     if _kind(scheme) is None:
         method = f" with method={scheme.method!r}" if type(scheme) is NullSpace else ""
         return f"the scheme {type(scheme).__name__}{method}"
     if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
         return f"a {type(scheme).__name__} with max_iterations"
+    return None
+
+
+def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
+    """Return the first part of a step that the core cannot compute alone, in words; None if there is none."""
+    if unknown_scheme(scheme) is not None:
+        return unknown_scheme(scheme)
     for limit in limits:
         if type(limit) not in _LIMITS:
             return f"the limit {type(limit).__name__}"
-        if type(limit) is ConfigurationLimit and independent_balls(robot.tree):
+        if limit.has_rows(robot):
             return "the limit ConfigurationLimit of a robot with ball joints"
     reasons = ((name, _unknown(robot, task)) for name, task in tasks.items())
     return next((f"the task {name!r}, which {reason}" for name, reason in reasons if reason), None)
@@ -83,15 +106,38 @@ def _kind(scheme: Scheme) -> int | None:
 
 
 def _unknown(robot: Robot, task: Task) -> str | None:
-    if type(task) not in (FrameTask, RelativeFrameTask, ComTask, PostureTask):
-        return f"is of the class {type(task).__name__}"
+    """Return why JAX computes the rows of a task, in words; None if the core does."""
     if task.hard:
         return "is hard"
-    if isinstance(task.gain, AdaptiveGain):
+    card = task.core(robot)
+    if not isinstance(card, str) and isinstance(task.gain, AdaptiveGain):
         return "has an AdaptiveGain"
-    if isinstance(task, PostureTask):
-        return None if all(is_scalar(robot, joint) for joint in task.joints) else "has joints that turn as a ball"
-    return "has error='se3'" if isinstance(task, FrameTask | RelativeFrameTask) and task.coupled else None
+    return card if isinstance(card, str) else None
+
+
+def _card(robot: Robot, task: Task) -> CoreCard:
+    card = task.core(robot)
+    assert not isinstance(card, str), card
+    return card
+
+
+def given_rows(
+    robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, dt: Array | float
+) -> dict[str, TaskRows]:
+    """Return the rows of the tasks that JAX computes, from placeholders for numbers that are not valid."""
+    given = {name: task for name, task in tasks.items() if _unknown(robot, task)}
+    if not given:
+        return {}
+    (robot, q, dt, given), _ = with_placeholder((robot, q, positive(dt), given))
+    kinematics = kinematics_by(getattr(scheme, "backend", "jax"), robot, q)
+    rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in given.items()})
+    return {name: _of_full_shape(own) for name, own in rows.items()}
+
+
+def _of_full_shape(rows: TaskRows) -> TaskRows:
+    """Return the rows with a number for each row and dof where a task of one's own may give one for all."""
+    pull = jnp.broadcast_to(rows.pull, rows.error.shape)
+    return replace(rows, pull=pull, levers=jnp.broadcast_to(rows.levers, rows.jacobian.shape[-1:]))
 
 
 class _Arrays:
@@ -114,8 +160,9 @@ class _Arrays:
         for i, (path, leaf) in enumerate(paths):
             alone = _is_moving(given, path) or not jnp.issubdtype(leaf.dtype, jnp.floating)
             groups.setdefault(i + 2 if alone else len(leaf) > 1, []).append(i)
-        # integers come last: the core counts the arrays of numbers alone
-        members = sorted(filter(None, groups.values()), key=lambda of: jnp.issubdtype(leaves[of[0]].dtype, jnp.integer))
+        # integers and flags come last: the core counts the arrays of numbers alone
+        is_number = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
+        members = sorted(filter(None, groups.values()), key=lambda of: not is_number[of[0]])
         self.places, self.arrays, self.shapes = {}, [], [leaf.shape[1:] for leaf in leaves]
         for own in members:
             sizes = [leaves[i][0].size for i in own]
@@ -148,22 +195,38 @@ def _is_moving(given: tuple[Any, ...], path: tuple[Any, ...]) -> bool:
 class Layout:
     """Sizes and indices of a step's rows, in the order of the core's ``StepSizes``.
 
+    Args:
+        robot: the robot.
+        tasks: by name.
+        scheme: the scheme.
+        given: rows that JAX computes, of which the structure and shapes count.
+
     Attributes:
         labels: shapes of the warm start's arrays.
         rows: of all tasks.
     """
 
-    def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme) -> None:
-        self.robot, self.tasks, self.kind = robot, tasks, _kind(scheme)
+    def __init__(
+        self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, given: Mapping[str, TaskRows] | None = None
+    ) -> None:
+        self.robot, self.tasks, self.kind, self.given = robot, tasks, _kind(scheme), given or {}
+        own = self.given
         nv, by_weight = robot.nv, self.kind == _WEIGHTED
-        self.parts = {name: _rows_of(robot, task) for name, task in tasks.items()}
+        self.parts = {
+            name: CoreCard(GIVEN, own[name].error.shape[-1], []) if name in own else _card(robot, task)
+            for name, task in tasks.items()
+        }
         self.count = count = {name: rows for name, (_, rows, _) in self.parts.items()}
         self.rows = sum(count.values())
-        bounds = {name: getattr(task, "lower", None) for name, task in tasks.items()}
-        self.bounded = bounded = {name: bounds[name] is not None or _polygon(task) for name, task in tasks.items()}
-        self.single = single = {
-            name: by_weight and isinstance(task, PostureTask) and not bounded[name] for name, task in tasks.items()
+        self.bounded = bounded = {
+            name: not own[name].is_equality if name in own else task.core_leaves()[4] is not None
+            for name, task in tasks.items()
         }
+        of_dofs = {
+            name: own[name].dofs is not None if name in own else kind == POSTURE
+            for name, (kind, _, _) in self.parts.items()
+        }
+        self.single = single = {name: by_weight and of_dofs[name] and not bounded[name] for name in tasks}
         ranks = sorted({task.priority for task in tasks.values()})
         self.level = level = {name: ranks.index(task.priority) for name, task in tasks.items()}
         self.of_level = [sum(count[name] for name in tasks if level[name] == k) for k in range(len(ranks))] + [0]
@@ -180,17 +243,26 @@ class Layout:
             self.labels = [] if projects else [(levels, h), (levels, longest)]
             self.sizes = longest, 0, levels, h, 10 * (nv + (2 if projects else longest))
 
-    def integers(self, places: Mapping[int, tuple[int, int, int]], given: tuple[Any, ...], box: int) -> np.ndarray:
+    def integers(
+        self,
+        places: Mapping[int, tuple[int, int, int]],
+        numbered: tuple[Any, ...],
+        box: int,
+        given: Mapping[str, list[int]] | None = None,
+    ) -> np.ndarray:
         """Return what ``Step`` in ``core/step.hpp`` reads.
 
         Args:
             places: of the leaves: array, offset and size.
-            given: the arguments of the step with the numbers of leaves in their place.
+            numbered: the arguments of the step with the numbers of leaves in their place.
             box: number of the leaf with the lower bounds of the box, before that of the upper ones; -1: by the limits.
+            given: numbers of the leaves with the rows that JAX computes, by task (``_placed``).
         """
-        robot, q, tasks, scheme, limits, dt, _ = given
+        robot, q, tasks, scheme, limits, dt, _ = numbered
         tree, nv, by_weight = self.robot.tree, self.robot.nv, self.kind == _WEIGHTED
-        of_limits = [_leaves_of_limit(limit) for limit in limits if type(limit) in (ConfigurationLimit, VelocityLimit)]
+        of_limits = [
+            _leaves_of_limit(limit) for limit in limits if isinstance(limit, ConfigurationLimit | VelocityLimit)
+        ]
         bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
         nq, *of_tree = tree_integers(tree)
         scalar, place = scalar_layout(self.robot)
@@ -213,8 +285,20 @@ class Layout:
         out = _offsets(self.count, sorted(tasks))
         for name, (kind, rows, options) in self.parts.items():
             numbers += [kind, rows, first[name], out[name], self.level[name], self.bounded[name], self.single[name]]
-            numbers += [len(options), *_leaves_of_task(tasks[name]), *options]
+            if kind == GIVEN:
+                leaves, options = (given or {})[name], self._options_of_given(name, tasks[name])
+            else:
+                leaves = [-1 if leaf is None else leaf for leaf in tasks[name].core_leaves()]
+            numbers += [len(options), *leaves, *options]
         return np.array(numbers, np.int32)
+
+    def _options_of_given(self, name: str, numbered: Any) -> list[int]:
+        """Return whether the rows close a loop, the task's leaves (first, end, those never infinite), and dofs."""
+        rows, leaves = self.given[name], jax.tree_util.tree_leaves_with_path(numbered)
+        kinds = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(self.tasks[name])]
+        finite = [leaf for (path, leaf), kind in zip(leaves, kinds, strict=True) if kind and never_infinite(path)]
+        first, end = leaves[0][1], leaves[-1][1] + 1
+        return [rows.closes_loop, first, end, len(finite), *finite, *(rows.dofs or ())]
 
     def constants(self, dtype: Any) -> np.ndarray:
         """Return what ``StepData`` has under this name."""
@@ -234,44 +318,32 @@ def _leaves_of_limit(limit: Any) -> list[Any]:
     return [0, *[limit.velocity] * 4]
 
 
-def _leaves_of_task(task: Any) -> list[Any]:
-    """Return the leaves of a task in the order of ``StepRows::add_task``, -1 for none."""
-    lower, upper, own = task.lower, task.upper, task.target
-    if _polygon(task):
-        upper, own = task.polygon.offsets, (task.polygon.normals, task.polygon.vertices)
-    own = own if isinstance(own, tuple) else (own, None)
-    weights = [task.position_weight, task.orientation_weight] if isinstance(task, FrameTask | RelativeFrameTask) else []
-    leaves = [task.gain, task.weight, task.target_velocity, lower, upper, *own, *weights, None, None]
-    return [-1 if leaf is None else leaf for leaf in leaves[:9]]
+def _placed(
+    rows: Mapping[str, TaskRows], places: dict[int, tuple[int, int, int]], array: int
+) -> tuple[dict[str, list[int]], list[Array]]:
+    """Return numbers of new leaves with the rows of lanes that JAX computes, by task, and the leaves.
+
+    The leaves stand side by side in one array; ``places`` gets theirs. Numbers are in the order of
+    ``StepRows::add_given``, -1 for what it does not need.
+    """
+    found: dict[str, list[int]] = {name: [] for name in rows}
+    parts: list[Array] = []
+    end = 0
+    for name, own in rows.items():
+        upper, jacobian = (None if own.is_equality else own.upper), (None if own.dofs is not None else own.jacobian)
+        for part in (own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None):
+            found[name].append(-1 if part is None else len(places))
+            if part is not None:
+                places[len(places)] = array, end, part[0].size
+                end += part[0].size
+                parts.append(part)
+    return found, parts
 
 
 def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:
     """Return where the rows of each task begin, if the tasks stand in this order."""
     ends = np.cumsum([0, *(count[name] for name in order)])
     return dict(zip(order, ends.tolist(), strict=False))
-
-
-def _polygon(task: Task) -> bool:
-    return isinstance(task, ComTask) and task.polygon is not None
-
-
-def _rows_of(robot: Robot, task: Any) -> tuple[int, int, list[int]]:
-    """Return the kind of a task, its number of rows, and its indices and flags."""
-    tree = robot.tree
-    if isinstance(task, PostureTask):
-        places, dofs = [tree.qpos_address[joint] for joint in task.joints], dofs_of(robot, task.joints)
-        return _POSTURE, len(dofs), [*places, *dofs]
-    if isinstance(task, ComTask):
-        rows = task.polygon.offsets.shape[-1] if task.polygon is not None else len(task.axes)
-        axes = [0] * rows if _polygon(task) else axis_numbers(task.axes).tolist()
-        below = tree.is_own if task.subtree is None else tree.descendants[tree.frame_bodies[tree.frame(task.subtree)]]
-        counts = np.asarray(below) | (task.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
-        return _CENTER, rows, [int(number) for number in (_polygon(task), *axes, *counts)]
-    options = [task.axes == "frame", task.orientation_jacobian == "geometric", *task.kept, len(task.frames)]
-    for frame in map(tree.frame, task.frames):
-        carrier = tree.frame_bodies[frame]
-        options += [frame, carrier, *tree.moves[carrier]]
-    return _POSE, sum(task.kept), [int(number) for number in options]
 
 
 def compiled(plain: Step) -> Step:
@@ -310,16 +382,21 @@ def _steps(plain: Step, *given: Any) -> Solution:
 def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     """Return all numbers and all integers of the solutions, those of a lane one after another."""
     robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
-    layout, numbered, places = Layout(robot, tasks, scheme), packed.numbered(), dict(packed.places)
+    rows = over_lanes(given_rows)(robot, q, tasks, scheme, dt)
+    layout, numbered = Layout(robot, tasks, scheme, rows), packed.numbered()
     guesses, box = jax.tree.leaves(warm_start), -1
     given = [a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
+    nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
+    places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
     if not (q.dtype == jnp.float64 and all(type(limit) in SIMPLE_LIMITS for limit in limits)):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv
             given.append(bound)
-    integers = layout.integers(places, numbered, box)
+    rows_at, parts = _placed(rows, places, len(given))
+    given += [side_by_side(*parts)] if parts else []
+    integers = layout.integers(places, numbered, box, rows_at)
     labels = sum(int(np.prod(shape)) for shape in layout.labels)
     shapes = ((packed.lanes, robot.tree.nv + 2 + 2 * layout.rows), float), ((packed.lanes, 3 + labels), int)
     numbers, integers = _library.call("step", shapes, integers, *guesses, *given, layout.constants(q.dtype))

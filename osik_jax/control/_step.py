@@ -197,7 +197,7 @@ def _plain_step(
     )
     kinematics = kinematics_by(getattr(chosen, "backend", "jax"), robot, q)
     problem = velocity_problem(robot, kinematics, q, tasks, bounds, dt)
-    given = _with_nan(problem, raw_box, jnp.stack([set_up, *is_valid.values()]).all())
+    given = _with_nan(problem, raw_box, jnp.stack([set_up, *is_valid.values(), _damping_is_finite(problem)]).all())
     answer = solved_with(chosen, given, warm_start)
     v = answer.velocity
     failed = answer.status == Status.NUMERICAL_ERROR
@@ -215,6 +215,13 @@ def _plain_step(
 
 
 _compiled_step = compiled(_plain_step)
+
+
+def _damping_is_finite(problem: VelocityProblem) -> Array:
+    """Return whether the numbers by which schemes choose the damping are finite; solvers check all other numbers."""
+    fields = ("error", "weight", "pull", "levers", "curvature")
+    numbers = [jnp.ravel(getattr(rows, field)) for rows in problem.rows.values() for field in fields]
+    return jnp.isfinite(jax.lax.stop_gradient(jnp.concatenate(numbers))).all()
 
 
 def _with_nan(problem: VelocityProblem, raw_box: tuple[Array, Array], is_valid: Array) -> VelocityProblem:

@@ -6,9 +6,7 @@ from collections.abc import Mapping
 
 from ..robot import Robot
 from ..robot._tree import BALL, FREE, HINGE, SLIDE
-from ..tasks import AngularMomentumTask, AxisAlignTask, ComTask, LookAtTask, PostureTask, Task
-from ..tasks._joint_velocity import VelocityTask
-from ..tasks._pose import PoseTask
+from ..tasks import Task
 
 _QUATERNION = ("qw", "qx", "qy", "qz")
 _IN_Q = {
@@ -23,14 +21,6 @@ _IN_V = {
     SLIDE: ([""], ["m/s"]),
     HINGE: ([""], ["rad/s"]),
 }
-_TARGETS: tuple[tuple[type[Task], str], ...] = (
-    (ComTask, "m"),
-    (PostureTask, "rad or m; quaternion w x y z"),
-    (LookAtTask, "m"),
-    (AxisAlignTask, "1 (direction)"),
-    (AngularMomentumTask, "kg m^2/s"),
-    (VelocityTask, "rad/s or m/s"),
-)
 
 
 def configuration_units(robot: Robot) -> tuple[list[str], list[str]]:
@@ -56,13 +46,4 @@ def _entries(robot: Robot, parts: Mapping[int, tuple[list[str], list[str]]]) -> 
 def unit_of(tasks: Mapping[str, Task], name: str) -> str:
     """Return the unit of a number of a task, by its name in ``leaf_names(tasks)``."""
     owner = max((own for own in tasks if name.startswith(f"{own}.")), key=len)
-    task, field = tasks[owner], name.removeprefix(f"{owner}.")
-    if field.startswith("gain"):
-        return {"gain.decay": "1 / unit of the error"}.get(field, "1/s")
-    if "weight" in field:
-        return "1"
-    if isinstance(task, PoseTask):
-        units = {"target[0]": "m", "target[1]": "1 (rotation matrix)", "target_velocity": "m/s, rad/s"}
-        return units.get(field, "m or rad")
-    unit = next((unit for kind, unit in _TARGETS if isinstance(task, kind)), "the task's own")
-    return f"({unit})/s" if field == "target_velocity" else unit
+    return tasks[owner].unit_of(name.removeprefix(f"{owner}."))

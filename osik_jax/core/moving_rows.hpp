@@ -12,7 +12,7 @@
 namespace osik {
 
 enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1, CLASSICAL = 2, SATURATED = 3 };  // the last two: NullSpace
-enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2 };
+enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2, GIVEN = 3 };  // the last one: rows that JAX has computed
 enum StepLimit { SPEED = 0, RANGE = 1 };  // in the order in which they narrow the box
 
 // Sizes of a step; m, p, L and h are those of QPSizes and Sizes.

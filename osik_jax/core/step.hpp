@@ -47,7 +47,7 @@ class Step : StepRows {
     int count = 0;
     for (int k = 0; k < s.tasks; ++k) {
       const Task& task = tasks[k];
-      if (!chosen(task) || (task.kind == POSTURE && !task.bounded)) continue;
+      if (!chosen(task) || (task.dofs && !task.bounded)) continue;
       double distance = 0, held = 0, divisor = curvature[k] > 0 ? curvature[k] : 1;
       for (int i = 0; i < task.m && !task.bounded; ++i) {
         distance += task.rows.error[i] * (task.weight[i] * (task.rows.pull[i] / divisor));
@@ -84,19 +84,36 @@ class Step : StepRows {
     }
     return most;
   }
-  // VelocityProblem.curvature_above: what the postures of a level cannot meet, the rows above it balance
+  // VelocityProblem.curvature_above: what the postures of a level cannot meet, the rows above it balance; what other tasks
+  // cannot meet, closed loops above it
   double curvature_above(int level) {
-    double* force = parts.data();
+    double *force = parts.data(), curved = 0;
     int count = 0;
-    for (const Task& task : tasks)
-      for (int i = 0; i < task.m && task.kind == POSTURE && task.level == level; ++i)
-        force[count++] = task.weight[i] * task.rows.pull[i];
-    if (!level || !count) return 0;
+    bool loops = false;
+    for (const Task& task : tasks) {
+      for (int i = 0; i < task.m && task.dofs && task.level == level; ++i) force[count++] = task.weight[i] * task.rows.pull[i];
+      loops |= task.level < level && task.closes_loop();
+    }
+    if (!level || !(count || loops)) return 0;
+    const double linear = count ? safe_norm(force, count) * bending([&](const Task& task) { return task.level < level; }) : 0;
+    if (!loops) return linear;
+    for (const Task& task : tasks) {
+      if (task.dofs || task.level != level) continue;
+      std::fill_n(force, s.nv, 0.0);
+      for (int i = 0; i < task.m; ++i)
+        for (int j = 0; j < s.nv; ++j) force[j] += task.rows.jacobian[i * s.nv + j] * (task.weight[i] * task.rows.pull[i]);
+      const double both[] = {curved, safe_norm(force, s.nv)};
+      curved = safe_norm(both, 2);
+    }
+    const double both[] = {linear, curved * bending([&](const Task& task) { return task.level < level && task.closes_loop(); })};
+    return safe_norm(both, 2);
+  }
+  // VelocityProblem._bending: the curvature of tasks for a unit force in the joints
+  template <class Chosen> double bending(Chosen chosen) {
     double squares = 0;
     for (const Task& task : tasks)
-      for (int i = 0; i < task.m && task.level < level; ++i) squares += task.weight[i] * task.rows.squares[i];
-    const double most = find_bends([&](const Task& task) { return task.level < level; }, above.data());
-    return safe_norm(force, count) * (most / (squares > 0 ? sqrt(squares) : 1.0));
+      for (int i = 0; i < task.m && chosen(task); ++i) squares += task.weight[i] * task.rows.squares[i];
+    return find_bends(chosen, above.data()) / (squares > 0 ? sqrt(squares) : 1.0);
   }
 
   // ---- the weighted scheme (schemes/_weighted.py)
@@ -112,7 +129,7 @@ class Step : StepRows {
     std::copy_n(low_speed.data(), n, qp_bounds.data()), std::copy_n(high_speed.data(), n, &qp_bounds[N]);
     for (const Task& task : tasks)
       for (int i = 0; i < task.m && task.diagonal; ++i) {
-        const int dof = task.options[task.m + i];
+        const int dof = task.dofs[i];
         diagonal[dof] += task.weight[i], center[dof] += task.weight[i] * task.rows.lower[i];
       }
     each_entry(n, [&](auto e) {
@@ -366,8 +383,8 @@ class Step : StepRows {
         double off = 0;
         if (task.valid) {
           const double a = task.rows.lower[i], b = task.bounded ? task.rows.upper[i] : a;
-          off = task.kind == POSTURE ? v[task.options[task.m + i]] : Team::own_dot(task.rows.jacobian + i * n, v, 0, n);
-          off -= nearest(off, a, b);
+          off = task.dofs ? v[task.dofs[i]] : Team::own_dot(task.rows.jacobian + i * n, v, 0, n);
+          off = a == a && b == b ? off - nearest(off, a, b) : 0;
         }
         slack[task.out + i] = finite(off), errors[task.out + i] = task.valid ? finite(task.rows.error[i]) : 0.0;
       }

@@ -52,10 +52,20 @@ class StepRows {
   using Numbers = std::vector<double>;
   using Pack = Lanes<double>;
   struct Task : StepLayout::Task {
-    bool valid;
-    Rows<double*> rows;
-    double* weight;
+    const int* dofs;  // of rows that each ask for the velocity of one dof [m]; null for other rows
+    bool valid = true;
+    Rows<double*> rows = {};
+    double* weight = nullptr;
+
+    explicit Task(const StepLayout::Task& of) : StepLayout::Task(of) {
+      const int own = kind == POSTURE ? m : kind == GIVEN ? FIRST_FINITE + options[FINITE] : count;
+      dofs = own < count ? options + own : nullptr;
+    }
+    bool closes_loop() const { return kind == GIVEN && options[CLOSES_LOOP]; }
   };
+  // options of GIVEN: whether the rows close a loop, the task's own leaves (first, end), how many of them are never
+  // infinite, these, and dofs
+  enum { CLOSES_LOOP, LEAVES, LEAVES_END, FINITE, FIRST_FINITE };
   StepLayout layout;
   const StepSizes& s;
   const RowPlaces place;
@@ -77,7 +87,7 @@ class StepRows {
     center.resize(3 * s.nv + 8), zeros.resize(s.rows + s.nq + 1), no_labels.resize(s.labels()), bounds.resize(s.tasks);
     parts.resize(s.rows + s.nv + 3 * s.tasks + 8);
     for (Numbers* v : {&lower, &upper, &low_speed, &high_speed}) v->resize(s.nv);
-    for (const StepLayout::Task& task : layout.tasks) tasks.push_back({task, true, {}, nullptr});
+    for (const StepLayout::Task& task : layout.tasks) tasks.emplace_back(task);
   }
   bool has(const int* given, int count) const { return layout.has(given, count); }
 
@@ -85,7 +95,7 @@ class StepRows {
   void find_pack(const StepData& d) {
     packed.place(d.constants, d.arrays, d.apart, numbers.data());
     for (int k = 0; k < s.tasks; ++k)
-      if (tasks[k].kind != POSTURE) packed.add(k);
+      if (tasks[k].kind == POSE || tasks[k].kind == CENTER) packed.add(k);
   }
 
  protected:
@@ -120,7 +130,9 @@ class StepRows {
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];
       task.valid = is_placed;
-      for (int i = 0; i < 9 && !clean; ++i)
+      const int* spoils = task.options + LEAVES;
+      if (task.kind == GIVEN) task.valid = is_placed && (clean || !spoiled(spoils[0], spoils[1], d.count));
+      else for (int i = 0; i < 9 && !clean; ++i)
         task.valid = task.valid && !(task.leaves[i] >= 0 && spoiled(task.leaves[i], task.leaves[i] + 1, d.count));
       if (task.valid) valid = add_task(k, given, robot < 0) && valid;
       valid = valid && task.valid;
@@ -193,6 +205,7 @@ class StepRows {
   // (or none), then those of its kind.
   bool add_task(int k, const double* given, bool alone) {
     Task& task = tasks[k];
+    if (task.kind == GIVEN) return add_given(task);
     const int m = task.m, *options = task.options, *leaves = task.leaves;
     const double own_gain = *leaf(leaves[0]).at;
     const double* velocity = leaves[2] < 0 ? zeros.data() : leaf(leaves[2]).at;
@@ -211,15 +224,48 @@ class StepRows {
     } else task.valid &= (task.bounded || is_finite(5, s.given)) && all_finite(velocity, m);
     if (task.kind == POSTURE) add_posture(task, given, velocity, own_gain > 1 / dt ? 1 / dt : own_gain);
     else if (task.valid && alone) own.add(k);
-    for (int i = 0; i < m; ++i) {
+    for (int i = 0; i < m; ++i) task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
+    return takes && are_taken(task);
+  }
+  // Whether a solver takes the rows of a task.
+  bool are_taken(const Task& task) {
+    bool takes = task.bounded || all_finite(task.rows.lower, task.m);
+    for (int i = 0; i < task.m; ++i) {
       const bool counts = task.weight[i] > 0 || s.scheme != WEIGHTED;  // a row of weight 0 has no bounds
-      task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
       takes &= task.weight[i] >= 0 || counts || task.bounded || task.diagonal;
       if (task.bounded && counts && task.rows.lower[i] > task.rows.upper[i]) ordered = false;
     }
-    takes = takes && (task.bounded || all_finite(task.rows.lower, m));
     // squared lengths are finite only where all entries of the rows are
-    return takes && (task.kind == POSTURE || all_finite(task.rows.squares, m) || all_finite(task.rows.jacobian, m * s.nv));
+    return takes && (task.dofs || all_finite(task.rows.squares, task.m) || all_finite(task.rows.jacobian, task.m * s.nv));
+  }
+  // The rows that JAX has computed. Leaves: error, bounds (or none above), weight, pull, levers, curvature, Jacobian (none
+  // for rows of dofs).
+  bool add_given(Task& task) {
+    const int m = task.m, nv = s.nv, *options = task.options, *leaves = task.leaves;
+    for (int i = 0; i < options[FINITE]; ++i) {
+      const auto own = leaf(options[FIRST_FINITE + i]);
+      task.valid = task.valid && all_finite(own.at, own.size);
+    }
+    const Rows<double*>& to = task.rows;
+    double* const places[] = {to.error, to.lower, to.upper, task.weight, to.pull, to.levers, to.curvature, to.jacobian};
+    const int sizes[] = {m, m, m, m, m, nv, 1, m * nv};
+    for (int k = 0; k < 8; ++k)
+      if (leaves[k] >= 0) std::copy_n(leaf(leaves[k]).at, sizes[k], places[k]);
+    if (task.dofs) put_dofs(task);
+    bool takes = all_finite(task.weight, m) && all_finite(to.error, m) && all_finite(to.pull, m) && all_finite(to.levers, nv) &&
+                 all_finite(to.curvature, 1);
+    for (int i = 0; i < m; ++i) {
+      if (!task.dofs) to.squares[i] = Team::own_dot(&to.jacobian[i * nv], &to.jacobian[i * nv], 0, nv);
+      takes &= !task.bounded || (s.scheme == WEIGHTED && task.weight[i] == 0) || (to.lower[i] < INFINITE && to.upper[i] > -INFINITE);
+    }
+    return takes && are_taken(task);
+  }
+  // rows of the identity, and their squared lengths
+  void put_dofs(const Task& task) {
+    for (int i = 0; i < task.m; ++i) {
+      task.rows.squares[i] = 1;
+      for (int j = 0; j < s.nv && !task.diagonal; ++j) task.rows.jacobian[i * s.nv + j] = j == task.dofs[i];
+    }
   }
   // options: place in q and dof of each row
   void add_posture(const Task& task, const double* given, const double* velocity, double gain) {
@@ -232,10 +278,10 @@ class StepRows {
     std::fill_n(task.rows.levers, s.nv, 0.0);
     for (int i = 0; i < m; ++i) {
       const double value = given[options[i]] - (target ? target[options[i]] : 0.0);
-      task.weight[i] = weights[i], task.rows.squares[i] = 1;
+      task.weight[i] = weights[i];
       ask(task.rows, interval, i, value, velocity[i], gain);
-      for (int j = 0; j < s.nv && !task.diagonal; ++j) task.rows.jacobian[i * s.nv + j] = j == options[m + i];
     }
+    put_dofs(task);
   }
 };
 }  // namespace osik

@@ -101,12 +101,14 @@ def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:
     def wide(*args: Any) -> Any:
         leaves, tree = jax.tree.flatten(args)
         lanes = lanes_of(leaves)
-        own = [len(a) == lanes for a in leaves]
+        own = [len(a) == lanes > 1 for a in leaves]
         rest = [a if many else a[0] for a, many in zip(leaves, own, strict=True)]
 
         def one(*leaves: jax.Array) -> Any:
             return function(*jax.tree.unflatten(tree, leaves))
 
+        if lanes == 1:  # without an axis of length 1, XLA compiles fewer operations
+            return jax.tree.map(lambda a: a[None], one(*rest))
         return jax.vmap(one, in_axes=[0 if many else None for many in own])(*rest)
 
     return wide

@@ -18,15 +18,13 @@ from ..robot import Robot
 from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
 from ..schemes import Scheme, VelocityProblem, WeightedQP
-from ..tasks import AxisAlignTask, ContactTask, LookAtTask, Task, TaskRows
-from ..tasks._pose import PoseTask
+from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
 from ._pool import Errors
 from ._seeds import unit_points
 from ._turns import unwound
 
-_TURNS = (LookAtTask, AxisAlignTask)
 _LONGEST = 1.0
 """Longest step of a coordinate [rad or m]."""
 CURVATURE = 0.1
@@ -212,7 +210,7 @@ class TaskSearch(eqx.Module):
     def _equalities(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, "m nv"]:
         """Return the Jacobian of the goals that are equalities, a radian in units of ``_RADIAN``."""
         rows = {name: own for name, own in self.errors(q, goal)[0].items() if own.is_equality}
-        scales = [np.where(position_rows(self.tasks[name], len(own.error)), 1.0, _RADIAN) for name, own in rows.items()]
+        scales = [np.where(self.tasks[name].are_lengths(len(own.error)), 1.0, _RADIAN) for name, own in rows.items()]
         parts = [
             jnp.where(own.weight > 0.0, scale, 0.0).astype(q.dtype)[:, None] * own.jacobian
             for own, scale in zip(rows.values(), scales, strict=True)
@@ -294,21 +292,11 @@ def is_goal(task: Task) -> bool:
 
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
     """Return the error of a task in metres and in radians; other units count as metres."""
-    position = position_rows(task, len(rows.error))
+    position = task.are_lengths(len(rows.error))
     residual = jnp.where(rows.weight > 0.0, rows.pull, 0.0)
     parts = (jnp.sum(jnp.where(mask, residual, 0.0) ** 2) for mask in (position, ~position))
     first, second = (jnp.sqrt(jnp.where(part > 0.0, part, 1.0)) * (part > 0.0) for part in parts)
     return first, second
-
-
-def position_rows(task: Task, count: int) -> np.ndarray:
-    """Return the indices of the rows of a task that are in metres; the other rows are in radians."""
-    number = np.arange(count)
-    if isinstance(task, PoseTask):
-        return np.flatnonzero(task.kept) < 3
-    if isinstance(task, ContactTask):
-        return number < (1 if task.sliding else 3)
-    return np.full(count, not isinstance(task, _TURNS))
 
 
 def entry_limits(robot: Robot, lower: Array, upper: Array) -> tuple[Array, Array]:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..robot import Robot
 from ..robot._tree import BALL, FREE, KinematicTree
-from ._forward import Kinematics, independent_columns
+from ._forward import Kinematics
 from ._joints import dof_kinds
 from ._rigid import cross
 
@@ -22,18 +20,44 @@ def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
     It equals the derivative by autodiff, computed from the known motion axes. A body moves with every dof above it. An
     axis and its anchor move with every dof of the joints before them.
     """
-    tree = robot.tree
+    (own, _), *followers = robot.tree.dof_columns
+    rates = _rates_of(robot.tree, kinematics, own)
+    for dofs, coefficient in followers:
+        added = _rates_of(robot.tree, kinematics, dofs)
+        rates = jax.tree.map(lambda rate, more, factor=coefficient: rate + more * factor, rates, added)
+    return rates
+
+
+def _rates_of(tree: KinematicTree, kinematics: Kinematics, dofs: Int[np.ndarray, " n"]) -> Kinematics:
+    """Return the rates at unit speed of each of some dofs alone.
+
+    Their axes are chosen first, so that XLA computes the rates of the bodies that are used, and no others.
+    """
     kinds, number = dof_kinds(tree)
     in_world = (kinds == FREE) & (number < 3)  # a free joint's translations are along the world's axes
     axes, anchors = _movers(tree)
-    rates = Kinematics(
-        _velocity(kinematics, kinematics.body_position, tree.moves),
-        _turning(kinematics, kinematics.body_rotation, tree.moves),
-        _turning(kinematics, kinematics.dof_linear[..., None], axes & ~in_world[:, None])[:, :, 0],
-        _turning(kinematics, kinematics.dof_angular[..., None], axes)[:, :, 0],
-        _velocity(kinematics, kinematics.dof_anchor, anchors),
+    linear, angular, anchor = (
+        a if len(dofs) == len(a) else a[dofs]
+        for a in (kinematics.dof_linear, kinematics.dof_angular, kinematics.dof_anchor)
     )
-    return jax.tree.map(partial(independent_columns, tree), rates)
+
+    def velocity(points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k 3 n"]:
+        """Return the velocity of points at unit speed of each dof that moves them."""
+        found = linear.T + cross(angular.T, points[:, :, None] - anchor.T, along=-2)
+        return jnp.where(moved[:, None, dofs], found, 0.0)
+
+    def turning(vectors: Float[Array, "k 3 m"], turned: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k 3 m n"]:
+        """Return the rate of column vectors at unit speed of each dof that rotates them."""
+        found = cross(angular.T[None, :, None, :], vectors[..., None], along=1)
+        return jnp.where(turned[:, None, None, dofs], found, 0.0)
+
+    return Kinematics(
+        velocity(kinematics.body_position, tree.moves),
+        turning(kinematics.body_rotation, tree.moves),
+        turning(kinematics.dof_linear[..., None], axes & ~in_world[:, None])[:, :, 0],
+        turning(kinematics.dof_angular[..., None], axes)[:, :, 0],
+        velocity(kinematics.dof_anchor, anchors),
+    )
 
 
 def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:
@@ -48,20 +72,3 @@ def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Boo
     before = above & (joint[None, :] < joint[:, None])
     own = (joint[None, :] == joint[:, None]) & (kinds == FREE)[:, None]
     return np.where(np.isin(kinds, (BALL, FREE))[:, None], above, before), before | own
-
-
-def _velocity(
-    kinematics: Kinematics, points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]
-) -> Float[Array, "k 3 nvfull"]:
-    """Return the velocity of points at unit speed of each dof that moves them."""
-    axis = kinematics.dof_angular.T
-    velocity = kinematics.dof_linear.T + cross(axis, points[:, :, None] - kinematics.dof_anchor.T, along=-2)
-    return jnp.where(moved[:, None, :], velocity, 0.0)
-
-
-def _turning(
-    kinematics: Kinematics, vectors: Float[Array, "k 3 n"], turned: Bool[np.ndarray, "k nvfull"]
-) -> Float[Array, "k 3 n nvfull"]:
-    """Return the rate of column vectors at unit speed of each dof that rotates them."""
-    axis = kinematics.dof_angular.T[None, :, None, :]
-    return jnp.where(turned[:, None, None, :], cross(axis, vectors[..., None], along=1), 0.0)

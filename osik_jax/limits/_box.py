@@ -57,6 +57,11 @@ class Limit(MadeForRobot, Replaceable):
         del robot, kinematics, q, dt
         return None
 
+    def has_rows(self, robot: Robot) -> bool:
+        """Return whether the limit has rows beside its box, for this robot."""
+        del robot
+        return any(type(part).rows is not Limit.rows for part in self.parts())
+
     def sought(self, robot: Robot) -> Limit | None:
         """Return the limit as ``inverse_kinematics`` uses it, whose steps go as far as its bounds in 1 s.
 

@@ -114,6 +114,10 @@ class ConfigurationLimit(Limit):
         matrix = matrix.at[np.arange(count)[:, None], np.array(balls.dofs)].set(balls.axis)
         return LimitRows(matrix, jnp.full(count, -jnp.inf, matrix.dtype), balls.outward)
 
+    def has_rows(self, robot: Robot) -> bool:
+        """Return whether the robot has ball joints, or a class of one's own has rows."""
+        return type(self).rows is not ConfigurationLimit.rows or bool(independent_balls(robot.tree))
+
     def sought(self, robot: Robot) -> Limit:
         """Return the limit with a gain of 1 and return in one step."""
         del robot

@@ -72,6 +72,12 @@ class FloatingBaseVelocityLimit(Limit):
             return lower, upper
         return lower.at[start : start + 3].set(-speeds), upper.at[start : start + 3].set(speeds)
 
+    def has_rows(self, robot: Robot) -> bool:
+        """Return whether speeds are bounded along axes that v does not have, or a class of one's own has rows."""
+        del robot
+        speeds = self.linear if self.axes == "base" else self.angular
+        return speeds is not None or type(self).rows is not FloatingBaseVelocityLimit.rows
+
     def rows(
         self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
     ) -> LimitRows | None:

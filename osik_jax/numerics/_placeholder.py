@@ -28,7 +28,7 @@ def with_placeholder(tree: Any) -> tuple[Any, Bool[Array, ""]]:
     valid = jax.tree_util.tree_map_with_path(lambda path, a: jnp.where(_is_invalid(path, a), 1.0, a), numbers)
     kinds: dict[bool, list[Array]] = {True: [], False: []}
     for path, leaf in jax.tree_util.tree_leaves_with_path(numbers):
-        kinds[_never_infinite(path)].append(jnp.ravel(jax.lax.stop_gradient(leaf)))
+        kinds[never_infinite(path)].append(jnp.ravel(jax.lax.stop_gradient(leaf)))
     flags = [~jnp.isnan(_joined(kinds[False])).any(), jnp.isfinite(_joined(kinds[True])).all()]
     return eqx.combine(valid, rest), flags[0] & flags[1]
 
@@ -45,9 +45,9 @@ def _joined(arrays: list[Array]) -> Array:
 
 
 def _is_invalid(path: tuple[Any, ...], leaf: Array) -> Bool[Array, "..."]:
-    return ~jnp.isfinite(leaf) if _never_infinite(path) else jnp.isnan(leaf)
+    return ~jnp.isfinite(leaf) if never_infinite(path) else jnp.isnan(leaf)
 
 
-def _never_infinite(path: tuple[Any, ...]) -> bool:
+def never_infinite(path: tuple[Any, ...]) -> bool:
     names = {key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)}
     return not names or bool(names & _NEVER_INFINITE)

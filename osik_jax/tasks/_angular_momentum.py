@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -47,6 +48,7 @@ class AngularMomentumTask(Task):
         ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis, or a robot without masses.
     """
 
+    units: ClassVar[Mapping[str, str]] = {"": "kg m^2/s"}
     axes: str = eqx.field(static=True)
     target: Float[Array, " m"] | None
     lower: Float[Array, " m"] | None

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
@@ -44,6 +45,13 @@ class AxisAlignTask(PointingTask):
         KeyError: no such frame.
         ValueError: frame and target frame are the same, a wrong shape, a direction of length 0, a negative weight.
     """
+
+    units: ClassVar[Mapping[str, str]] = {
+        "": "rad",
+        "axis": "1 (direction)",
+        "target": "1 (direction)",
+        "target_velocity": "rad/s",
+    }
 
     def __init__(
         self,

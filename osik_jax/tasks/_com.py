@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
@@ -25,7 +25,7 @@ from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
 from ._polygon import SupportPolygon
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import CENTER, DEFAULT_GAIN, CoreCard, Task, TaskRows, check_priority
 
 
 class ComTask(Task):
@@ -57,6 +57,7 @@ class ComTask(Task):
         ValueError: a wrong shape, a negative weight, lower > upper, an unknown axis.
     """
 
+    units: ClassVar[Mapping[str, str]] = {"": "m", "target_velocity": "m/s", "polygon.normals": "1 (direction)"}
     is_goal: ClassVar[bool] = True
     sees_places: ClassVar[bool] = True
     axes: str = eqx.field(static=True)
@@ -109,6 +110,24 @@ class ComTask(Task):
             alike = eqx.tree_at(lambda robot: robot.body_mass, robot, mass), replace(kinematics, backend="jax")
             return equality_rows(*_by_kernel(self, *alike))
         return self._plain_rows(robot, kinematics)
+
+    def core(self, robot: Robot) -> CoreCard | str:
+        """Return the card of the centre of mass."""
+        if type(self) is not ComTask:
+            return super().core(robot)
+        tree, edges = robot.tree, self.polygon is not None
+        rows = self.polygon.offsets.shape[-1] if self.polygon is not None else len(self.axes)
+        axes = [0] * rows if edges else axis_numbers(self.axes).tolist()
+        below = tree.is_own if self.subtree is None else tree.descendants[tree.frame_bodies[tree.frame(self.subtree)]]
+        counts = np.asarray(below) | (self.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
+        return CoreCard(CENTER, rows, [int(number) for number in (edges, *axes, *counts)])
+
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves in the order of ``StepRows::add_task``."""
+        bounds = [self.lower, self.upper, self.target, None]
+        if self.polygon is not None:
+            bounds = [None, self.polygon.offsets, self.polygon.normals, self.polygon.vertices]
+        return [self.gain, self.weight, self.target_velocity, *bounds, None, None]
 
     def _plain_rows(self, robot: Robot, kinematics: Kinematics) -> TaskRows:
         point, jacobian = moving_center(robot, kinematics, self.subtree)

@@ -6,7 +6,8 @@ from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError
@@ -116,6 +117,10 @@ class ContactTask(PlaneTask):
         return {("point", True): 1, ("point", False): 3, ("plane", True): 3, ("plane", False): 6}[
             self.contact, self.sliding
         ]
+
+    def are_lengths(self, count: int) -> Bool[np.ndarray, " m"]:
+        """Return which rows are in metres: those of the contact's place."""
+        return np.arange(count) < (1 if self.sliding else 3)
 
     def rows_at(
         self,

@@ -22,7 +22,7 @@ from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
 from ._pose import RADIAN, PoseTask, goal_arguments, pose_fields
 from ._targets import PoseLike
-from ._task import DEFAULT_GAIN, TaskRows
+from ._task import DEFAULT_GAIN, CoreCard, TaskRows
 
 
 class FrameTask(PoseTask):
@@ -128,6 +128,10 @@ class FrameTask(PoseTask):
         if self._in_core(kinematics.backend) and np.array_equal(columns, np.arange(robot.tree.nv)):
             return equality_rows(*_by_kernel(self, robot, replace(kinematics, backend="jax")))
         return super().rows(robot, kinematics, q)
+
+    def core(self, robot: Robot) -> CoreCard | str:
+        """Return the card of a pose, or in words why there is none."""
+        return self._core_card(robot) if type(self) is FrameTask else super().core(robot)
 
     def rows_at(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self
 
 import equinox as eqx
@@ -29,6 +29,7 @@ class VelocityTask(Task):
     motion from ``q0``.
     """
 
+    units: ClassVar[Mapping[str, str]] = {"": "rad/s or m/s"}
     joints: tuple[int, ...] = eqx.field(static=True)
     row_count: int = eqx.field(static=True)
 
@@ -98,6 +99,8 @@ class DampingTask(VelocityTask):
         KeyError: no such joint, or it is locked or a mimic follower.
         ValueError: a negative weight.
     """
+
+    calms: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -222,6 +225,8 @@ class LowAccelerationTask(VelocityTask):
     """
 
     velocity: Float[Array, " nv"]
+
+    calms: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -49,6 +50,8 @@ class LookAtTask(PointingTask):
         KeyError: no such frame.
         ValueError: frame and target frame are the same, a wrong shape, an axis of length 0, a negative weight.
     """
+
+    units: ClassVar[Mapping[str, str]] = {"": "rad", "axis": "1 (direction)", "target": "m", "target_velocity": "m/s"}
 
     def __init__(
         self,

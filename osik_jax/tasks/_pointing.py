@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
@@ -80,6 +80,10 @@ class PointingTask(FramedTask):
         self.half_angle = None if half_angle is None else _as_half_angle(half_angle, dtype)
         self.weight = as_scalar(weight, "weight", dtype)
         self.gain = as_gain(gain, dtype)
+
+    def are_lengths(self, count: int) -> Bool[np.ndarray, " m"]:
+        """Return that no row is in metres."""
+        return np.zeros(count, bool)
 
     @property
     def frames(self) -> tuple[str, ...]:

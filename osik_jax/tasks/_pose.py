@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError, unknown_name
@@ -24,7 +24,7 @@ from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._targets import Pose, PoseLike, as_pose
-from ._task import TaskRows, check_priority
+from ._task import POSE, CoreCard, TaskRows, check_priority
 from ._twist import pose_log, seen_from
 
 RADIAN = 0.1
@@ -46,6 +46,12 @@ _Wrench = Float[Array, "6 6"] | None
 class PoseTask(FramedTask):
     """Base of tasks on a pose, in the world or in another frame; ``FrameTask`` states the formulas."""
 
+    units: ClassVar[Mapping[str, str]] = {
+        "": "m or rad",
+        "target[0]": "m",
+        "target[1]": "1 (rotation matrix)",
+        "target_velocity": "m/s, rad/s",
+    }
     frame: str = eqx.field(static=True)
     kept: tuple[bool, ...] = eqx.field(static=True)
     axes: str = eqx.field(static=True)
@@ -110,6 +116,27 @@ class PoseTask(FramedTask):
     def coupled(self) -> bool:
         """Return whether the error is the logarithm on SE(3)."""
         return self.error == "se3"
+
+    def are_lengths(self, count: int) -> Bool[np.ndarray, " m"]:
+        """Return which of the kept rows are in metres: those of the position."""
+        del count
+        return np.flatnonzero(self.kept) < 3
+
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves in the order of ``StepRows::add_task``."""
+        bounds, weights = (self.lower, self.upper), (self.position_weight, self.orientation_weight)
+        return [self.gain, self.weight, self.target_velocity, *bounds, *self.target, *weights]
+
+    def _core_card(self, robot: Robot) -> CoreCard | str:
+        if self.coupled:
+            return "has error='se3'"
+        tree = robot.tree
+        options: list[Any] = [self.axes == "frame", self.orientation_jacobian == "geometric", *self.kept]
+        options.append(len(self.frames))
+        for frame in map(tree.frame, self.frames):
+            carrier = tree.frame_bodies[frame]
+            options += [frame, carrier, *tree.moves[carrier]]
+        return CoreCard(POSE, sum(self.kept), [int(number) for number in options])
 
     def pose_rows(
         self,

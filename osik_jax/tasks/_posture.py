@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
 from ._rotation import inverse_left_jacobian
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, POSTURE, CoreCard, Task, TaskRows, check_priority
 
 
 class PostureTask(Task):
@@ -55,6 +55,11 @@ class PostureTask(Task):
         ValueError: a wrong shape, a negative weight, lower > upper, bounds on a ball or free joint.
     """
 
+    units: ClassVar[Mapping[str, str]] = {
+        "": "rad or m",
+        "target": "rad or m; quaternion w x y z",
+        "target_velocity": "rad/s or m/s",
+    }
     joints: tuple[int, ...] = eqx.field(static=True)
     target: Float[Array, " nq"] | None
     target_velocity: Float[Array, " m"]
@@ -117,6 +122,20 @@ class PostureTask(Task):
             dofs=tuple(dofs) if self._adds(robot) else None,
             curvature=no_curvature,
         )
+
+    def core(self, robot: Robot) -> CoreCard | str:
+        """Return the card of a posture, or in words why there is none."""
+        if type(self) is not PostureTask:
+            return super().core(robot)
+        if not all(is_scalar(robot, joint) for joint in self.joints):
+            return "has joints that turn as a ball"
+        dofs = dofs_of(robot, self.joints)
+        return CoreCard(POSTURE, len(dofs), [*(robot.tree.qpos_address[joint] for joint in self.joints), *dofs])
+
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves in the order of ``StepRows::add_task``."""
+        bounds = self.lower, self.upper
+        return [self.gain, self.weight, self.target_velocity, *bounds, self.target, None, None, None]
 
     def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
         """Return the entries of v of the chosen joints."""

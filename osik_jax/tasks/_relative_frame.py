@@ -19,7 +19,7 @@ from ._leaves import home_kinematics
 from ._pose import RADIAN, PoseTask
 from ._rotation import cross_matrix, dot
 from ._targets import Pose, PoseLike
-from ._task import DEFAULT_GAIN, TaskRows
+from ._task import DEFAULT_GAIN, CoreCard, TaskRows
 
 
 class RelativeFrameTask(PoseTask):
@@ -112,6 +112,10 @@ class RelativeFrameTask(PoseTask):
     def frames(self) -> tuple[str, ...]:
         """Return the name of the frame, then of its root."""
         return self.frame, self.root
+
+    def core(self, robot: Robot) -> CoreCard | str:
+        """Return the card of a pose, or in words why there is none."""
+        return self._core_card(robot) if type(self) is RelativeFrameTask else super().core(robot)
 
     def rows_at(
         self,

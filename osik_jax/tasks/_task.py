@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, ClassVar, Self
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics, forward_kinematics
@@ -132,6 +133,24 @@ class TaskRows(eqx.Module):
         return short_sum(self.jacobian**2) if self.squares is None else self.squares
 
 
+class CoreCard(NamedTuple):
+    """Facts by which the compiled step computes the rows of a task (``core/step_rows.hpp``).
+
+    Attributes:
+        kind: ``POSE``, ``CENTER`` or ``POSTURE``: ``StepTask`` in ``core/moving_rows.hpp``.
+        rows: their number.
+        options: indices and flags of this kind.
+    """
+
+    kind: int
+    rows: int
+    options: list[int]
+
+
+POSE, CENTER, POSTURE, GIVEN = range(4)
+"""Kinds of a step's rows; those of ``GIVEN`` are computed by JAX."""
+
+
 class Task(MadeForRobot, Replaceable):
     """Base of all tasks: an immutable pytree.
 
@@ -149,10 +168,14 @@ class Task(MadeForRobot, Replaceable):
             meet it. It has to meet hard tasks in any case.
         sees_places: whether a whole turn of a hinge leaves the task's error as it is, because it depends on the places
             of bodies alone (static).
+        calms: whether the task calms a motion, which it cannot beneath tasks that leave its joints no freedom (static).
+        units: unit of each number, by the field's name; that of ``""`` is of all numbers that are not named (static).
     """
 
     is_goal: ClassVar[bool] = False
     sees_places: ClassVar[bool] = False
+    calms: ClassVar[bool] = False
+    units: ClassVar[Mapping[str, str]] = MappingProxyType({"": "the task's own"})
     weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
     priority: int = eqx.field(default=1, static=True, kw_only=True)
@@ -191,6 +214,28 @@ class Task(MadeForRobot, Replaceable):
         del robot, q0
         still = {"gain": 1.0, "target_velocity": 0.0}
         return self.replace(**{name: value for name, value in still.items() if name in self.replaceable})
+
+    def unit_of(self, field: str) -> str:
+        """Return the unit of a number of the task, by its name in the task, such as ``"target[0]"``."""
+        if field.startswith("gain"):
+            return {"gain.decay": "1 / unit of the error"}.get(field, "1/s")
+        return "1" if "weight" in field else self.units.get(field, self.units.get("", "the task's own"))
+
+    def are_lengths(self, count: int) -> Bool[np.ndarray, " m"]:
+        """Return which of ``count`` rows are in metres; the other rows are in radians. Other units count as metres."""
+        return np.ones(count, bool)
+
+    def core(self, robot: Robot) -> CoreCard | str:
+        """Return the card by which the compiled step computes the rows, or in words why JAX computes them.
+
+        A subclass inherits no card: it may have rows of its own.
+        """
+        del robot
+        return f"is of the class {type(self).__name__}"
+
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves of a task with a card in the order of ``StepRows::add_task``; None for a missing one."""
+        return []
 
     def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
         """Return the entries of v of the joints whose whole turns may change the error."""
