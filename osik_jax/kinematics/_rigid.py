@@ -16,12 +16,13 @@ _GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)).mT
 
 
 def rotation_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
-    """Return the rotation of a quaternion w, x, y, z of any length but 0.
+    """Return the rotation of a quaternion w, x, y, z of any length but 0; by NumPy of NumPy's array.
 
     Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries.
     """
-    dtype = quaternion.dtype
-    half = quaternion * jnp.sqrt(2.0 / jnp.sum(quaternion**2, -1, keepdims=True))  # its products are twice a unit one's
+    dtype, numbers = quaternion.dtype, np if isinstance(quaternion, np.ndarray) else jnp
+    half = quaternion * numbers.sqrt(2.0 / numbers.sum(quaternion**2, -1, keepdims=True))
+    # products of `half` are twice a unit one's
     (w, x, y, z), v = (half[..., i, None, None] for i in range(4)), half[..., 1:]
     turn = w * sum(a * generator for a, generator in zip((x, y, z), _GENERATORS.astype(dtype), strict=True))
     stretch = (1.0 - (x * x + y * y + z * z)) * np.eye(3, dtype=dtype)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,20 +22,19 @@ _ITERATIONS = 4
 """Number of Newton-Schulz iterations: each takes a residual e below e^2, so four take 0.04 below 1e-16."""
 
 
-def _evaluated(function: Callable[[Array, str], Array]) -> Callable[[Array, str], Array]:
+def _evaluated(function: Callable[[Array], tuple[Array, Array]]) -> Callable[[Array], tuple[Array, Array]]:
     """Decorate a function so that concrete arguments are evaluated during tracing and stay constants."""
 
     @wraps(function)
-    def evaluated(given: Array, what: str) -> Array:
+    def evaluated(given: Array) -> tuple[Array, Array]:
         if concrete(given) is None:
-            return function(given, what)
+            return function(given)
         with jax.ensure_compile_time_eval():
-            return function(given, what)
+            return function(given)
 
     return evaluated
 
 
-@_evaluated
 def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B 4"]:
     """Return quaternions divided by their lengths, which must be 1 within 2 %.
 
@@ -42,22 +42,23 @@ def exact_quaternion(given: Float[Array, "*B 4"], what: str) -> Float[Array, "*B
         ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
             length becomes NaN.
     """
-    quaternion, valid = _unit_quaternion(given)
+    quaternion, valid = _unit_quaternion(given, np) if isinstance(given, np.ndarray) else _compiled_unit(given)
     _refuse(valid, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
     return quaternion
 
 
-# compiled as one program, like _nearest_rotation: on a GPU, operations run one by one take milliseconds
-@jax.jit
-def _unit_quaternion(given: Float[Array, "*B 4"]) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
-    squared = jnp.sum(given**2, -1, keepdims=True)
+def _unit_quaternion(given: Any, numbers: Any = jnp) -> tuple[Float[Array, "*B 4"], Bool[Array, "*B"]]:
+    squared = numbers.sum(given**2, -1, keepdims=True)
     valid = (squared >= (1.0 - ROUNDED) ** 2) & (squared <= (1.0 + ROUNDED) ** 2)
-    safe = jnp.where(valid, given, jnp.array([1.0, 0.0, 0.0, 0.0], given.dtype))
-    length = jnp.sqrt(jnp.sum(safe**2, -1, keepdims=True))
-    return jnp.where(valid, safe / length, jnp.nan), valid[..., 0]
+    safe = numbers.where(valid, given, numbers.array([1.0, 0.0, 0.0, 0.0], given.dtype))
+    length = numbers.sqrt(numbers.sum(safe**2, -1, keepdims=True))
+    return numbers.where(valid, safe / length, numbers.nan), valid[..., 0]
 
 
-@_evaluated
+# compiled as one program, like _nearest_rotation: on a GPU, operations run one by one take milliseconds
+_compiled_unit = _evaluated(jax.jit(_unit_quaternion))
+
+
 def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B 3 3"]:
     """Return the rotation matrices nearest to the given ones, whose columns must have length 1 within 2 %.
 
@@ -65,11 +66,20 @@ def exact_rotation(given: Float[Array, "*B 3 3"], what: str) -> Float[Array, "*B
         ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
             becomes NaN if it is traced.
     """
+    if isinstance(given, np.ndarray) and _are_exact(given):
+        return cast(Array, given)
     rotation, valid = _nearest_rotation(given)
     _refuse(valid, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
     return rotation
 
 
+def _are_exact(given: np.ndarray) -> bool:
+    """Return whether all matrices are taken as they are."""
+    residual = np.abs(given @ given.swapaxes(-1, -2) - np.eye(3)).max(initial=0.0)
+    return bool(residual <= _EXACT * float(np.finfo(given.dtype).eps) and (np.linalg.det(given) > 0.0).all())
+
+
+@_evaluated
 @jax.jit
 def _nearest_rotation(given: Float[Array, "*B 3 3"]) -> tuple[Float[Array, "*B 3 3"], Bool[Array, "*B"]]:
     eye = jnp.eye(3, dtype=given.dtype)

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
+from ..kinematics._rigid import rotation_matrix
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._leaves import check_finite, concrete
 
@@ -102,8 +103,15 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
 def _rotation(given: Float[Array, "3 3"] | Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
-        return jaxlie.SO3(exact_quaternion(given, "the target's quaternion")).as_matrix()
+        return matrix_of(exact_quaternion(given, "the target's quaternion"))
     return exact_rotation(given, "the target's rotation")
+
+
+def matrix_of(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B 3 3"]:
+    """Return the rotation matrices of unit quaternions w, x, y, z; by NumPy of NumPy's array."""
+    if isinstance(quaternion, np.ndarray):
+        return rotation_matrix(quaternion)
+    return jaxlie.SO3(quaternion).as_matrix()
 
 
 def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
