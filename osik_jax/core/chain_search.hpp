@@ -10,8 +10,9 @@
 namespace osik {
 
 // The larger one; NaN if one is.
-template <class Real> OSIK_FN Real most(Real a, Real b) { return a != a || a > b ? a : b; }
+template <class Real> OSIK_FN Real most(Real a, Real b) { return select((a != a) | (a > b), a, b); }
 
+// Written for one search, and for a pack of them (lanes.hpp).
 template <class Call> struct ChainSearch {
   using Real = typename Call::Real;
   using In = typename Call::In;
@@ -21,18 +22,19 @@ template <class Call> struct ChainSearch {
     Real position, orientation, score, cost;
   };
   int n, joints, frames, m, rows;                  // coordinates, joints, frames, rows of all frames and those that count
-  bool near;                                       // whether what the frames leave free goes towards `start`
+  bool near;                                       // whether what the frames leave free goes towards `start` in any
   const int *parent, *hinge, *coordinate, *end;    // [joints]: parent or `joints` for the world, ...; [frames] last joint
   const int *carries, *row;                        // [frames, joints] flags; [m] number among those that count or -1
   In constant, first, second, offset, axis, anchor, tip, factor;  // [joints, 12] thrice, [joints], [joints, 3] twice,
                                                                   // [frames, 12], [joints]
   In lower, upper, start, numbers;                 // [n] thrice; length, tolerances, enough, share and least of damping
+  Real pull, enough;                               // 1 where it goes there, else 0; score at which a search ends, else
   Real *pose, *turned, *point, *e, *gram;          // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
   Real *tips, *J, *x, *home;                       // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
 
   ChainSearch(const int* sizes, int n, int frames, Real* next) : n(n), frames(frames), m(6 * frames) {
     Reader<const int*> integers{sizes};
-    joints = *integers.take(1), rows = *integers.take(1), near = *integers.take(1);
+    joints = *integers.take(1), rows = *integers.take(1), near = *integers.take(1), pull = near ? 1 : 0;
     parent = integers.take(joints), hinge = integers.take(joints), coordinate = integers.take(joints);
     end = integers.take(frames), carries = integers.take(frames * joints), row = integers.take(m);
     Reader<Real*> space{next};
@@ -44,7 +46,7 @@ template <class Call> struct ChainSearch {
     Reader<In> at{given};
     constant = at.take(12 * joints), first = at.take(12 * joints), second = at.take(12 * joints);
     offset = at.take(joints), axis = at.take(3 * joints), anchor = at.take(3 * joints), tip = at.take(12 * frames);
-    factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at;
+    factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at, enough = numbers[3];
   }
 
   // Rotation and position of a pose [3, 4].
@@ -55,8 +57,10 @@ template <class Call> struct ChainSearch {
 
   void place() {
     for (int j = 0; j < joints; ++j) {
-      const Real angle = (coordinate[j] < 0 ? 0 : x[coordinate[j]] * factor[j]) + offset[j], half = Real(0.5) * angle;
-      const Real s = sin(half), f = hinge[j] ? 2 * s * cos(half) : angle, g = hinge[j] ? 2 * s * s : 0;
+      const Real angle = (coordinate[j] < 0 ? Real(0) : x[coordinate[j]] * factor[j]) + offset[j];
+      Real s, c;
+      sine_and_cosine(Real(0.5) * angle, s, c);
+      const Real f = hinge[j] ? Real(2) * s * c : angle, g = hinge[j] ? Real(2) * s * s : Real(0);
       Real local[12];
       OSIK_UNROLL
       for (int i = 0; i < 12; ++i)
@@ -83,7 +87,7 @@ template <class Call> struct ChainSearch {
       for (int i = 0; i < 6; ++i) {
         const int own = row[6 * f + i];
         if (own < 0) continue;
-        e[own] = off[i] * (i < 3 ? 1 : length);
+        e[own] = off[i] * (i < 3 ? Real(1) : length);
         squares[i / 3] += off[i] * off[i], found.cost += e[own] * e[own];
       }
       found.position = most(found.position, sqrt(squares[0])), found.orientation = most(found.orientation, sqrt(squares[1]));
@@ -97,11 +101,11 @@ template <class Call> struct ChainSearch {
     for (int j = 0; j < joints; ++j) {
       if (coordinate[j] < 0) continue;
       Real* const column = J + coordinate[j] * rows;
-      const V own = factor[j] * V::of(turned + 3 * j), at = V::of(point + 3 * j);
+      const V own = Real(factor[j]) * V::of(turned + 3 * j), at = V::of(point + 3 * j);
       for (int f = 0; f < frames; ++f) {
         if (!carries[f * joints + j]) continue;
         const V linear = hinge[j] ? cross(own, V::of(tips + 3 * f) - at) : own;
-        const V angular = (hinge[j] ? numbers[0] : 0) * own;
+        const V angular = Real(hinge[j] ? numbers[0] : 0) * own;
         const Real off[] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
         OSIK_UNROLL
         for (int i = 0; i < 6; ++i)
@@ -114,7 +118,7 @@ template <class Call> struct ChainSearch {
     const int rows = ROWS ? ROWS : this->rows;
     OSIK_UNROLL
     for (int k = 0; k < rows; ++k) {
-      const Real inverse = 1 / gram[k * rows + k];
+      const Real inverse = Real(1) / gram[k * rows + k];
       OSIK_UNROLL
       for (int i = k + 1; i < rows; ++i) {
         const Real ratio = gram[i * rows + k] * inverse;
@@ -127,11 +131,11 @@ template <class Call> struct ChainSearch {
     for (int k = rows - 1; k >= 0; --k) {
       OSIK_UNROLL
       for (int i = k + 1; i < rows; ++i) e[k] -= gram[i * rows + k] * e[i];
-      e[k] /= gram[k * rows + k];
+      e[k] = e[k] / gram[k * rows + k];
     }
   }
   // Whether a search with these errors is at its end. One towards `start` goes on.
-  bool is_done(const Errors& found) const { return !near && found.score <= numbers[3]; }
+  auto is_done(const Errors& found) const { return (found.score <= enough) & (pull == Real(0)); }
   // The errors at x, and the next point in its place.
   template <int ROWS> Errors step(In goal) {
     const int rows = ROWS ? ROWS : this->rows;
@@ -139,22 +143,24 @@ template <class Call> struct ChainSearch {
     Real *const gram = ROWS ? registers : this->gram, *const e = ROWS ? registers + ROWS * ROWS : this->e;
     place();
     const Errors found = compare(goal);
-    if (is_done(found)) return found;
+    const auto is_at_end = is_done(found);
+    if (!any(!is_at_end)) return found;
     differentiate();
     const Real damping = numbers[4] * found.cost + numbers[5] * numbers[0] * numbers[0];
     OSIK_UNROLL
     for (int a = 0; a < rows; ++a) {
       e[a] = this->e[a];
       OSIK_UNROLL
-      for (int b = 0; b <= a; ++b) gram[a * rows + b] = a == b ? damping : 0;
+      for (int b = 0; b <= a; ++b) gram[a * rows + b] = a == b ? damping : Real(0);
     }
     for (int j = 0; j < n; ++j) {
       Real *column = J + j * rows, gradient = 0;
       OSIK_UNROLL
       for (int a = 0; a < rows; ++a) gradient += column[a] * e[a];
-      const bool is_stopped = (x[j] <= lower[j] && gradient > 0) || (x[j] >= upper[j] && gradient < 0);
-      for (int a = 0; a < rows && is_stopped; ++a) column[a] = 0;
-      home[j] = near && !is_stopped ? start[j] - x[j] : 0;
+      const Real zero = 0, low = lower[j], high = upper[j];
+      const auto is_stopped = ((x[j] <= low) & (gradient > zero)) | ((high <= x[j]) & (gradient < zero));
+      for (int a = 0; a < rows && any(is_stopped); ++a) column[a] = select(is_stopped, zero, column[a]);
+      home[j] = near ? select(is_stopped, zero, pull * (start[j] - x[j])) : zero;
       OSIK_UNROLL
       for (int a = 0; a < rows; ++a) {
         OSIK_UNROLL
@@ -170,14 +176,25 @@ template <class Call> struct ChainSearch {
       Real to = x[j] + home[j];
       OSIK_UNROLL
       for (int a = 0; a < rows; ++a) to -= J[j * rows + a] * e[a];
-      x[j] = to < lower[j] ? lower[j] : to > upper[j] ? upper[j] : to;
+      to = select(to < Real(lower[j]), Real(lower[j]), select(to > Real(upper[j]), Real(upper[j]), to));
+      x[j] = select(is_at_end, x[j], to);
+    }
+    return found;
+  }
+  // Take steps from x to x; `here` becomes the start of the last one, whose errors are returned.
+  template <class Out> Errors advance(int steps, In goal, Out here) {
+    Errors found{};
+    bool is_at_end = false;  // all of a pack
+    for (int at = 0; at < steps && !is_at_end; ++at) {
+      for (int j = 0; j < n; ++j) here[j] = x[j];
+      found = rows == 6 ? step<6>(goal) : step<0>(goal);
+      is_at_end = !any(!is_done(found));
     }
     return found;
   }
 };
 
 template <class Call> void advance_chain(const Call& call) {
-  using Real = typename Call::Real;
   const int n = call.size(0, 1), frames = call.size(1, 1), *integers = call.integers(3);
   auto space = call.space();
   ChainSearch<Call> search(integers + 1, n, frames, space.data());
@@ -185,16 +202,9 @@ template <class Call> void advance_chain(const Call& call) {
     search.read(call.in(2, lane));
     auto x = call.in(0, lane);
     auto here = call.out(0, lane), there = call.out(1, lane), errors = call.out(2, lane);
-    Real* at = search.x;
-    typename ChainSearch<Call>::Errors found{};
-    for (int j = 0; j < n; ++j) at[j] = x[j];
-    bool is_done = false;
-    for (int step = 0; step < integers[0] && !is_done; ++step) {
-      for (int j = 0; j < n; ++j) here[j] = at[j];
-      found = search.rows == 6 ? search.template step<6>(call.in(1, lane)) : search.template step<0>(call.in(1, lane));
-      is_done = search.is_done(found);
-    }
-    for (int j = 0; j < n; ++j) there[j] = at[j];
+    for (int j = 0; j < n; ++j) search.x[j] = x[j];
+    const auto found = search.advance(integers[0], call.in(1, lane), here);
+    for (int j = 0; j < n; ++j) there[j] = search.x[j];
     errors[0] = found.position, errors[1] = found.orientation, errors[2] = found.score, errors[3] = found.cost;
   });
 }

@@ -1,7 +1,7 @@
 // XLA's calls of kinematics and of rows of tasks on a CPU, in double precision.
 #include <vector>
 
-#include "chain_search.hpp"
+#include "chain_find.hpp"
 #include "xla.hpp"
 
 using namespace osik;
@@ -27,6 +27,7 @@ template <void (*method)(const Robots&)> void of_lanes(const xla::Call& call) { 
 }  // namespace
 
 extern "C" {
+void* osik_chain_find(xla::CallFrame* frame) { return xla::handle<find_chain>(frame); }
 void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Robots>>>(frame); }
 void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Robots>>>(frame); }
 void* osik_moving_frames(xla::CallFrame* frame) { return xla::handle<of_lanes<move_frames<Robots>>>(frame); }

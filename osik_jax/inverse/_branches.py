@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
-from ._fixed import Outcomes
-from ._solution import InverseKinematicsSolution
+from ._fixed import Explored
 from ._turns import TURN, apart, unwound
 
 _SEPARATION = 0.1
@@ -37,36 +35,36 @@ class Coordinates:
     first: Float[np.ndarray, " n"]
 
 
-def with_all(
-    found: InverseKinematicsSolution, outcomes: Outcomes, isolated: Bool[Array, "targets seeds"], own: Coordinates
-) -> InverseKinematicsSolution:
-    """Add the solutions that differ, ``q`` first, then the other branches, then their copies by whole turns."""
-    score, x, q = np.asarray(outcomes.errors.score), np.asarray(outcomes.x), np.asarray(found.q)
-    separation = np.where(isolated, _ISOLATED_SEPARATION, _SEPARATION)
+def all_solutions(explored: Explored, alone: Bool[np.ndarray, " targets"], own: Coordinates) -> dict[str, np.ndarray]:
+    """Return the solutions that differ, ``q`` first, then the other branches, then their copies by whole turns.
+
+    Args:
+        explored: the results of all searches.
+        alone: whether each answer ``q`` is an isolated solution.
+        own: the coordinates.
+
+    Returns:
+        The fields ``solutions``, ``count``, ``branches`` and ``isolated`` of the answers.
+    """
+    found, isolated = explored.found, np.asarray(explored.isolated)
+    score, x, q = np.asarray(explored.outcomes.errors.score), np.asarray(explored.outcomes.x), np.asarray(found.q)
     rows = score.shape[1]
     solutions = np.full((*score.shape, q.shape[1]), np.nan, q.dtype)
-    alone = np.zeros(score.shape, bool)
+    labels = np.zeros(score.shape, bool)
     counts, branches = np.zeros(len(q), np.int32), np.zeros(len(q), np.int32)
     for target in np.flatnonzero(np.asarray(found.converged)):
         # a score is the error over its tolerance, so up to 1 it is a solution
         good = score[target] <= 1.0
         near = unwound(x[target][good], own.first, own.lower, own.upper, own.turns)  # pyright: ignore
         solved = np.concatenate([q[target, own.entries][None], near])
-        # a further search has none of these starts: it found the only solution, so its separation does not matter
-        at = np.append(np.minimum(found.seed[target], rows - 1), np.flatnonzero(good))
-        kept = _distinct(solved, separation[target][at], own.turns)[:rows]
-        distinct, alone[target, : len(kept)] = solved[kept], np.asarray(isolated)[target][at[kept]]
+        points = np.append(alone[target], isolated[target][good])
+        kept = _distinct(solved, np.where(points, _ISOLATED_SEPARATION, _SEPARATION), own.turns)[:rows]
+        distinct, labels[target, : len(kept)] = solved[kept], points[kept]
         every = np.concatenate([distinct, _copies(distinct, own, rows)])[:rows]
         branches[target], counts[target] = len(distinct), len(every)
         solutions[target, : len(every)] = q[target]
         solutions[target, : len(every), own.entries] = every.T
-    return dataclasses.replace(
-        found,
-        solutions=jnp.asarray(solutions),
-        count=jnp.asarray(counts),
-        branches=jnp.asarray(branches),
-        isolated=jnp.asarray(alone),
-    )
+    return dict(solutions=solutions, count=counts, branches=branches, isolated=labels)
 
 
 def _distinct(
@@ -89,23 +87,22 @@ def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> 
     """
     copies = branches[:, None]
     for at in np.flatnonzero(own.turns & np.isfinite(own.lower) & np.isfinite(own.upper)):
-        number = np.arange(-(reach := int((own.upper[at] - own.lower[at]) // TURN)), reach + 1)
-        turned = copies[:, :, None].repeat(len(number), 2)
-        turned[..., at] += TURN * number
-        inside = (turned[..., at] >= own.lower[at]) & (turned[..., at] <= own.upper[at])
-        flat = turned.reshape(len(branches), -1, len(own.first)), inside.reshape(len(branches), -1)
-        copies = _nearest(*flat, own, most)
+        here, end = branches[:, at], own.upper[at]
+        fewest = np.ceil((own.lower[at] - here) / TURN)
+        number = fewest[:, None] + np.arange(int((np.floor((end - here) / TURN) - fewest).max(initial=0)) + 1)
+        turned = copies[:, :, None].repeat(number.shape[1], 2)
+        turned[..., at] += TURN * number[:, None]
+        turned[turned[..., at] > end] = np.nan
+        copies = turned.reshape(len(branches), -1, len(own.first))
+        if copies.shape[1] > most:
+            copies = _nearest(copies, own, most)
     every = copies.reshape(-1, copies.shape[-1])
     others = ~(every[:, None] == branches).all(-1).any(1) & np.isfinite(every[:, 0])
     every = every[others]
     return every[np.argsort(np.linalg.norm(every - own.first, axis=1), kind="stable")]
 
 
-def _nearest(
-    x: Float[np.ndarray, "k m n"], inside: Bool[np.ndarray, "k m"], own: Coordinates, most: int
-) -> Float[np.ndarray, "k some n"]:
-    """Return at most ``most`` copies of each branch, nearest first; copies outside the limits become NaN, last."""
-    away = np.where(inside & np.isfinite(x[..., 0]), np.linalg.norm(x - own.first, axis=-1), np.inf)
-    kept = np.argsort(away, 1, kind="stable")[:, : min(most, int(np.isfinite(away).sum(1).max(initial=1)))]
-    out = np.take_along_axis(x, kept[..., None], 1)
-    return np.where(np.isfinite(np.take_along_axis(away, kept, 1))[..., None], out, np.nan)
+def _nearest(x: Float[np.ndarray, "k m n"], own: Coordinates, most: int) -> Float[np.ndarray, "k most n"]:
+    """Return the ``most`` copies of each branch that are nearest to the first configuration; those of NaN are last."""
+    away = np.linalg.norm(x - own.first, axis=-1)
+    return np.take_along_axis(x, np.argsort(away, 1, kind="stable")[:, :most, None], 1)

@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, UInt
 
 from ..core import _cuda
 from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, scalar_layout
-from ._chain import Chain, Layout, chain_kinematics, chain_layout, make_chain
+from ._chain import Chain, Layout, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
 from ._implicit import errors_at
 from ._pool import Errors, Pace
+from ._reach import ROUNDOFF, Reach, beyond, norm, reaches
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._turns import one_turn
 
-_ROUNDOFF = 64.0
-"""Machine epsilons, of the robot's size, by which computed errors may be off."""
-_ENOUGH = 0.01
+ENOUGH = 0.01
 """Score at which a search is done; the next step would be a rounding."""
 _RADIAN = 0.1
 """Length that a radian counts as, relative to the length of the chain."""
-_STOPPED = 1e-3
+STOPPED = 1e-3
 """A joint is stopped by its limit where the gradient is at least this, relative to its largest value for the error."""
-_SWEEPS = 4
-"""Passes over the slides for the nearest point of what they reach; one is exact where they are at right angles."""
 
 
 class Settings(NamedTuple):
@@ -87,7 +83,8 @@ class ChainRoute(NamedTuple):
 
     def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
         """Return a lower bound on the distance from each target to the workspace [m]; 0 where it may be inside."""
-        return _beyond(search, goal)
+        asked: Any = np.array(self.rows)[:, :3].all(-1)
+        return beyond(search.reaches, goal.position, asked)
 
     def entries(self, robot: Robot) -> np.ndarray:
         """Return the entries of q that a search moves."""
@@ -107,47 +104,87 @@ class ChainRoute(NamedTuple):
         return answer(robot, self, search, goal, x, seed, steps)
 
 
+class Carried(NamedTuple):
+    """What a search needs of a robot and its limits alone.
+
+    Attributes:
+        chain: geometry.
+        lower: limits of the chain's coordinates, -inf where free. (n,)
+        upper: (n,)
+        reaches: bounds on where each frame gets.
+        length: the greatest distance that a frame gets from its root and its slides' travel [m]; may be infinite. ()
+    """
+
+    chain: Chain
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    reaches: list[Reach]
+    length: Float[Array, ""]
+
+
+def carried(
+    robot: Robot, lower: Float[Array, " nv"], upper: Float[Array, " nv"], *, frames: tuple[str, ...]
+) -> Carried:
+    """Return what a search for poses of these frames needs of the robot and the limits of its joints."""
+    layout = chain_layout(robot.tree, frames)
+    chain, dofs = make_chain(robot, frames, layout), dof_of_entries(robot)[np.array(layout.dofs, int)]
+    lower, upper = lower[dofs], upper[dofs]
+    found = reaches(chain, *starting_box(lower, upper))
+    length = jnp.max(jnp.stack([reach.length + jnp.sum(norm(reach.slides)) for reach in found]))
+    return Carried(chain, lower, upper, found, jax.lax.stop_gradient(length))
+
+
 def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
     """Return the search for configurations of a robot whose frames hinges and slides carry."""
-    frames, rows, by_core = route
-    layout = chain_layout(robot.tree, frames)
-    chain = make_chain(robot, frames, layout)
-    coordinates = np.array(layout.dofs, int)
-    dofs = dof_of_entries(robot)[coordinates]
-    lower, upper = settings.lower[dofs], settings.upper[dofs]
-    first = jnp.clip(settings.home[coordinates], lower, upper)
+    own = carried(robot, settings.lower, settings.upper, frames=route.frames)
+    shift = shift_of(settings.key, len(own.lower))
+    return search_of(own, route, settings.home, shift, settings.tolerance, settings.seeds, warm=warm, near=near)
+
+
+def search_of(
+    own: Carried,
+    route: ChainRoute,
+    home: Float[Array, " nq"],
+    shift: UInt[Array, " n"],
+    tolerance: Float[Array, "2"],
+    seeds: Int[Array, ""] | int,
+    *,
+    warm: bool,
+    near: bool,
+) -> ChainSearch:
+    """Return the search with its parts; arguments as in ``Settings`` and ``ChainSearch``."""
+    chain, lower, upper, _, length = own
+    layout = chain.layout
+    first = jnp.clip(home[np.array(layout.dofs, int)], lower, upper)
     box, turns = starting_box(lower, upper), turning(layout)
     low, high = _starts(layout, turns, *box, first)
-    found = jax.lax.stop_gradient(reaches(chain, first, *box))
-    length = jnp.max(jnp.stack([reach.length + jnp.sum(_norm(reach.slides)) for reach in found]))
     return ChainSearch(
-        rows=rows,
-        by_core=by_core,
+        rows=route.rows,
+        by_core=route.by_core,
         turns=turns,
         chain=chain,
         lower=lower,
         upper=upper,
+        reaches=jax.lax.stop_gradient(own.reaches),
         low=low,
         high=high,
         first=first,
-        home=settings.home,
+        home=home,
         warm=warm,
         near=near,
-        seeds=jnp.asarray(settings.seeds, first.dtype),
-        shift=shift_of(settings.key, len(coordinates)),
+        seeds=jnp.asarray(seeds, first.dtype),
+        shift=shift,
         # links in one point have no length, but the steps' damping needs one
-        length=jax.lax.stop_gradient(
-            jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), settings.tolerance[0])
-        ),
-        tolerance=allowed(settings.tolerance, length),
-        enough=jnp.asarray(_ENOUGH, first.dtype),
+        length=jax.lax.stop_gradient(jnp.maximum(_RADIAN * jnp.where(jnp.isfinite(length), length, 1.0), tolerance[0])),
+        tolerance=allowed(tolerance, length),
+        enough=jnp.asarray(ENOUGH, first.dtype),
     )
 
 
 def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Array, "2"]:
     """Return the tolerances less the possible rounding, so that a converged answer holds in exact numbers too."""
     size = jnp.stack([jnp.where(jnp.isfinite(length), length, 1.0), jnp.ones_like(length)])
-    hidden = _ROUNDOFF * float(jnp.finfo(tolerance.dtype).eps) * size
+    hidden = ROUNDOFF * float(jnp.finfo(tolerance.dtype).eps) * size
     # a tolerance near roundoff keeps a quarter of itself, or no search could end
     return jnp.maximum(tolerance - hidden, 0.25 * tolerance)
 
@@ -179,47 +216,6 @@ def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array,
     return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
 
-class Reach(NamedTuple):
-    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move.
-
-    Attributes:
-        root: the first hinge's position with the slides before it in the middle of their ranges [m]. (3,)
-        slides: half the travel of each of these slides, along its direction in the world [m]. (k, 3)
-        length: of the links from there to the frame, with the slides among them drawn out [m]. ()
-    """
-
-    root: Float[Array, "3"]
-    slides: Float[Array, "k 3"]
-    length: Float[Array, ""]
-
-
-def reaches(chain: Chain, x: Array, lower: Array, upper: Array) -> list[Reach]:
-    """Return the reach of each frame, which does not depend on the configuration x."""
-    kinematics, layout = chain_kinematics(chain, x[:, None]), chain.layout
-    axis, anchor = kinematics.axis[..., 0], kinematics.anchor[..., 0]
-    middle, half = 0.5 * (lower + upper) - x, 0.5 * (upper - lower)
-    found = []
-    for at, carried in enumerate(layout.carries):
-        path = np.flatnonzero(carried).tolist()
-        hinges = [j for j in path if layout.hinges[j]]
-        points = [*(anchor[j] for j in hinges), kinematics.position[at, :, 0]]
-        before = [points[0], *(after - here for here, after in pairwise(points))]
-        travels: list[list[Array]] = [[] for _ in before]
-        for j in path:
-            if not layout.hinges[j] and layout.entries[j] >= 0:
-                segment, entry = sum(hinge < j for hinge in hinges), layout.dofs.index(layout.entries[j])
-                before[segment] = before[segment] + layout.factors[j] * middle[entry] * axis[j]
-                travels[segment].append(abs(layout.factors[j]) * half[entry] * axis[j])
-        links = [_norm(own) for own in before[1:]] + [_norm(own) for travel in travels[1:] for own in travel]
-        slides = jnp.array(travels[0], x.dtype).reshape(-1, 3)
-        found.append(Reach(before[0], slides, sum(links, jnp.zeros((), x.dtype))))
-    return found
-
-
-def _norm(vector: Float[Array, "... 3"]) -> Float[Array, "..."]:
-    return jnp.sqrt(jnp.sum(vector**2, -1))
-
-
 def answer(
     robot: Robot,
     route: ChainRoute,
@@ -249,7 +245,7 @@ def answer(
         steps=steps,
         residual={name: jnp.moveaxis(residual[at], -1, 0) for at, name in enumerate(route.frames)},
         at_limit=at_limit.at[:, dof_of_entries(robot)[coordinates]].set(active.T),
-        beyond_reach=_beyond(fixed_search, fixed_goal),
+        beyond_reach=route.beyond(fixed_search, fixed_goal),
         joints=tuple(dof_names(robot)),
     )
 
@@ -262,42 +258,6 @@ def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> t
     residual = jnp.zeros((*rows.shape, x.shape[-1]), x.dtype).at[np.nonzero(rows)].set(error / scale[:, None])
     gradient = jnp.sum(matrix * error[:, None], 0)
     most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
-    stopped = jnp.abs(gradient) > _STOPPED * most
+    stopped = jnp.abs(gradient) > STOPPED * most
     low, high = (x <= search.lower[:, None]) & (gradient > 0.0), (x >= search.upper[:, None]) & (gradient < 0.0)
     return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
-
-
-def _beyond(search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
-    """Return a lower bound on the distance from each target to the workspace, 0 where it may be inside."""
-    found = reaches(search.chain, search.first, *starting_box(search.lower, search.upper))
-    away = jnp.stack([_outside(reach, goal.position[:, at]) for at, reach in enumerate(found)], -1)
-    asked = np.array(search.rows)[:, :3].all(-1)
-    return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(away) & asked, away, 0.0), -1), 0.0)
-
-
-def _outside(reach: Reach, position: Float[Array, "targets 3"]) -> Float[Array, " targets"]:
-    """Return a lower bound on the distance from each position to all that is within reach; not finite for none.
-
-    The root moves in a convex set. In any direction a position is away from that set by at least as much as it is
-    further than the set's furthest point.
-    """
-    way = position - reach.root
-    shares = [jnp.zeros_like(way[:, 0])] * len(reach.slides)
-    for _ in range(_SWEEPS):
-        for at, slide in enumerate(reach.slides):
-            left = _left(way, reach.slides, shares) + shares[at][:, None] * slide
-            square = jnp.sum(slide**2)
-            nearest = jnp.sum(left * slide, -1) / jnp.where(square > 0.0, square, 1.0)
-            shares[at] = jnp.clip(nearest, -1.0, 1.0)
-    left = _left(way, reach.slides, shares)
-    distance = _norm(left)
-    direction = left / jnp.where(distance > 0.0, distance, 1.0)[:, None]
-    furthest = sum((jnp.abs(jnp.sum(direction * slide, -1)) for slide in reach.slides), reach.length)
-    # rounded up, so that a target on the boundary is never called out of reach; positions round by their own size
-    rounding = _ROUNDOFF * float(jnp.finfo(way.dtype).eps) * (furthest + jnp.max(jnp.abs(reach.root), -1))
-    return jnp.sum(direction * way, -1) - (furthest + rounding)
-
-
-def _left(way: Float[Array, "targets 3"], slides: Array, shares: list[Array]) -> Float[Array, "targets 3"]:
-    """Return the way that is left after a share of each slide's travel."""
-    return way - sum((share[:, None] * slide for share, slide in zip(shares, slides, strict=True)), jnp.zeros_like(way))

@@ -21,12 +21,13 @@ from ._error import rotation_error
 from ._linear import ISOLATED, positive_pivot, solve_positive
 from ._minimum import inverse_hessian, minimum
 from ._pool import Errors
+from ._reach import Reach
 from ._seeds import unit_points
 from ._turns import unwound
 
-_DAMPING = 0.03
+DAMPING = 0.03
 """Damping, as a fraction of the squared error: less overshoots from afar, more makes steps short."""
-_LEAST_DAMPING = 1e-5
+LEAST_DAMPING = 1e-5
 """Least damping, as a fraction of the squared length of a radian: bounds the steps of a singular arm near its target.
 """
 _GAIN = 1e-4
@@ -64,6 +65,7 @@ class ChainSearch(eqx.Module):
         chain: geometry.
         lower: of the chain's coordinates, -inf where free. (n,)
         upper: (n,)
+        reaches: bounds on where each frame gets.
         low: of where searches start, finite. (n,)
         high: (n,)
         first: where search 0 starts, used where ``warm``. (n,)
@@ -84,6 +86,7 @@ class ChainSearch(eqx.Module):
     chain: Chain
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
+    reaches: list[Reach]
     low: Float[Array, " n"]
     high: Float[Array, " n"]
     first: Float[Array, " n"]
@@ -135,7 +138,7 @@ class ChainSearch(eqx.Module):
         # a joint at a limit that the descent direction points beyond would be clipped there anyway
         free = ~(((x <= lower) & (gradient > 0.0)) | ((x >= upper) & (gradient < 0.0)))
         matrix = jnp.where(free, matrix, 0.0)
-        damping = _DAMPING * errors.cost + _LEAST_DAMPING * self.length**2
+        damping = DAMPING * errors.cost + LEAST_DAMPING * self.length**2
         done, home = errors.score <= self.enough, jnp.zeros_like(x)
         if self.near:
             done, home = jnp.zeros_like(done), jnp.where(free, self.first[:, None] - x, 0.0)
@@ -281,7 +284,7 @@ def _one_lane(search: ChainSearch, x: Float[Array, " n"], goal: Goal, *, steps: 
     return jax.tree.map(lambda a: a[0], found)
 
 
-_by_kernel = by_kernel(_one_lane, partial(advanced, damping=(_DAMPING, _LEAST_DAMPING)))
+_by_kernel = by_kernel(_one_lane, partial(advanced, damping=(DAMPING, LEAST_DAMPING)))
 
 
 def _times(matrix: Float[Array, "m n lanes"], vector: Float[Array, "n lanes"]) -> Float[Array, "m lanes"]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ._implicit import attached
 from ._pool import Errors, Search
+from ._solution import InverseKinematicsSolution
 
 LAST = 8
 """Steps at the end."""
-_SETTLED = 0.1
+SETTLED = 0.1
 """Score of a search that has come to its end; of those the nearest is taken before any that still moves."""
 
 
@@ -27,6 +30,36 @@ class Outcomes(NamedTuple):
 
     x: Float[Array, "targets seeds n"]
     errors: Errors
+
+
+class Searches(NamedTuple):
+    """Static settings of the searches for a target; hashable.
+
+    Attributes:
+        seeds: their number, where all of them run.
+        warm: whether search 0 starts at the first configuration.
+        near: whether they start around it and go towards it.
+        every: whether the results of all of them are wanted.
+    """
+
+    seeds: int
+    warm: bool
+    near: bool
+    every: bool
+
+
+class Explored(NamedTuple):
+    """Results of all searches of each target.
+
+    Attributes:
+        found: the best.
+        outcomes: their ends; None where the core computed the best alone.
+        isolated: with ``every``, whether these are isolated solutions, else None. (targets, seeds)
+    """
+
+    found: InverseKinematicsSolution
+    outcomes: Any
+    isolated: Any
 
 
 def search_all(
@@ -85,7 +118,7 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
     score = jnp.where(jnp.isnan(outcomes.errors.score), jnp.inf, outcomes.errors.score)
     order = jnp.broadcast_to(jnp.arange(score.shape[-1]), score.shape) if distance is None else distance
     best = jnp.argmin(score, -1)
-    for bound in (1.0, _SETTLED):
+    for bound in (1.0, SETTLED):
         good = score <= bound
         best = jnp.where(good.any(-1), jnp.argmin(jnp.where(good, order, jnp.inf), -1), best)
     return best.astype(jnp.int32)
@@ -94,3 +127,35 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
 def at_solution(search: Any, goal: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
     """Return x, the result of an undifferentiated search, with the derivative of a solution."""
     return attached(jax.lax.stop_gradient(x), search, goal)
+
+
+def or_far(answer: InverseKinematicsSolution, valid: Bool[Array, " targets"]) -> InverseKinematicsSolution:
+    """Return the answer, with the largest finite errors where the target is not valid."""
+    most = jnp.asarray(jnp.finfo(answer.q.dtype).max, answer.q.dtype)
+    return dataclasses.replace(
+        answer,
+        converged=answer.converged & valid,
+        position_error=jnp.where(valid, answer.position_error, most),
+        orientation_error=jnp.where(valid, answer.orientation_error, most),
+    )
+
+
+def with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
+    """Return the targets with 0 in place of NaN and infinity (traced ones may be), and which are valid.
+
+    A target so far away that the square of a distance may not be finite is not valid; a nearer one takes its place.
+    """
+    numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
+    valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
+
+    def largest(a: Array) -> Array:
+        return 1e-3 * jnp.sqrt(jnp.finfo(a.dtype).max)
+
+    for leaf in jax.tree.leaves(numbers):
+        valid &= (jnp.abs(leaf) <= largest(leaf)).reshape(len(leaf), -1).all(1)
+
+    def kept(a: Array) -> Array:
+        near = jnp.clip(jnp.where(jnp.isfinite(a), a, 0.0), -largest(a), largest(a))
+        return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, near)
+
+    return eqx.combine(jax.tree.map(kept, numbers), rest), valid

@@ -17,19 +17,24 @@ from .._errors import OsikTypeError, OsikValueError
 from ..control._checks import check_setting, checked_limits, checked_start
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
+from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
+from ..robot._configuration import check_configuration
+from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme
 from ..tasks import Task
 from ..tasks._targets import PoseLike
 from ._advice import advice
-from ._branches import Coordinates, with_all
+from ._branches import Coordinates, all_solutions
 from ._chain_problem import ChainRoute, Settings
+from ._fixed import Explored, Searches
 from ._host import in_chunks
 from ._problem import read_problem
-from ._run import explored, searched, searched_on
+from ._run import explored, explored_by_core, found_at_once, isolated_at_answers, searched, searched_on
 from ._seeds import starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_search import entry_limits
+from ._whole import whole_is_possible
 
 _STEPS = 40
 _RESTARTS = 7
@@ -96,8 +101,8 @@ def inverse_kinematics(
         position_tolerance: largest distance of a frame from its target [m]; of tasks, of the rows in metres.
         orientation_tolerance: largest angle [rad]; of tasks, of the rows in radians.
         nearest: take all ``seeds`` searches, which start around ``q0`` (or ``robot.q0``), and return the solution that
-            is nearest to it of those that they find. Where they find none, the call without ``nearest`` follows, and
-            its solution then moves towards ``q0`` as far as the frames allow.
+            is nearest to it of those that they find and that of the call without ``nearest``, which then moves towards
+            ``q0`` as far as the frames allow. While tracing, that call follows only where they find none.
         all: take all ``seeds`` searches and return all their solutions that differ, too: ``solutions``, ``count`` and
             ``branches``, the number that differ by more than whole turns. Where they find none, the call without
             ``all`` follows.
@@ -124,7 +129,7 @@ def inverse_kinematics(
     check_count("steps", steps)
     check_count("restarts", restarts, least=0)
     limits, dtype = checked_limits(robot, limits), robot.q0.dtype
-    home = robot.q0 if q0 is None else checked_start(robot, q0).astype(dtype)
+    home = robot.q0 if q0 is None else _start(robot, q0, dtype)
     problem = read_problem(robot, tasks, targets, scheme, limits, home)
     lower, upper = joint_box(robot, limits)
     tolerance = _together(
@@ -135,26 +140,54 @@ def inverse_kinematics(
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
     settings = Settings(home, lower, upper, key, tolerance, seeds, problem.parts)
-    traced = _is_traced((robot, problem.goals, settings))
+    traced = not hold_numbers(robot) or _is_traced((problem.goals, settings))
     if traced and isinstance(route, ChainRoute):
         route = route._replace(by_core=False)
-    start: dict[str, Any] = dict(route=route, warm=q0 is not None, go_on=closest)
     if all and traced:
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
+    how, given = Searches(seeds, warm=q0 is not None, near=nearest, every=all), (robot, problem.goals, settings)
+    most, by_core = once * (1 + restarts), not traced and whole_is_possible(route)
+    if by_core and not problem.many:
+        at_once = found_at_once(*given, most, steps, how, route=route)
+        if at_once is not None and all:
+            batched = at_once._replace(found=jax.tree.map(lambda a: np.asarray(a)[None], at_once.found))
+            more = {name: a[0] for name, a in _all_of(*given, batched, route).items()}
+            return dataclasses.replace(at_once.found, **jax.device_put(more))
+        if at_once is not None:
+            return at_once.found
     if traced or nearest or all:
-        kind = dict(near=nearest, every=all, fall_back=nearest and traced)
-        run = partial(explored, robot, settings=settings, seeds=seeds, steps=steps, **kind, **start)
+        options: dict[str, Any] = dict(settings=settings, how=how, steps=steps, route=route, go_on=closest)
+        if by_core:
+            run = partial(explored_by_core, robot, most=most, **options)
+        else:
+            run = partial(explored, robot, fall_back=nearest and traced, **options)
         results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
-        found, outcomes, isolated = results
+        found = results.found
         if not traced:
-            on = partial(searched_on, route=route, warm=q0 is not None, near=nearest)
-            found = on(robot, problem.goals, settings, found, once * (1 + restarts), steps)
-        found = with_all(found, outcomes, isolated, _coordinates(robot, route, settings)) if all else found
+            found = searched_on(*given, found, most, steps, route=route, warm=how.warm, near=nearest)
+        if all:
+            found = dataclasses.replace(found, **_all_of(*given, results._replace(found=found), route))
     else:
-        found = searched(robot, problem.goals, settings, once * (1 + restarts), steps, **start)
+        found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
     if not (traced or np.all(found.converged)):
         found = dataclasses.replace(found, advice=advice(robot, route.asked(settings)))
     return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
+
+
+def _all_of(robot: Robot, goals: Any, settings: Settings, results: Explored, route: Any) -> dict[str, np.ndarray]:
+    """Return the fields that answers with all solutions have."""
+    alone = isolated_at_answers(robot, goals, settings, results, route=route)
+    return all_solutions(results, alone, _coordinates(robot, route, settings))
+
+
+def _start(robot: Robot, q0: Any, dtype: Any) -> Any:
+    """Return a checked configuration to start from; by NumPy unless traced."""
+    if not isinstance(q0, np.ndarray | jax.Array) or isinstance(q0, Tracer) or q0.dtype.kind not in "fiu":
+        return checked_start(robot, q0).astype(dtype)
+    seen = np.asarray(q0)
+    check_configuration(robot, seen, "q")
+    warn_of_far_joints(robot, seen, "q0")
+    return seen.astype(dtype)
 
 
 def default_seeds(coordinates: int, every: bool) -> int:
@@ -164,14 +197,21 @@ def default_seeds(coordinates: int, every: bool) -> int:
 
 def _coordinates(robot: Robot, route: Any, settings: Settings) -> Coordinates:
     """Return the entries of q that a search moves, as numbers."""
-    entries = route.entries(robot)
-    lower, upper = entry_limits(robot, *starting_box(settings.lower, settings.upper))
-    whole = lower, upper, jnp.clip(settings.home, lower, upper)
-    return Coordinates(entries, route.turning(robot, settings), *(np.asarray(a)[entries] for a in whole))
+    entries, home = route.entries(robot), np.asarray(settings.home)
+    given: Any = np.asarray(settings.lower), np.asarray(settings.upper)
+    lower, upper = entry_limits(robot, *starting_box(*given))
+    whole: Any = lower, upper, np.clip(home, lower, upper)
+    return Coordinates(entries, route.turning(robot, settings), *(a[entries] for a in whole))
 
 
 def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Array]:
-    """Return the lower and upper ends of the joint ranges [rad or m], each (nv,)."""
+    """Return the lower and upper ends of the joint ranges [rad or m], each (nv,); the same objects each time."""
+    parts = robot, *(() if limits is None else limits)
+    return (_known_box if hold_numbers(*parts) else _joint_box)(*parts, own=limits is None)
+
+
+def _joint_box(robot: Robot, *given: Limit, own: bool) -> tuple[Array, Array]:
+    limits = None if own else given
     if keeps_own(limits, ConfigurationLimit):
         return _inward(robot.position_lower, 1.0), _inward(robot.position_upper, -1.0)
     free = jnp.full(robot.nv, jnp.inf, robot.q0.dtype)
@@ -180,6 +220,9 @@ def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Ar
         if isinstance(limit, ConfigurationLimit):
             lower, upper = jnp.maximum(lower, limit.lower), jnp.minimum(upper, limit.upper)
     return _inward(lower, 1.0), _inward(upper, -1.0)
+
+
+_known_box = remembered(_joint_box)
 
 
 def _inward(bound: Array, sign: float) -> Array:

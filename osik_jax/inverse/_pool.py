@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..execution._lanes import first_set
 
-_TRIAL = 8
+TRIAL = 8
 """Steps that every search may take before it has to make progress."""
-_PROGRESS = 0.7
+PROGRESS = 0.7
 """A search goes on where a few steps have brought the cost below this, relative to what it was."""
 
 
@@ -209,7 +209,7 @@ def _culled(lanes: _Lanes, x: Array, errors: Errors, found: Found, check: int, l
     """End searches whose target is found, that are too long, or that make no progress."""
     age = lanes.age + check
     # the negated comparison also ends a search whose cost is NaN
-    stuck = (age > _TRIAL) & ~(errors.cost < _PROGRESS * lanes.cost)
+    stuck = (age > TRIAL) & ~(errors.cost < PROGRESS * lanes.cost)
     ends = stuck | (age >= longest) | (found.errors.score[lanes.target] <= enough)
     idle = len(found.seed) - 1
     return _Lanes(x, jnp.where(ends, idle, lanes.target), lanes.seed, age, errors.cost)

@@ -8,7 +8,6 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
@@ -18,7 +17,7 @@ from ..execution._platform import on_host
 from ..numerics._arguments import concrete
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
-from ..tasks._targets import as_pose, pose_array, pose_parts
+from ..tasks._targets import as_pose, matrix_of, pose_array, pose_parts
 from ._chain_search import Goal
 
 _POSITION = (True,) * 3 + (False,) * 3
@@ -45,7 +44,7 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
         fetched = iter(jax.device_get([leaf for leaf in values if isinstance(leaf, jax.Array)]))
         values = [next(fetched) if isinstance(leaf, jax.Array) else leaf for leaf in values]
     # an operation of JAX's costs as much as a short search; it alone refuses all that is no number
-    numbers = np if all(isinstance(leaf, np.ndarray) and leaf.dtype != object for leaf in values) else jnp
+    numbers = np if all(isinstance(leaf, np.ndarray) and leaf.dtype.kind in "fiu" for leaf in values) else jnp
     with nullcontext() if traced else on_host():
         for name, value in zip(targets, jax.tree.unflatten(structure, values), strict=True):
             try:
@@ -90,7 +89,7 @@ def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool
         raise OsikValueError(f"got rotations of shape {rotation.shape}; many are (n, 3, 3), or (n, 4): w x y z")
     _check_finite(position)
     if rotation.ndim == 2:
-        return position, jaxlie.SO3(exact_quaternion(rotation, "rotation")).as_matrix(), _POSE
+        return position, matrix_of(exact_quaternion(rotation, "rotation")), _POSE
     return position, exact_rotation(rotation, "rotation"), _POSE
 
 

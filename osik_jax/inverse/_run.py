@@ -6,21 +6,21 @@ import dataclasses
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from ..execution._blocks import in_blocks
 from ..robot import Robot
-from ._chain_problem import Settings
+from ._chain_problem import ENOUGH, Settings
 from ._closest import Closest, closest
-from ._fixed import LAST, Outcomes, choose, or_plain, search_all
+from ._fixed import LAST, Explored, Outcomes, Searches, choose, or_far, or_plain, search_all, with_placeholders
 from ._host import in_chunks, lanes_for, only
 from ._packed import Packed, packed, unpacked
-from ._pool import run_pool
+from ._pool import Errors, run_pool
 from ._solution import InverseKinematicsSolution
+from ._whole import whole, whole_is_possible
 
 _HOPELESS = 16
 """Searches for a target that is known to be out of reach, where the closest configuration is not wanted."""
@@ -49,16 +49,21 @@ def searched(
     """
     lanes = lanes_for(len(jax.tree.leaves(goals)[0]), route.pace.lanes)
     run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
-    hopeless = np.int32(1 if go_on else _HOPELESS)
+    hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route)
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
         def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
-            given = packed((goals, settings, left, np.int32(most), hopeless, np.int32(steps)))
+            if by_core:
+                how, number = Searches(0, warm, near=False, every=False), np.where(left, most, 0)
+                results = whole(robot, route, goals, settings, number, hopeless, steps, how, single=False)
+                return jax.tree.map(np.asarray, results.answer)
+            given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
             return unpacked(jax.device_get(run(given)))
 
-        found = by(1 if warm else seeds, wanted)
+        alone = warm and not by_core
+        found = by(1 if alone else seeds, wanted)
         left = wanted & ~found.converged
-        if warm and left.any():
+        if alone and left.any():
             found = _with(found, left, by(seeds, left))
             left &= ~found.converged
         if not (go_on and left.any()):
@@ -76,6 +81,70 @@ def searched(
     return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
 
 
+def found_at_once(
+    robot: Robot, goals: Any, settings: Settings, seeds: int, steps: int, how: Searches, *, route: Any
+) -> Explored | None:
+    """Return the results for one target by one call of the core, None if more has to be done for it.
+
+    The answer has no axis of targets; the ends of the searches have.
+    """
+    found, score, ends = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
+    if not found.converged or ((how.near or how.every) and not score <= ENOUGH):
+        return None
+    return Explored(found, *_split(None if ends is None else np.asarray(ends)[None]))
+
+
+def explored_by_core(
+    robot: Robot,
+    goals: Any,
+    *,
+    most: int,
+    settings: Settings,
+    how: Searches,
+    steps: int,
+    route: Any,
+    go_on: bool,
+) -> Explored:
+    """Return what ``explored`` does. Only targets that go on to the least error are computed by it."""
+    count = np.full(len(goals.position), most)
+    results = whole(robot, route, goals, settings, count, most, steps, how, single=False)
+    found, score, ends = jax.tree.map(np.asarray, results)
+    further = ~(score <= ENOUGH)
+    if go_on and further.any():
+        run = partial(explored, robot, settings=settings, how=how._replace(every=False), steps=steps, route=route)
+        by_jax = only(further, lambda goals: run(goals, go_on=True, fall_back=False).found, goals)
+        kept = found.converged & how.near & (_distances(found, settings) < _distances(by_jax, settings))
+        found = _with(found, further & ~kept, by_jax)
+    return Explored(found, *_split(ends))
+
+
+def _split(ends: Any) -> tuple[Outcomes | None, Any]:
+    """Return the ends of all searches by ``whole``, and whether they are isolated solutions."""
+    if ends is None:
+        return None, None
+    return Outcomes(ends[..., :-2], Errors(*[ends[..., -2]] * 4)), ends[..., -1] > 0.0
+
+
+def isolated_at_answers(
+    robot: Robot, goals: Any, settings: Settings, explored: Explored, *, route: Any
+) -> Bool[np.ndarray, " targets"]:
+    """Return of each answer whether it is an isolated solution."""
+    found, score, isolated = explored.found, explored.outcomes.errors.score, np.asarray(explored.isolated)
+    at = np.arange(len(isolated)), np.minimum(found.seed, isolated.shape[1] - 1)
+    # where no search of these has met the target, the answer is from a further one, whose numbers begin at 0 again
+    known = ~np.asarray(found.converged) | (np.asarray(score)[at] <= 1.0)
+    if known.all():
+        return isolated[at]
+    alone = only(~known, partial(_isolated, robot, settings=settings, route=route), goals, found.q)
+    return np.where(known, isolated[at], alone)
+
+
+@partial(jax.jit, static_argnames="route")
+def _isolated(robot: Robot, goals: Any, q: Array, *, settings: Settings, route: Any) -> Array:
+    search = route.search(robot, settings, warm=False, near=False)
+    return search.isolated(q[:, route.entries(robot)], goals)
+
+
 def searched_on(
     robot: Robot,
     goals: Any,
@@ -88,22 +157,32 @@ def searched_on(
     warm: bool,
     near: bool,
 ) -> InverseKinematicsSolution:
-    """Return ``found``; for targets that it has not met, what ``searched`` finds, moved home where ``near``."""
-    left = ~np.asarray(found.converged) & (np.asarray(found.beyond_reach) <= 0.0)
+    """Return ``found``; for targets that it has not met, what ``searched`` finds, moved home where ``near``.
+
+    A pull towards home can keep a search from any solution. So where ``near`` the targets that are met are searched for
+    as well, and the nearer answer is kept, unless the core has done so.
+    """
+    near = near and route.starts_anew
+    reachable, met = np.asarray(found.beyond_reach) <= 0.0, np.asarray(found.converged)
+    left = reachable & ~(met & (not near or whole_is_possible(route)))
     if not left.any():
         return found
     new = searched(robot, goals, settings, seeds, steps, route=route, warm=warm, go_on=False, wanted=left)
     new = dataclasses.replace(new, steps=found.steps + new.steps)
     left &= np.asarray(new.converged)
-    if near and route.starts_anew and left.any():
+    if near and left.any():
 
         def walk(*args: Any) -> InverseKinematicsSolution:
             return unpacked(jax.device_get(_walked_home(robot, packed((settings, *args)), route=route, steps=steps)))
 
         home = only(left, walk, goals, new.q, new.seed, new.steps)
-        far, away = (np.linalg.norm(a.q - np.asarray(settings.home), axis=1) for a in (home, new))
-        new = _with(new, np.asarray(home.converged) & (far < away), home)
-    return _with(found, left, new)
+        new = _with(new, np.asarray(home.converged) & (_distances(home, settings) < _distances(new, settings)), home)
+    return _with(found, left & ~(met & (_distances(found, settings) <= _distances(new, settings))), new)
+
+
+def _distances(found: InverseKinematicsSolution, settings: Settings) -> Float[np.ndarray, " targets"]:
+    """Return how far the answers are from the first configuration."""
+    return np.linalg.norm(np.asarray(found.q) - np.asarray(settings.home), axis=1)
 
 
 def _with(found: Any, changed: np.ndarray, new: Any) -> Any:
@@ -113,19 +192,19 @@ def _with(found: Any, changed: np.ndarray, new: Any) -> Any:
 @partial(jax.jit, static_argnames=("route", "warm", "lanes"))
 def _pooled(robot: Robot, given: Packed, *, route: Any, warm: bool, lanes: int) -> Packed:
     goals, settings, wanted, seeds, hopeless, longest = unpacked(given)
-    goals, valid = _with_placeholders(goals)
+    goals, valid = with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=False)
     most = jnp.where(route.beyond(search, goals) > 0.0, jnp.minimum(seeds, hopeless), seeds)
     limits = dict(seeds=most, longest=longest, enough=search.enough)
     found = run_pool(search, goals, wanted, lanes=lanes, check=route.pace.check, **limits)
-    return packed(_or_far(route.answer(robot, search, goals, found.x, found.seed, found.steps), valid))
+    return packed(or_far(route.answer(robot, search, goals, found.x, found.seed, found.steps), valid))
 
 
 @partial(jax.jit, static_argnames=("route", "warm", "starts"))
 def _approached(robot: Robot, given: Packed, *, route: Any, warm: bool, starts: int) -> Packed:
     """Return the least-error configuration for unmet targets, from new searches and the best so far."""
     settings, goals, q, seed, before = unpacked(given)
-    goals, valid = _with_placeholders(goals)
+    goals, valid = with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=False)
 
     def some(goals: Any, best: Array) -> Closest:
@@ -138,7 +217,7 @@ def _approached(robot: Robot, given: Packed, *, route: Any, warm: bool, starts: 
     new = starts if route.starts_anew else 0
     steps = before + new * _GLANCE + found.steps
     number = jnp.where(found.seed == new, seed, found.seed)
-    return packed(_or_far(route.answer(robot, search, goals, found.x, number, steps), valid))
+    return packed(or_far(route.answer(robot, search, goals, found.x, number, steps), valid))
 
 
 @partial(jax.jit, static_argnames=("route", "steps"))
@@ -151,26 +230,24 @@ def _walked_home(robot: Robot, given: Packed, *, route: Any, steps: int) -> Pack
     return packed(route.answer(robot, search, goals, x, seed, before + steps + LAST))
 
 
-@partial(jax.jit, static_argnames=("route", "seeds", "steps", "warm", "near", "every", "go_on", "fall_back"))
+@partial(jax.jit, static_argnames=("how", "route", "steps", "go_on", "fall_back"))
 def explored(
     robot: Robot,
     goals: Any,
     *,
     settings: Settings,
+    how: Searches,
     route: Any,
-    seeds: int,
     steps: int,
-    warm: bool,
-    near: bool,
-    every: bool,
     go_on: bool,
     fall_back: bool,
-) -> tuple[InverseKinematicsSolution, Outcomes, Bool[Array, "targets seeds"] | None]:
-    """Return the results of all searches of each target; with ``every`` also whether solutions are isolated.
+) -> Explored:
+    """Return the results of all searches of each target.
 
     It is a pure function of a limited amount of work. ``fall_back``: on plain searches, where ``near`` meets no target.
     """
-    goals, valid = _with_placeholders(goals)
+    seeds, warm, near, every = how
+    goals, valid = with_placeholders(goals)
     search = route.search(robot, settings, warm=warm, near=near)
     fixed_search, fixed_goals = jax.lax.stop_gradient((search, goals))
     last = fixed_search.finishing(exact=every) if near or every else None
@@ -200,36 +277,5 @@ def explored(
 
     outcomes, alone, found = in_blocks(some, (fixed_goals,), _TOGETHER)
     taken = seeds * (steps + (0 if last is None else LAST)) + found.steps
-    return _or_far(route.answer(robot, search, goals, found.x, found.seed, taken), valid), outcomes, alone
-
-
-def _or_far(answer: InverseKinematicsSolution, valid: Bool[Array, " targets"]) -> InverseKinematicsSolution:
-    """Return the answer, with the largest finite errors where the target is not valid."""
-    most = jnp.asarray(jnp.finfo(answer.q.dtype).max, answer.q.dtype)
-    return dataclasses.replace(
-        answer,
-        converged=answer.converged & valid,
-        position_error=jnp.where(valid, answer.position_error, most),
-        orientation_error=jnp.where(valid, answer.orientation_error, most),
-    )
-
-
-def _with_placeholders(goals: Any) -> tuple[Any, Bool[Array, " targets"]]:
-    """Return the targets with 0 in place of NaN and infinity (traced ones may be), and which are valid.
-
-    A target so far away that the square of a distance may not be finite is not valid; a nearer one takes its place.
-    """
-    numbers, rest = eqx.partition(goals, eqx.is_inexact_array)
-    valid = jnp.ones(len(jax.tree.leaves(goals)[0]), bool)
-
-    def largest(a: Array) -> Array:
-        return 1e-3 * jnp.sqrt(jnp.finfo(a.dtype).max)
-
-    for leaf in jax.tree.leaves(numbers):
-        valid &= (jnp.abs(leaf) <= largest(leaf)).reshape(len(leaf), -1).all(1)
-
-    def kept(a: Array) -> Array:
-        near = jnp.clip(jnp.where(jnp.isfinite(a), a, 0.0), -largest(a), largest(a))
-        return jnp.where(valid.reshape(-1, *[1] * (a.ndim - 1)), a, near)
-
-    return eqx.combine(jax.tree.map(kept, numbers), rest), valid
+    answer = route.answer(robot, search, goals, found.x, found.seed, taken)
+    return Explored(or_far(answer, valid), outcomes, alone)

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
+from ..numerics._arguments import numbers_for
+
 _BITS = 32
 _UNLIMITED = 100.0
 """Limits further out than this [rad or m] are placeholders that files write for none, such as 1e9."""
@@ -21,7 +23,8 @@ def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
 def starting_box(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Return the limits for starts: infinite beyond 100 rad or 100 m, where starts would be spread too thinly."""
     # starts spread over such a range would practically never be inside the robot's real one
-    return jnp.where(lower < -_UNLIMITED, -jnp.inf, lower), jnp.where(upper > _UNLIMITED, jnp.inf, upper)
+    numbers = numbers_for(lower, upper)
+    return numbers.where(lower < -_UNLIMITED, -np.inf, lower), numbers.where(upper > _UNLIMITED, np.inf, upper)
 
 
 def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.dtype) -> Float[Array, "... n"]:
@@ -35,12 +38,13 @@ def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.
         number: of the points.
         dtype: of the result.
     """
-    increments = jnp.asarray(_increments(len(shift)))
-    bits = shift + number.astype(jnp.uint32)[..., None] * increments
+    steps = jnp.asarray(increments(len(shift)))
+    bits = shift + number.astype(jnp.uint32)[..., None] * steps
     return (bits >> 8).astype(dtype) * 2.0 ** (8 - _BITS)  # 24 bits: what single precision holds
 
 
-def _increments(dimensions: int) -> np.ndarray:
+def increments(dimensions: int) -> np.ndarray:
+    """Return the increments of ``unit_points``, as fractions of the cube in units of 2**-32."""
     # any start above 1 converges to the fixed point
     phi = 1.5
     for _ in range(64):  # a contraction: phi = (1 + phi)^(1 / (n + 1))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt
 from ..control._step import velocity_problem
 from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
+from ..numerics._arguments import numbers_for
 from ..robot import Robot
 from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
@@ -302,5 +303,6 @@ def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
 def entry_limits(robot: Robot, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the limits of each entry of q, from those of each entry of v."""
     scalar, index = scalar_layout(robot)
-    low, high = jnp.full(robot.nq, -jnp.inf, lower.dtype), jnp.full(robot.nq, jnp.inf, upper.dtype)
-    return low.at[index[scalar]].set(lower[scalar]), high.at[index[scalar]].set(upper[scalar])
+    dof, numbers = np.full(robot.nq, -1), numbers_for(lower, upper)
+    dof[index[scalar]] = np.flatnonzero(scalar)
+    return numbers.where(dof >= 0, lower[dof], -np.inf), numbers.where(dof >= 0, upper[dof], np.inf)

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..numerics._arguments import numbers_for
+
 TURN = 2.0 * np.pi
 
 
@@ -28,10 +30,11 @@ def unwound(
         turns: of each coordinate, whether a whole turn changes no pose.
     """
     # the numbers of turns that stay inside the limits; infinite limits allow any number
-    fewest, most = jnp.ceil((lower - x) / TURN), jnp.floor((upper - x) / TURN)
-    number = jnp.clip(jnp.round((about - x) / TURN), fewest, most)
-    moved = jnp.clip(x + TURN * number, lower, upper)
-    return jnp.where(np.array(turns) & (number != 0.0), moved, x).astype(x.dtype)
+    numbers = numbers_for(x, about, lower, upper)
+    fewest, most = numbers.ceil((lower - x) / TURN), numbers.floor((upper - x) / TURN)
+    number = numbers.clip(numbers.round((about - x) / TURN), fewest, most)
+    moved = numbers.clip(x + TURN * number, lower, upper)
+    return numbers.where(np.array(turns) & (number != 0.0), moved, x).astype(x.dtype)
 
 
 def one_turn(

@@ -143,3 +143,8 @@ def as_floats(value: Any, *beside: Any) -> Array:
 def concrete(value: Any) -> np.ndarray | None:
     """Return the value as a NumPy array, or None if it is traced."""
     return None if isinstance(value, Tracer) else np.asarray(value)
+
+
+def numbers_for(*values: Any) -> Any:
+    """Return NumPy for NumPy's arrays alone, else ``jax.numpy``, whose dispatch costs more than a short computation."""
+    return np if all(isinstance(value, np.ndarray) for value in values) else jnp

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compilations import Compilations
 from model_files import mjcf
 from mujoco_states import mujoco_at
 from refusals import refuses
@@ -218,14 +219,12 @@ def test_derivative_is_finite_out_of_reach(planar):
 def test_changing_numbers_compiles_nothing(arm, rng):
     position, rotation = random_poses(arm, "hand", 16, rng)
     osik.inverse_kinematics(arm, {"hand": (position, rotation)})
-    from osik_jax.inverse import _run as module
-
-    program: Any = module._pooled
-    before = program._cache_size()
-    for key, tolerance, seeds in ((1, 1e-4, 8), (2, 1e-2, 32)):
-        poses = {"hand": (position[::-1], rotation[::-1])}
-        osik.inverse_kinematics(arm, poses, key=key, position_tolerance=tolerance, seeds=seeds, restarts=0, steps=30)
-    assert program._cache_size() == before
+    with Compilations() as compiled:
+        for key, tolerance, seeds in ((1, 1e-4, 8), (2, 1e-2, 32)):
+            poses = {"hand": (position[::-1], rotation[::-1])}
+            options: dict[str, Any] = dict(position_tolerance=tolerance, seeds=seeds, restarts=0, steps=30)
+            osik.inverse_kinematics(arm, poses, key=key, **options)
+    assert compiled.names == []
 
 
 @pytest.mark.release

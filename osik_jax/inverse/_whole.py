@@ -1,0 +1,196 @@
+"""Whole searches for poses outside of programs, by one call of the core (``core/chain_find.hpp``) on a CPU.
+
+What does not change from call to call is found by the identity of the robot and of the limits of its joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..core import _library
+from ..execution._platform import cpu_is_default
+from ..numerics._remembered import remembered
+from ..robot import Robot
+from ..robot._joint_selection import dof_names
+from ._chain_kernel import integers_of, numbers_of
+from ._chain_problem import STOPPED, ChainRoute, Settings, carried, dof_of_entries, search_of
+from ._chain_search import DAMPING, LEAST_DAMPING, ChainSearch, Goal
+from ._fixed import LAST, SETTLED, Searches, or_far, with_placeholders
+from ._linear import ISOLATED
+from ._pool import PROGRESS, TRIAL, Pace
+from ._seeds import increments, shift_of
+from ._solution import InverseKinematicsSolution
+
+_STILL = 1e-9
+"""A search is at its end if no coordinate moves by more in a step [rad or m]."""
+
+
+class Whole(NamedTuple):
+    """Results of whole searches.
+
+    Attributes:
+        answer: the answers, as of ``ChainRoute.answer``.
+        score: of the answers. (targets,)
+        ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
+    """
+
+    answer: InverseKinematicsSolution
+    score: Float[Array, "*targets"]
+    ends: Float[Array, "*targets seeds n_and_2"] | None
+
+
+class _Known(NamedTuple):
+    """Numbers of a robot and its limits, their structure, and the programs that take them."""
+
+    leaves: list[Array]
+    structure: Any
+    programs: dict[tuple[ChainRoute, Searches, bool], Callable[..., Whole]]
+
+
+def whole_is_possible(route: Any) -> bool:
+    """Return whether ``whole`` runs here, for concrete arguments."""
+    return isinstance(route, ChainRoute) and route.by_core and cpu_is_default() and _library.installed()
+
+
+def whole(
+    robot: Robot,
+    route: ChainRoute,
+    goals: Goal,
+    settings: Settings,
+    most: np.ndarray,
+    hopeless: int,
+    steps: int,
+    how: Searches,
+    *,
+    single: bool,
+) -> Whole:
+    """Return the results of whole searches.
+
+    Args:
+        robot: the robot.
+        route: its frames.
+        goals: the targets.
+        settings: numbers, without ``parts``.
+        most: number of searches for each target at most, where they do not all run. (targets,)
+        hopeless: the same for targets that are out of reach.
+        steps: of one search at most.
+        how: static settings. All searches run where ``near`` or ``every`` is set.
+        single: whether there is one target, and results have no axis of targets (static).
+    """
+    known = _known(robot, settings.lower, settings.upper, frames=route.frames)
+    program = known.programs.get((route, how, single))
+    if program is None:
+        dofs = dof_of_entries(robot)[route.entries(robot)].tolist()
+        program = _program(known.structure, route, how, single, tuple(dofs), tuple(dof_names(robot)))
+        known.programs[route, how, single] = program
+    shift = _shift(settings.key, len(route.entries(robot)))
+    counts = np.append(most, (hopeless, steps)).astype(np.int32)
+    return program(known.leaves, *goals, settings.home, shift, settings.tolerance, counts)
+
+
+@remembered
+def _known(robot: Robot, lower: Array, upper: Array, *, frames: tuple[str, ...]) -> _Known:
+    return _Known(*jax.tree.flatten(_carried(robot, lower, upper, frames=frames)), {})
+
+
+_carried = jax.jit(carried, static_argnames="frames")
+
+
+def _shift(key: Any, dimensions: int) -> Array:
+    return _shift_of(int(key), dimensions) if isinstance(key, int | np.integer) else shift_of(key, dimensions)
+
+
+_shift_of = lru_cache(shift_of)
+
+
+@lru_cache
+def _program(
+    structure: Any, route: ChainRoute, how: Searches, single: bool, dofs: tuple[int, ...], joints: tuple[str, ...]
+) -> Callable[..., Whole]:
+    """Return the compiled program for robots of one structure; ``dofs``: entries of v of the coordinates."""
+
+    def program(
+        leaves: list[Array],
+        position: Array,
+        rotation: Array,
+        home: Array,
+        shift: Array,
+        tolerance: Array,
+        counts: Array,
+    ) -> Whole:
+        own, (goals, valid) = jax.tree.unflatten(structure, leaves), with_placeholders(Goal(position, rotation))
+        search = search_of(own, route, home, shift, tolerance, how.seeds, warm=how.warm, near=how.near)
+        beyond = route.beyond(search, goals)
+        most, (hopeless, steps) = counts[:-2], counts[-2:]
+        most = jnp.where(beyond > 0.0, jnp.minimum(most, hopeless), most)
+        results = _by_core(search, goals, most, steps, how, dofs, joints)
+        whole = _named(route.frames, joints, beyond, *results)
+        whole = whole._replace(answer=or_far(whole.answer, valid))
+        return jax.tree.map(lambda a: a[0], whole) if single else whole
+
+    return jax.jit(program)
+
+
+def _by_core(
+    search: ChainSearch,
+    goal: Goal,
+    most: Int[Array, " targets"],
+    steps: Int[Array, ""],
+    how: Searches,
+    dofs: tuple[int, ...],
+    joints: tuple[str, ...],
+) -> list[Array]:
+    """Return the results of ``core/chain_find.hpp``.
+
+    These are configurations (targets, nq). Then position and orientation error, score, and
+    residuals (targets, 3 + 6 frames). Then whether it has converged, the number of the search, steps, and at_limit
+    (targets, 3 + nv). With ``every``, also end points, score and whether isolated (targets, seeds, n + 2).
+    """
+    kind, nv = search.first.dtype, len(joints)
+    targets, frames, n, nq = len(most), len(search.rows), len(search.first), len(search.home)
+    goals = jnp.concatenate([goal.position[..., None, :], goal.rotation], -2).reshape(targets, frames, 12)
+    tuned = np.array([PROGRESS, SETTLED, ISOLATED, STOPPED, _STILL], kind)
+    numbers = [*numbers_of(search, (DAMPING, LEAST_DAMPING)), search.low, search.high, search.home, tuned]
+    flags = [how.warm, how.near, how.every, kind == jnp.float32]
+    bits = [jax.lax.bitcast_convert_type(search.shift, jnp.int32), increments(n).view(np.int32)]
+    options = [[n, steps, Pace().check, TRIAL, LAST, how.seeds, nq, nv, *flags], *bits, search.turns]
+    options += [search.chain.layout.dofs, dofs]
+    shapes: list[Any] = [((targets, nq), float), ((targets, 3 + 6 * frames), float), ((targets, 3 + nv), int)]
+    shapes += [((targets, how.seeds, n + 2), float)] * how.every
+    return _library.call(
+        *("chain_find", shapes, goals, most, jnp.concatenate([jnp.ravel(a) for a in numbers])),
+        *(integers_of(search, 0), jnp.concatenate([jnp.array(a, jnp.int32) for a in options])),
+    )
+
+
+def _named(
+    frames: tuple[str, ...],
+    joints: tuple[str, ...],
+    beyond: Array,
+    q: Array,
+    sizes: Array,
+    labels: Array,
+    *every: Array,
+) -> Whole:
+    """Return the results of ``_by_core`` by their names."""
+    residual = sizes[:, 3:].reshape(-1, len(frames), 6)
+    answer = InverseKinematicsSolution(
+        q=q,
+        converged=labels[:, 0] > 0,
+        position_error=sizes[:, 0],
+        orientation_error=sizes[:, 1],
+        seed=labels[:, 1],
+        steps=labels[:, 2],
+        residual={name: residual[:, at] for at, name in enumerate(frames)},
+        at_limit=labels[:, 3:],
+        beyond_reach=beyond,
+        joints=joints,
+    )
+    return Whole(answer, sizes[:, 2], every[0] if every else None)
