@@ -1,5 +1,4 @@
 """Controllers as files."""
 
-from ._controller import Controller as Controller
 from ._controller import load_controller as load_controller
 from ._controller import save_controller as save_controller

@@ -20,6 +20,7 @@ import numpy as np
 
 from .._errors import OsikError, OsikValueError, OsikWarning
 from .._whole_file import write_text
+from ..control import Controller
 from ..control._checks import check_setting, check_tasks, checked_limits
 from ..control._packed_step import packed_section
 from ..control._step import build_problem
@@ -39,16 +40,8 @@ _ACCURACY = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-4}
 """Largest difference of a step's numbers, relative to the largest of each array, that is roundoff of an MJCF."""
 
 
-class Controller(NamedTuple):
-    """Result of ``load_controller``: the arguments of ``solve`` and ``rollout``.
-
-    Attributes:
-        robot: the robot.
-        tasks: by name.
-        scheme: how they share the robot.
-        limits: as ``solve`` takes them.
-        dt: time of a step [s].
-    """
+class _Saved(NamedTuple):
+    """What a file holds: the arguments of ``Controller``."""
 
     robot: Robot
     tasks: dict[str, Task]
@@ -102,13 +95,13 @@ def save_controller(
         "robot": _source(robot, source),
         "dt": float(dt),
     } | encode_parts(robot, tasks, used, given)
-    saved = Controller(robot, dict(tasks), used, given, content["dt"])
+    saved = _Saved(robot, dict(tasks), used, given, content["dt"])
     if source is None:
         saved = _check_written(saved, content)
     write_text(path, _with_packed_step(json.dumps(content, indent=1), saved))
 
 
-def _with_packed_step(text: str, saved: Controller) -> str:
+def _with_packed_step(text: str, saved: _Saved) -> str:
     """Return the file's text with its last two entries: the step for programs without Python, and a checksum."""
     step = packed_section(saved.robot, saved.tasks, saved.scheme, saved.limits, saved.dt)
     text = f'{text[:-2]},\n "core": {json.dumps(step, ensure_ascii=False)}'
@@ -121,7 +114,7 @@ def _checksum(text: str) -> str:
 
 
 def load_controller(path: str | os.PathLike[str]) -> Controller:
-    """Return the controller that ``save_controller`` wrote.
+    """Return the controller that ``save_controller`` wrote; it unpacks to the arguments of ``solve``.
 
     Raises:
         FileNotFoundError: no such file, or the robot's file is not where it was.
@@ -141,7 +134,8 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         raise OsikValueError(f"{path} cannot be loaded: {said}") from problem
     except Exception as problem:  # whatever an edited file leads the constructors to
         raise OsikValueError(f"{path} cannot be loaded: {problem}") from problem
-    return found
+    robot, tasks, scheme, limits, dt = found
+    return Controller(robot, tasks, scheme=scheme, limits=limits, dt=dt)
 
 
 def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -163,7 +157,7 @@ def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
     return content
 
 
-def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
+def _made(content: Mapping[str, Any], robot: Robot) -> _Saved:
     """Return the controller of a file's content, with its robot."""
     if content["format"] == _OLDER:
         content = {
@@ -172,7 +166,7 @@ def _made(content: Mapping[str, Any], robot: Robot) -> Controller:
     tasks, scheme, limits = decode_parts(content, robot)
     # a scheme's constructor takes no robot, so it does not know the robot's precision
     scheme = jax.tree.map(lambda number: number.astype(robot.q0.dtype), scheme)
-    return Controller(robot, tasks, scheme, limits, content["dt"])
+    return _Saved(robot, tasks, scheme, limits, content["dt"])
 
 
 def _source(robot: Robot, source: str | os.PathLike[str] | None) -> dict[str, Any]:
@@ -196,7 +190,7 @@ def _array_data(array: np.ndarray) -> dict[str, Any]:
     return {"array": array.tolist(), "shape": array.shape, "dtype": str(array.dtype)}
 
 
-def _check_written(saved: Controller, content: Mapping[str, Any]) -> Controller:
+def _check_written(saved: _Saved, content: Mapping[str, Any]) -> _Saved:
     """Return the controller read from the content; raise ValueError if its step differs.
 
     Locked joints and fused bodies are written as one body, so masses, shapes and numbers of bodies may differ. What
