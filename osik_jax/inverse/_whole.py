@@ -104,10 +104,12 @@ _carried = jax.jit(carried, static_argnames="frames")
 
 
 def _shift(key: Any, dimensions: int) -> Array:
-    return _shift_of(int(key), dimensions) if isinstance(key, int | np.integer) else shift_of(key, dimensions)
+    if isinstance(key, int | np.integer):
+        return _shift_of(key=int(key), dimensions=dimensions)
+    return shift_of(key, dimensions)
 
 
-_shift_of = lru_cache(shift_of)
+_shift_of = remembered(shift_of)
 
 
 @lru_cache

@@ -14,11 +14,16 @@ _MOST = 32
 """Results that are kept; each keeps its arguments, too, so that no other object has their place in memory."""
 
 
+def holds_tracer(tree: Any) -> bool:
+    """Return whether a leaf of a pytree is traced."""
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with its last results kept, for the same positional objects and equal keyword arguments.
 
     The positional arguments are compared by identity: flattening a robot costs more than a search. They must not be
-    changed in place. Keyword arguments are hashable. A result that is None is not kept.
+    changed in place. Keyword arguments are hashable. A result that is None, or made while tracing, is not kept.
     """
     kept: OrderedDict[Any, tuple[tuple[Any, ...], Any]] = OrderedDict()
 
@@ -29,7 +34,7 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
         if found is not None:
             return found[1]
         result = function(*objects, **static)
-        if result is not None:
+        if result is not None and not holds_tracer(result):
             kept[key] = objects, result
             while len(kept) > _MOST:
                 kept.popitem(last=False)
@@ -41,4 +46,4 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
 @remembered
 def hold_numbers(*objects: Any) -> bool | None:
     """Return True if no number of the objects is traced, else None."""
-    return None if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(objects)) else True
+    return None if holds_tracer(objects) else True

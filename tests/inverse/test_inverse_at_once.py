@@ -103,3 +103,17 @@ def test_a_solution_of_a_further_search_is_judged_at_its_configuration():
     explored = Explored(found, Outcomes(jnp.zeros((3, 2, 2)), Errors(*[score] * 4)), isolated)  # pyright: ignore
     alone = _run.isolated_at_answers(planar, goals, settings, explored, route=route)
     assert alone.tolist() == [True, False, False]
+
+
+def test_what_a_trace_has_made_is_not_kept_for_later_calls():
+    """Limits of a robot that are first read inside jit, then by a plain call with the same objects."""
+    planar = osik.Robot.from_mjcf(mjcf("two_links_with_a_tip"))
+    limits = (osik.ConfigurationLimit(planar, lower=jnp.full(2, -1.5), upper=jnp.full(2, 1.5)),)
+
+    def find(position):
+        return osik.inverse_kinematics(planar, {"tip": position}, limits=limits, seeds=4, closest=False)
+
+    target = np.array([0.7, 0.3, 0.0])
+    traced, plain = jax.jit(find)(target), find(target)
+    assert traced.converged and plain.converged
+    assert jnp.abs(plain.q).max() <= 1.5
