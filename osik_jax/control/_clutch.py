@@ -98,8 +98,9 @@ class Clutch(Replaceable):
 
 @jax.jit
 def _step(clutch: _Own, engaged: Array, device: PoseLike, frame: PoseLike) -> tuple[_Own, Pose]:
-    device, frame = (as_pose(pose, clutch.scale.dtype) for pose in (device, frame))
-    tracked = jnp.isfinite(device[0]).all() & jnp.isfinite(device[1]).all()
+    held: Pose = as_pose(device, clutch.scale.dtype)
+    device, frame = held, as_pose(frame, clutch.scale.dtype)
+    tracked = jnp.isfinite(held[0]).all() & jnp.isfinite(held[1]).all()
     pressed, device = engaged & tracked, _choose(tracked, device, clutch.device)
     here = _choose(_is_at_rest(frame, clutch.frame), clutch.target, frame)
     anchor = _choose(pressed != clutch.engaged, here, clutch.anchor)

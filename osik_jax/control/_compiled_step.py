@@ -39,8 +39,8 @@ from ..tasks._rows import rows_of
 from ..tasks._task import GIVEN, POSTURE, CoreCard
 from ._solution import Solution
 
-SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
-_LIMITS = (*SIMPLE_LIMITS, AccelerationLimit)
+_SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
+_LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
 
@@ -389,7 +389,7 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    if not (q.dtype == jnp.float64 and all(type(limit) in SIMPLE_LIMITS for limit in limits)):
+    if not (q.dtype == jnp.float64 and all(type(limit) in _SIMPLE_LIMITS for limit in limits)):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from ..kinematics import integrate
 from ..kinematics._manifold import plain_integration
-from ..limits import Limits
+from ..limits import Limit, Limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
@@ -73,7 +73,7 @@ class Controller:
         dt: float = 0.005,
     ) -> None:
         check_setting("Controller(robot, tasks)", robot, scheme, dt)
-        self.limits = checked_limits(robot, limits) or ()
+        self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
         check_tasks(tasks, robot)
         warn_of_large_gains(tasks, dt)
         warn_of_ignored_priorities(scheme, tasks)
@@ -107,7 +107,7 @@ class Controller:
         values = plain_configuration(self.robot, q)
         self._checked = q, values
         if self._plain is not None and values is not None:
-            found = self._plain.solve(values, self.tasks, targets or {}, self.dt, None)
+            found = self._plain.solve(self.robot, values, self.tasks, self.scheme, self.limits, self.dt, targets or {})
             if found is None:  # another structure of tasks
                 check_tasks(self.tasks, self.robot)
                 self._plain = plain_step(self.robot, self.tasks, self.scheme, self.limits, self.dt)

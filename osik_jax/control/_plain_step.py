@@ -6,8 +6,9 @@ they are recognised by their identity, and only the configuration and what is ne
 
 from __future__ import annotations
 
+import operator
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from itertools import chain
 from typing import Any
@@ -18,26 +19,26 @@ import numpy as np
 from jax.core import Tracer
 
 from ..core._plain import functions
-from ..limits import Limit, Limits, with_own_limits
+from ..limits import Limits, with_own_limits
 from ..robot import Robot
 from ..schemes import HierarchicalQP, Scheme, WeightedQP
 from ..schemes._default import scheme_for
 from ..solvers.hqp import WorkingSet
 from ..tasks import Task
-from ._checks import LARGEST_GAIN, checked_limits, plain_configuration
-from ._compiled_step import SIMPLE_LIMITS, is_compiled
+from ._checks import LARGEST_GAIN, plain_configuration
+from ._compiled_step import is_compiled
 from ._packed_step import missing_part, pack
 from ._solution import Solution
 
 _MOST = 32
 """Number of steps that are kept; each has its workspace in the core, some hundred kilobytes."""
-_kept: dict[tuple[Any, ...], tuple[Checked, Any]] = {}
-"""Steps, with the objects by whose identity each is found: they have to live as long."""
+_kept: dict[tuple[Any, ...], Checked] = {}
 
 
-def kept_step(robot: Robot, tasks: Any, scheme: Any, limits: Any) -> Checked | None:
-    """Return what is kept for the same robot, scheme and limits, and for tasks of the same names, if anything."""
-    return _kept.get(_key(robot, tasks, scheme, limits), (None,))[0] if type(tasks) is dict else None
+def kept_step(robot: Any, tasks: Any, scheme: Any, limits: Any) -> Checked | None:
+    """Return what is kept for arguments of the same structure, if anything."""
+    known = isinstance(robot, Robot) and type(tasks) is dict
+    return _kept.get(_key(robot, tasks, scheme, limits)) if known else None
 
 
 def keep_step(
@@ -47,33 +48,36 @@ def keep_step(
     if _is_traced((robot, q, dict(tasks), scheme, limits, dt)) or robot.q0.dtype != jnp.result_type(float):
         return None
     key = _key(robot, tasks, scheme, limits)
-    step = _kept[key][0] if key in _kept else None
+    step = _kept.get(key)
     if step is None or not step.fits(tasks):
         while len(_kept) >= _MOST:
             _kept.pop(next(iter(_kept)))
         with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
-            step = plain_step(robot, tasks, scheme, checked_limits(robot, limits), dt) or Checked(tasks)
-        _kept[key] = step, (robot, scheme, tuple(limits) if isinstance(limits, tuple | list) else limits)
+            step = plain_step(robot, tasks, scheme, limits, dt) or Checked(robot, tasks, scheme, limits)
+        _kept[key] = step
     return step
 
 
 def _key(robot: Robot, tasks: Mapping[str, Task], scheme: Any, limits: Any) -> tuple[Any, ...]:
-    """Return what a step is found by; limits that the core does not have change from step to step."""
-    given = limits if isinstance(limits, tuple | list) else (limits,)
-    of_limits = [id(limit) if limit is None or type(limit) in SIMPLE_LIMITS else type(limit) for limit in given]
-    return id(robot), id(scheme), *of_limits, jax.config.jax_enable_x64, *tasks  # pyright: ignore[reportAttributeAccessIssue]
+    of_scheme = None if scheme is None else jax.tree.structure(scheme)
+    return robot.tree, of_scheme, *map(type, _given(limits)), jax.config.jax_enable_x64, *tasks  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _given(limits: Any) -> Sequence[Any]:
+    return () if limits is None else limits if isinstance(limits, tuple | list) else (limits,)
 
 
 def plain_step(
-    robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: tuple[Limit, ...] | None, dt: Any
+    robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any, dt: Any
 ) -> PlainStep | None:
     """Return the step for checked arguments, none of them traced; None if the core has none."""
     if jnp.result_type(float) != np.float64:
         return None
-    chosen, bounds = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme, with_own_limits(robot, limits)
+    chosen = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+    bounds = with_own_limits(robot, _given(limits))
     if not is_compiled(robot, robot.q0, dict(tasks), chosen, bounds, np.float64(dt), None):
         return None
-    return None if missing_part(robot, tasks, chosen, bounds) else PlainStep(robot, tasks, chosen, bounds, float(dt))
+    return None if missing_part(robot, tasks, chosen, bounds) else PlainStep(robot, tasks, scheme, limits, float(dt))
 
 
 def _is_traced(tree: Any) -> bool:
@@ -81,20 +85,27 @@ def _is_traced(tree: Any) -> bool:
 
 
 class Checked:
-    """Tasks that were checked, recognised by their identity.
+    """Arguments that were checked, recognised by their identity.
 
     Args:
+        robot: the robot.
         tasks: by name.
+        scheme: how they share the robot, None for the default.
+        limits: beside the robot's own, as they are given.
     """
 
-    def __init__(self, tasks: Mapping[str, Task]) -> None:
-        self._seen = dict(tasks)
+    def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any) -> None:
+        self._seen, self._scheme, self._setting = dict(tasks), scheme, (robot, *_given(limits))
         self._look_at_gains()
 
-    def has_checked(self, tasks: Mapping[str, Task], dt: Any) -> bool:
-        """Return whether nothing but targets is new in the tasks, and dt is ordinary."""
+    def has_checked(self, robot: Robot, tasks: Mapping[str, Task], limits: Any, dt: Any) -> bool:
+        """Return whether nothing but targets and the scheme's numbers is new, and dt is ordinary."""
         same = all(self._seen[name] is task or _is_aimed(task, self._seen[name]) for name, task in tasks.items())
-        return same and isinstance(dt, float) and 0.0 < dt <= self._longest
+        return same and self._has(robot, limits) and isinstance(dt, float) and 0.0 < dt <= self._longest
+
+    def _has(self, robot: Robot, limits: Any) -> bool:
+        given = robot, *_given(limits)
+        return len(given) == len(self._setting) and all(map(operator.is_, given, self._setting))
 
     def fits(self, tasks: Mapping[str, Task]) -> bool:
         """Return whether ``solution`` takes these tasks."""
@@ -102,10 +113,19 @@ class Checked:
         return True
 
     def solution(
-        self, robot: Robot, q: Any, tasks: Mapping[str, Task], targets: Any, dt: Any, warm_start: Any
+        self,
+        robot: Robot,
+        q: Any,
+        tasks: Mapping[str, Task],
+        scheme: Any,
+        limits: Any,
+        dt: Any,
+        targets: Any,
+        warm_start: Any,
     ) -> Solution | None:
         """Return the solution as ``control.solve`` does, which has checked all but q; None if the core has it not."""
-        del robot, q, targets, dt, warm_start
+        del q, scheme, targets, dt, warm_start
+        self._setting = robot, *_given(limits)
         if any(self._seen[name] is not task for name, task in tasks.items()):
             self._seen = dict(tasks)
             self._look_at_gains()
@@ -124,8 +144,8 @@ class PlainStep(Checked):
     Args:
         robot: the robot.
         tasks: by name.
-        scheme: how they share the robot.
-        bounds: all limits.
+        scheme: how they share the robot, None for the default.
+        limits: beside the robot's own, as they are given.
         dt: time of a step [s].
 
     Attributes:
@@ -133,13 +153,15 @@ class PlainStep(Checked):
         unpacked: the same with NumPy's.
     """
 
-    def __init__(
-        self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float
-    ) -> None:
-        packed = pack(robot, tasks, scheme, bounds, dt)
-        _, q, numbered, _, _, of_dt, _ = packed.numbered
+    def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any, dt: float) -> None:
+        super().__init__(robot, tasks, scheme, limits)
+        self._default = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+        bounds = with_own_limits(robot, _given(limits))
+        packed = pack(robot, tasks, self._default, bounds, dt)
+        of_robot, q, numbered, of_scheme, of_limits, of_dt, _ = packed.numbered
         self._q, self._of_dt, self._dt = packed.place(q), packed.place(of_dt), dt
-        super().__init__(tasks)
+        self._parts, self._of_scheme = _places(packed, (of_robot, of_limits)), _places(packed, of_scheme)
+        self._structure, self._own = jax.tree.structure((robot, bounds)), bounds[len(_given(limits)) :]
         self._leaves = {name: _places(packed, task) for name, task in numbered.items()}
         self._targets = {name: _places(packed, getattr(task, "target", None)) for name, task in numbered.items()}
         self._structures = {name: jax.tree.structure(task) for name, task in tasks.items()}
@@ -148,9 +170,8 @@ class PlainStep(Checked):
         self._result = np.zeros(robot.nv + 2 + 2 * packed.rows.rows)
         sizes = [int(np.prod(shape)) for shape in self._labels]
         self._guess, self._integers = np.zeros(sum(sizes), np.int32), np.zeros(3 + sum(sizes), np.int32)
-        structure = _structure(tuple(sorted(tasks)), type(scheme))
-        self.unpacked = partial(_unpacked, structure, *_leaf_places(robot.nv, packed.rows.count, self._labels))
-        self.as_arrays = jax.jit(self.unpacked)
+        counts = tuple(sorted(packed.rows.count.items()))
+        self.unpacked, self.as_arrays = _makers(type(self._default), robot.nv, counts, tuple(self._labels))
         self._free = functions().free  # while the process ends, modules are gone before objects
         self._handle = functions().new(packed.layout.ctypes.data, len(packed.layout))
         if not self._handle:
@@ -170,25 +191,46 @@ class PlainStep(Checked):
         return all(jax.tree.structure(task) == self._structures[name] for name, task in tasks.items())
 
     def solution(
-        self, robot: Robot, q: Any, tasks: Mapping[str, Task], targets: Any, dt: Any, warm_start: Any
+        self,
+        robot: Robot,
+        q: Any,
+        tasks: Mapping[str, Task],
+        scheme: Any,
+        limits: Any,
+        dt: Any,
+        targets: Any,
+        warm_start: Any,
     ) -> Solution | None:
         """Return the solution as ``control.solve`` does, which has checked all but q; None if a number is traced."""
         values = None if isinstance(dt, Tracer) else plain_configuration(robot, q)
         if values is None:
             return None
-        found = self.solve(values, tasks, targets or {}, float(dt), warm_start)
+        found = self.solve(robot, values, tasks, scheme, limits, float(dt), targets or {}, warm_start)
         return None if found is None else self.as_arrays(*found)
 
     def solve(
-        self, q: np.ndarray, tasks: Mapping[str, Task], targets: Mapping[str, Any], dt: float, warm_start: Any
+        self,
+        robot: Robot,
+        q: np.ndarray,
+        tasks: Mapping[str, Task],
+        scheme: Any,
+        limits: Any,
+        dt: float,
+        targets: Mapping[str, Any],
+        warm_start: Any = None,
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return numbers and integers of the answer; None where structures differ, or numbers are traced.
 
+        Robot, tasks, scheme and limits that are new are copied.
+
         Args:
+            robot: the robot.
             q: a checked configuration. (nq,)
-            tasks: by name; those that are new are copied.
-            targets: of some tasks, as ``replace(target=...)`` takes them.
+            tasks: by name.
+            scheme: None for the default.
+            limits: as they are given.
             dt: time of the step [s].
+            targets: of some tasks, as ``replace(target=...)`` takes them.
             warm_start: as in ``solve``.
 
         Raises:
@@ -203,6 +245,10 @@ class PlainStep(Checked):
         if guess and [np.shape(labels) for labels in guess] != self._labels:
             return None
         with self._lock:
+            if not (self._has(robot, limits) or self._takes_setting(robot, limits)):
+                return None
+            if scheme is not self._scheme and not self._takes_scheme(scheme):
+                return None
             if not all([self._seen[name] is task or self._takes(name, task) for name, task in tasks.items()]):
                 return None
             if dt != self._dt:
@@ -222,6 +268,34 @@ class PlainStep(Checked):
             task.replace(target=target)  # raises: the task has none
         return jax.tree.leaves(type(task)._convert(task, "target", target))
 
+    def _takes_setting(self, robot: Robot, limits: Any) -> bool:
+        """Copy the numbers of robot and limits; return whether they have the structure that was laid out."""
+        given = _given(limits)
+        if robot is not self._setting[0]:
+            self._own = with_own_limits(robot, given)[len(given) :]
+        leaves, structure = jax.tree.flatten((robot, (*given, *self._own)))
+        if structure != self._structure or not self._fill(self._parts, leaves):
+            return False
+        self._setting = robot, *_given(limits)
+        return True
+
+    def _takes_scheme(self, scheme: Scheme) -> bool:
+        """Copy the numbers of a scheme, whose structure is known; return whether none is traced."""
+        if not self._fill(self._of_scheme, jax.tree.leaves(scheme)):
+            return False
+        self._scheme = scheme
+        return True
+
+    def _fill(self, places: Sequence[slice], leaves: Sequence[Any]) -> bool:
+        """Copy numbers to their places; return whether they have the sizes of these, and none is traced."""
+        sizes = [place.stop - place.start for place in places]
+        if [np.size(leaf) for leaf in leaves] != sizes or _is_traced(leaves):
+            return False
+        for place, leaf in zip(places, leaves, strict=True):
+            self._put(place, leaf)
+        self._clean = not np.isnan(self._numbers).any()
+        return True
+
     def _takes(self, name: str, task: Task) -> bool:
         """Copy the numbers of a task; return whether it has the structure of the one that was laid out."""
         if _is_aimed(task, self._seen[name]):
@@ -230,12 +304,9 @@ class PlainStep(Checked):
             places, (leaves, structure) = self._leaves[name], jax.tree.flatten(task)
             if structure != self._structures[name]:
                 return False
-        sizes = [place.stop - place.start for place in places]
-        if [np.size(leaf) for leaf in leaves] != sizes or _is_traced(leaves):
+        if not self._fill(places, leaves):
             return False
-        for place, leaf in zip(places, leaves, strict=True):
-            self._put(place, leaf)
-        self._seen[name], self._clean = task, not np.isnan(self._numbers).any()
+        self._seen[name] = task
         self._look_at_gains()
         return True
 
@@ -297,8 +368,20 @@ def _leaf_places(
 
 
 @cache
-def _structure(names: tuple[str, ...], scheme: type[Scheme]) -> Any:
-    """Return the tree of a solution: making it by its constructor takes as long as the step."""
+def _makers(
+    scheme: type[Scheme], nv: int, rows: tuple[tuple[str, int], ...], labels: tuple[tuple[int, ...], ...]
+) -> tuple[Callable[..., Solution], Callable[..., Solution]]:
+    """Return the functions from the core's results to a solution, with NumPy's arrays and with JAX's.
+
+    Args:
+        scheme: class of the scheme.
+        nv: length of the velocity.
+        rows: names of the tasks in their order, with the number of rows of each.
+        labels: shapes of the warm start's arrays.
+    """
     warm_start = {HierarchicalQP: WorkingSet(0, 0), WeightedQP: 0}.get(scheme)  # pyright: ignore[reportArgumentType]
-    by_name = dict.fromkeys(names, 0)
-    return jax.tree.structure(Solution(0, 0, 0, 0, 0, 0, by_name, by_name, warm_start))  # pyright: ignore[reportArgumentType]
+    by_name = dict.fromkeys(dict(rows), 0)
+    # a solution is made from its leaves, because its constructor takes as long as the step
+    structure = jax.tree.structure(Solution(0, 0, 0, 0, 0, 0, by_name, by_name, warm_start))  # pyright: ignore[reportArgumentType]
+    unpacked = partial(_unpacked, structure, *_leaf_places(nv, dict(rows), labels))
+    return unpacked, jax.jit(unpacked)

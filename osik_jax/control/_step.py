@@ -98,7 +98,7 @@ def solve(
             ``DampingTask`` beneath tasks that leave its joints no freedom.
     """
     plain = kept_step(robot, tasks, scheme, limits)
-    if plain is None or not plain.has_checked(tasks, dt):
+    if plain is None or not plain.has_checked(robot, tasks, limits, dt):
         check_setting("solve(robot, q, tasks)", robot, scheme, dt)
         checked_limits(robot, limits)
         check_tasks(tasks, robot)
@@ -108,7 +108,7 @@ def solve(
         plain = keep_step(robot, q, tasks, scheme, limits, dt)
     check_target_names(tasks, targets)
     check_warm_start(warm_start)
-    found = None if plain is None else plain.solution(robot, q, tasks, targets, dt, warm_start)
+    found = None if plain is None else plain.solution(robot, q, tasks, scheme, limits, dt, targets, warm_start)
     if found is not None:
         return found
     q = checked_configuration(robot, q)

@@ -106,6 +106,16 @@ def test_new_numbers_and_new_structures_are_seen(arm: osik.Robot) -> None:
         wanted = compiled(arm, q, tasks)
         assert_same(osik.solve(arm, q, tasks, dt=DT), wanted)
         np.testing.assert_allclose(controller.step(q).velocity, wanted.velocity, atol=1e-9)
+    scheme, limits = osik.HierarchicalQP(damping=1e-3), (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
+    longer = arm.scaled(length={"link3": 1.2})
+    variants: list[tuple[osik.Robot, Any]] = [
+        (arm, {"scheme": scheme}),
+        (arm, {"limits": limits}),
+        (longer, {}),
+        (arm, {}),
+    ]
+    for robot, options in variants:
+        assert_same(osik.solve(robot, q, tasks, dt=DT, **options), compiled(robot, q, tasks, **options))
     for dt in (0.02, np.float64(0.003), jax.numpy.asarray(0.004)):
         wanted = jax.jit(lambda q, dt, tasks=tasks: osik.solve(arm, q, tasks, dt=dt))(q, dt)
         np.testing.assert_allclose(osik.solve(arm, q, tasks, dt=dt).velocity, wanted.velocity, atol=1e-9)
