@@ -20,6 +20,7 @@ from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
 from ..kinematics import forward_kinematics
 from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
+from ..numerics._host import float_now
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._made_for import check_made_for, check_robot
@@ -50,7 +51,7 @@ def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
 
 def _check_precision(robot: Robot) -> None:
     """Raise ValueError for a float64 robot in single precision; warn of a float32 robot in double precision."""
-    own, now = robot.q0.dtype, jnp.result_type(float)
+    own, now = robot.q0.dtype, float_now()
     if own == now:
         return
     cure = "take robot.astype(float), or load it again, and make tasks, limits and scheme after that"
@@ -91,8 +92,8 @@ def check_dt(dt: Any) -> None:
     seen = concrete(dt)
     if seen is not None and seen.dtype.kind not in "iuf":
         raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
-    if jnp.shape(dt) != ():
-        raise OsikValueError(f"dt has shape {jnp.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
+    if np.shape(dt) != ():
+        raise OsikValueError(f"dt has shape {np.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
     if seen is None:
         return
     if not ((seen > 0.0) & np.isfinite(seen)).all():

@@ -14,12 +14,12 @@ from itertools import chain
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 from ..core._plain import functions
 from ..limits import Limits, with_own_limits
+from ..numerics._host import float_now
 from ..robot import Robot
 from ..schemes import HierarchicalQP, Scheme, WeightedQP
 from ..schemes._default import scheme_for
@@ -45,7 +45,7 @@ def keep_step(
     robot: Robot, q: Any, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Limits | None, dt: Any
 ) -> Checked | None:
     """Return a step of the core for checked arguments, and keep it, or that all was checked; None if traced."""
-    if _is_traced((robot, q, dict(tasks), scheme, limits, dt)) or robot.q0.dtype != jnp.result_type(float):
+    if _is_traced((robot, q, dict(tasks), scheme, limits, dt)) or robot.q0.dtype != float_now():
         return None
     key = _key(robot, tasks, scheme, limits)
     step = _kept.get(key)
@@ -71,7 +71,7 @@ def plain_step(
     robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any, dt: Any
 ) -> PlainStep | None:
     """Return the step for checked arguments, none of them traced; None if the core has none."""
-    if jnp.result_type(float) != np.float64:
+    if float_now() != np.float64:
         return None
     chosen = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
     bounds = with_own_limits(robot, _given(limits))

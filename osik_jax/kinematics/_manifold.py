@@ -19,6 +19,7 @@ from .._errors import OsikValueError
 from ..core import _library
 from ..core._plain import functions
 from ..execution._platform import cuda_is_default
+from ..numerics._host import float_now
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._made_for import check_robot
@@ -60,7 +61,7 @@ def integrate(
 def _is_plain(numbers: Any) -> bool:
     """Return whether these are numbers in double precision, on the host and not traced."""
     kind = isinstance(numbers, jax.Array | np.ndarray) and not isinstance(numbers, Tracer)
-    return kind and numbers.dtype == np.float64 == jnp.result_type(float) and not cuda_is_default()
+    return kind and numbers.dtype == np.float64 == float_now() and not cuda_is_default()
 
 
 @jax.jit

@@ -18,6 +18,11 @@ else:
 """An array of JAX, or of NumPy for what is computed on the host."""
 
 
+def float_now() -> np.dtype:
+    """Return the type of JAX's floats, ``jnp.result_type(float)``, which takes longer to ask."""
+    return np.dtype(np.float64 if jax.config.jax_enable_x64 else np.float32)  # pyright: ignore[reportAttributeAccessIssue]
+
+
 def module_of(array: Any) -> ModuleType:
     """Return ``numpy`` for NumPy's arrays and numbers, else ``jax.numpy``: one text serves the host and programs."""
     return np if isinstance(array, np.ndarray | np.generic) else jnp

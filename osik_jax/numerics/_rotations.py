@@ -33,10 +33,13 @@ def _exact(function: Callable[[Any], _Result], given: Numbers, what: str, right:
     """
     if isinstance(given, Tracer):
         return jax.jit(function)(given)[0]
-    with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+    with np.errstate(all="ignore"):
         out, valid = function(np.asarray(given))
-        _refuse(valid, given, what, right)
-        return out if isinstance(given, np.ndarray) else to_jax(out)
+    _refuse(valid, given, what, right)
+    if isinstance(given, np.ndarray):
+        return out
+    with jax.ensure_compile_time_eval():
+        return to_jax(out)
 
 
 def exact_quaternion(given: Float[Numbers, "*B 4"], what: str) -> Float[Numbers, "*B 4"]:
