@@ -7,11 +7,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num
+from jax.core import Tracer
+from jaxtyping import ArrayLike, Float, Num
 
+from .._errors import OsikTypeError
 from ..kinematics import integrate
 from ..kinematics._manifold import plain_integration
 from ..limits import Limit, Limits
+from ..numerics._host import is_traced
 from ..robot import Robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
@@ -27,7 +30,7 @@ from ._checks import (
     warn_of_ignored_priorities,
     warn_of_large_gains,
 )
-from ._plain_step import plain_step
+from ._plain_step import Checked, plain_step
 from ._rollout import remembering
 from ._solution import Solution
 from ._step import Targets, Tasks, aim, in_type_of, step
@@ -39,8 +42,8 @@ class Controller:
     It computes what ``solve`` computes. Tasks, limits and schemes that the core does not have run in a compiled
     program, which takes seconds at the first step and more time at each.
 
-    The numbers of a task may change: ``controller.tasks["hand"] = controller.tasks["hand"].replace(weight=2.0)``.
-    A controller belongs to one thread at a time, and is not for use inside ``jit``: there is ``solve``.
+    Tasks may be exchanged: ``controller.tasks["hand"] = controller.tasks["hand"].replace(weight=2.0)``. A controller
+    belongs to one thread at a time, and is not for use inside ``jit``: there is ``solve``.
 
     Args:
         robot: the robot.
@@ -73,21 +76,26 @@ class Controller:
         dt: float = 0.005,
     ) -> None:
         check_setting("Controller(robot, tasks)", robot, scheme, dt)
-        self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
         check_tasks(tasks, robot)
-        warn_of_large_gains(tasks, dt)
-        warn_of_ignored_priorities(scheme, tasks)
-        warn_of_idle_tasks(robot, robot.q0, tasks, scheme)
         self.robot, self.tasks, self.dt = robot, dict(tasks), float(dt)
-        self.scheme = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
-        self._plain = plain_step(robot, self.tasks, self.scheme, self.limits, self.dt)
+        self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
+        self._chooses, self._started = scheme is None, False
         self._velocity: Any = None
-        self._checked: tuple[Any, Any] = None, None
-        self._started = False
+        self.scheme = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+        self._lay_out()
 
     def __iter__(self) -> Iterator[Any]:
         """Iterate over robot, tasks, scheme, limits and dt, the arguments of ``solve`` and ``rollout``."""
         return iter((self.robot, self.tasks, self.scheme, self.limits, self.dt))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy has; it lays out its step itself."""
+        return vars(self) | {"tasks": dict(self.tasks), "_plain": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make a copy of a controller."""
+        vars(self).update(state)
+        self._lay_out()
 
     def step(self, q: Num[ArrayLike, " nq"] | Sequence[float], targets: Targets | None = None) -> Solution:
         """Return the solution of a step at q, with NumPy's arrays.
@@ -97,25 +105,30 @@ class Controller:
             targets: of some tasks in this step, by name, as in ``solve``; the others keep theirs.
 
         Raises:
-            KeyError, TypeError, ValueError: as in ``solve``.
+            KeyError, TypeError, ValueError: as in ``solve``; TypeError also inside ``jit``.
         """
         if targets:
             check_target_names(self.tasks, targets)
+        if isinstance(q, Tracer) or (targets and is_traced(targets)):
+            raise OsikTypeError("a Controller's step is for numbers, not inside jit or vmap: there is osik_jax.solve")
         if not self._started:
             checked_start(self.robot, q)
             self._started = True
+        if not self._checked.has_checked(self.robot, self.tasks, self.limits, self.dt):
+            self._lay_out()
         values = plain_configuration(self.robot, q)
-        self._checked = q, values
         if self._plain is not None and values is not None:
             found = self._plain.solve(self.robot, values, self.tasks, self.scheme, self.limits, self.dt, targets or {})
-            if found is None:  # another structure of tasks
-                check_tasks(self.tasks, self.robot)
-                self._plain = plain_step(self.robot, self.tasks, self.scheme, self.limits, self.dt)
-                return self.step(q, targets)
-            return self._plain.unpacked(*found)
-        answer = self._compiled(checked_configuration(self.robot, q), targets)
+            if found is not None:
+                self._velocity = found[0][: self.robot.nv]
+                return self._plain.unpacked(*found)
+            self._lay_out()  # of another scheme
+        tasks = aim(dict(self.tasks), targets)
+        tasks, limits = remembering((tasks, self.limits), self._velocity, True)
+        at = checked_configuration(self.robot, q)
+        answer = step(self.robot, at, tasks, self.scheme, limits, in_type_of(self.dt, at))
         self._velocity = answer.velocity
-        return jax.tree.map(np.asarray, answer)
+        return jax.tree.map(np.array, answer)
 
     def integrate(
         self, q: Num[ArrayLike, " nq"] | Sequence[float], velocity: Num[ArrayLike, " nv"] | Sequence[float]
@@ -125,20 +138,29 @@ class Controller:
         Raises:
             ValueError: q or the velocity has the wrong length, or q is not finite.
         """
-        at, values = self._checked
-        v = np.asarray(velocity)
-        if at is not q:
-            values = plain_configuration(self.robot, q)
-        if self._plain is None or values is None or v.shape != (self.robot.nv,) or v.dtype != np.float64:
-            return np.asarray(integrate(self.robot, q, velocity, self.dt))
-        return plain_integration(self.robot.tree)(values, v * self.dt)
+        at, v, tree = np.asarray(q), np.asarray(velocity), self.robot.tree
+        if self._plain is not None and (at.shape, v.shape) == ((tree.nq,), (tree.nv,)) and at.dtype == v.dtype == float:
+            found = plain_integration(tree)(at, v * self.dt)
+            if found @ found < np.inf:
+                return found
+        return np.asarray(integrate(self.robot, q, velocity, self.dt))
 
     def forget(self) -> None:
         """Forget the last velocity, as before the first step: limits and tasks that remember it begin anew."""
         self._velocity = None
 
-    def _compiled(self, q: Array, targets: Targets | None) -> Solution:
+    def _lay_out(self) -> None:
+        """Check the tasks, and lay out the step for the core where their structure is new."""
+        check_setting("Controller", self.robot, self.scheme, self.dt)
         check_tasks(self.tasks, self.robot)
-        todo = aim(dict(self.tasks), targets)
-        todo, limits = remembering((todo, self.limits), self._velocity, True)
-        return step(self.robot, q, todo, self.scheme, limits, in_type_of(self.dt, q))
+        if self._chooses:
+            chosen = scheme_for(self.tasks, self.robot.q0.dtype)
+            self.scheme = self.scheme if type(chosen) is type(self.scheme) else chosen
+        warn_of_large_gains(self.tasks, self.dt)
+        warn_of_ignored_priorities(self.scheme, self.tasks)
+        warn_of_idle_tasks(self.robot, self.robot.q0, self.tasks, self.scheme)
+        plain = getattr(self, "_plain", None)
+        known = plain is not None and plain.is_of(self.tasks, self.scheme)
+        given = self.robot, self.tasks, self.scheme, self.limits
+        self._plain = plain if known else plain_step(*given, self.dt)
+        self._checked = Checked(*given)

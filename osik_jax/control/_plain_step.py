@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import operator
 import threading
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, partial
-from itertools import chain
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -18,8 +18,8 @@ import numpy as np
 from jax.core import Tracer
 
 from ..core._plain import functions
-from ..limits import Limits, with_own_limits
-from ..numerics._host import float_now
+from ..limits import Limit, NoLimits, with_own_limits
+from ..numerics._host import float_now, is_traced
 from ..robot import Robot
 from ..schemes import HierarchicalQP, Scheme, WeightedQP
 from ..schemes._default import scheme_for
@@ -30,40 +30,63 @@ from ._compiled_step import is_compiled
 from ._packed_step import missing_part, pack
 from ._solution import Solution
 
-_MOST = 32
+_MOST = 64
 """Number of steps that are kept; each has its workspace in the core, some hundred kilobytes."""
-_kept: dict[tuple[Any, ...], Checked] = {}
+_kept: OrderedDict[Any, Checked] = OrderedDict()
+"""Steps by the structure of their arguments, those used last at the end."""
+_lock = threading.Lock()
+_UNKNOWN = object()
+"""Stands for arguments whose numbers are being copied: an interrupted copy is made again."""
 
 
 def kept_step(robot: Any, tasks: Any, scheme: Any, limits: Any) -> Checked | None:
-    """Return what is kept for arguments of the same structure, if anything."""
-    known = isinstance(robot, Robot) and type(tasks) is dict
-    return _kept.get(_key(robot, tasks, scheme, limits)) if known else None
-
-
-def keep_step(
-    robot: Robot, q: Any, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Limits | None, dt: Any
-) -> Checked | None:
-    """Return a step of the core for checked arguments, and keep it, or that all was checked; None if traced."""
-    if _is_traced((robot, q, dict(tasks), scheme, limits, dt)) or robot.q0.dtype != float_now():
-        return None
+    """Return the step for arguments of this structure, None if there is none."""
     key = _key(robot, tasks, scheme, limits)
-    step = _kept.get(key)
-    if step is None or not step.fits(tasks):
-        while len(_kept) >= _MOST:
-            _kept.pop(next(iter(_kept)))
-        with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
-            step = plain_step(robot, tasks, scheme, limits, dt) or Checked(robot, tasks, scheme, limits)
-        _kept[key] = step
+    with _lock:
+        step = _kept.get(key)
+        if step is not None:
+            _kept.move_to_end(key)
     return step
 
 
-def _key(robot: Robot, tasks: Mapping[str, Task], scheme: Any, limits: Any) -> tuple[Any, ...]:
-    of_scheme = None if scheme is None else jax.tree.structure(scheme)
-    return robot.tree, of_scheme, *map(type, _given(limits)), jax.config.jax_enable_x64, *tasks  # pyright: ignore[reportAttributeAccessIssue]
+def keep_step(
+    robot: Robot,
+    q: Any,
+    tasks: Mapping[str, Task],
+    scheme: Scheme | None,
+    limits: tuple[Limit, ...] | None,
+    dt: Any,
+) -> Checked | None:
+    """Return a step for checked arguments, and keep it; None if a number is traced, or may be changed in place."""
+    key, numbers = _key(robot, tasks, scheme, limits), (robot, dict(tasks), scheme, limits)
+    if key is None or is_traced((q, dt)) or _is_open(numbers) or robot.q0.dtype != float_now():
+        return None
+    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
+        step = plain_step(robot, tasks, scheme, limits, dt) or Checked(robot, tasks, scheme, limits)
+    with _lock:
+        _kept[key] = step
+        if len(_kept) > _MOST:
+            _kept.popitem(last=False)
+    return step
+
+
+def _key(robot: Any, tasks: Any, scheme: Any, limits: Any) -> Any:
+    """Return the structure of the arguments, None where they are no arguments of ``solve`` or have none."""
+    if not isinstance(robot, Robot) or type(tasks) is not dict:
+        return None
+    if not (limits is None or isinstance(limits, tuple | list | NoLimits)):
+        return None
+    kinds = *map(type, _given(limits)), None if scheme is None else jax.tree.structure(scheme)
+    key = robot.tree, float_now(), *kinds, *tasks, *map(jax.tree.structure, tasks.values())
+    try:
+        hash(key)
+    except TypeError:  # of something static in a task
+        return None
+    return key
 
 
 def _given(limits: Any) -> Sequence[Any]:
+    """Return the limits beside the robot's own."""
     return () if limits is None else limits if isinstance(limits, tuple | list) else (limits,)
 
 
@@ -71,7 +94,7 @@ def plain_step(
     robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any, dt: Any
 ) -> PlainStep | None:
     """Return the step for checked arguments, none of them traced; None if the core has none."""
-    if float_now() != np.float64:
+    if float_now() != np.float64 or _is_open((robot, dict(tasks), scheme, limits)):
         return None
     chosen = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
     bounds = with_own_limits(robot, _given(limits))
@@ -80,8 +103,9 @@ def plain_step(
     return None if missing_part(robot, tasks, chosen, bounds) else PlainStep(robot, tasks, scheme, limits, float(dt))
 
 
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+def _is_open(tree: Any) -> bool:
+    """Return whether a number is traced, or of NumPy and so may change in place."""
+    return any(isinstance(leaf, Tracer | np.ndarray) for leaf in jax.tree.leaves(tree))
 
 
 class Checked:
@@ -95,22 +119,21 @@ class Checked:
     """
 
     def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any) -> None:
-        self._seen, self._scheme, self._setting = dict(tasks), scheme, (robot, *_given(limits))
+        self._seen: dict[str, Any] = dict(tasks)
+        self._scheme: Any = scheme
+        self._setting: tuple[Any, ...] = robot, *_given(limits)
         self._look_at_gains()
 
     def has_checked(self, robot: Robot, tasks: Mapping[str, Task], limits: Any, dt: Any) -> bool:
         """Return whether nothing but targets and the scheme's numbers is new, and dt is ordinary."""
+        if tasks.keys() != self._seen.keys() or not self._has(robot, limits):
+            return False
         same = all(self._seen[name] is task or _is_aimed(task, self._seen[name]) for name, task in tasks.items())
-        return same and self._has(robot, limits) and isinstance(dt, float) and 0.0 < dt <= self._longest
+        return same and isinstance(dt, float) and 0.0 < dt <= self._longest
 
     def _has(self, robot: Robot, limits: Any) -> bool:
         given = robot, *_given(limits)
         return len(given) == len(self._setting) and all(map(operator.is_, given, self._setting))
-
-    def fits(self, tasks: Mapping[str, Task]) -> bool:
-        """Return whether ``solution`` takes these tasks."""
-        del tasks
-        return True
 
     def solution(
         self,
@@ -123,13 +146,20 @@ class Checked:
         targets: Any,
         warm_start: Any,
     ) -> Solution | None:
-        """Return the solution as ``control.solve`` does, which has checked all but q; None if the core has it not."""
+        """Return the answer of ``solve``, which has checked all but q; None: it takes a program of JAX."""
         del q, scheme, targets, dt, warm_start
+        if _is_open((robot, dict(tasks), limits)):
+            return None
         self._setting = robot, *_given(limits)
         if any(self._seen[name] is not task for name, task in tasks.items()):
             self._seen = dict(tasks)
             self._look_at_gains()
         return None
+
+    def fits(self, tasks: Mapping[str, Task]) -> bool:
+        """Return whether tasks of the same structure have numbers of the sizes that are known."""
+        del tasks
+        return True
 
     def _look_at_gains(self) -> None:
         """Find the longest time of a step in which no gain is too large."""
@@ -159,9 +189,11 @@ class PlainStep(Checked):
         bounds = with_own_limits(robot, _given(limits))
         packed = pack(robot, tasks, self._default, bounds, dt)
         of_robot, q, numbered, of_scheme, of_limits, of_dt, _ = packed.numbered
-        self._q, self._of_dt, self._dt = packed.place(q), packed.place(of_dt), dt
+        self._q, self._of_dt = packed.place(q), packed.place(of_dt)
+        self._dt: Any = dt
         self._parts, self._of_scheme = _places(packed, (of_robot, of_limits)), _places(packed, of_scheme)
-        self._structure, self._own = jax.tree.structure((robot, bounds)), bounds[len(_given(limits)) :]
+        self._structure, self._scheme_structure = jax.tree.structure((robot, bounds)), jax.tree.structure(self._default)
+        self._own, self._own_robot = bounds[len(_given(limits)) :], robot
         self._leaves = {name: _places(packed, task) for name, task in numbered.items()}
         self._targets = {name: _places(packed, getattr(task, "target", None)) for name, task in numbered.items()}
         self._structures = {name: jax.tree.structure(task) for name, task in tasks.items()}
@@ -186,9 +218,15 @@ class PlainStep(Checked):
         if getattr(self, "_handle", None):
             self._free(self._handle)
 
+    def is_of(self, tasks: Mapping[str, Task], scheme: Scheme) -> bool:
+        """Return whether tasks and scheme have the structure that was laid out."""
+        same = {name: jax.tree.structure(task) for name, task in tasks.items()} == self._structures
+        return same and jax.tree.structure(scheme) == self._scheme_structure and self.fits(tasks)
+
     def fits(self, tasks: Mapping[str, Task]) -> bool:
-        """Return whether the tasks have the structure of those that were laid out."""
-        return all(jax.tree.structure(task) == self._structures[name] for name, task in tasks.items())
+        """Return whether tasks of the same structure have numbers of the sizes that were laid out."""
+        sizes = {name: [place.stop - place.start for place in places] for name, places in self._leaves.items()}
+        return {name: [np.size(leaf) for leaf in jax.tree.leaves(task)] for name, task in tasks.items()} == sizes
 
     def solution(
         self,
@@ -201,8 +239,9 @@ class PlainStep(Checked):
         targets: Any,
         warm_start: Any,
     ) -> Solution | None:
-        """Return the solution as ``control.solve`` does, which has checked all but q; None if a number is traced."""
-        values = None if isinstance(dt, Tracer) else plain_configuration(robot, q)
+        """Return the answer of ``solve``, which has checked all but q; None: it takes a program of JAX."""
+        is_program = isinstance(dt, Tracer) or jax.config.jax_disable_jit  # pyright: ignore[reportAttributeAccessIssue]
+        values = None if is_program else plain_configuration(robot, q)
         if values is None:
             return None
         found = self.solve(robot, values, tasks, scheme, limits, float(dt), targets or {}, warm_start)
@@ -252,14 +291,21 @@ class PlainStep(Checked):
             if not all([self._seen[name] is task or self._takes(name, task) for name, task in tasks.items()]):
                 return None
             if dt != self._dt:
-                self._numbers[self._of_dt] = self._dt = dt
+                self._dt = _UNKNOWN
+                self._numbers[self._of_dt] = dt
+                self._dt = dt
             self._numbers[self._q] = q
             if guess:
                 np.concatenate([np.asarray(labels).ravel() for labels in guess], out=self._guess, casting="unsafe")
-            aimed = [self._aimed(name, tasks[name], parts) for name, parts in aims.items()]
-            functions().step(*self._inputs, *(self._guesses if guess else (None, None)), self._clean, *self._results)
-            for place, own in chain(*aimed):
-                self._numbers[place] = own
+            guesses = self._guesses if guess else (None, None)
+            own: list[tuple[slice, np.ndarray]] = []
+            try:
+                for name, parts in aims.items():
+                    self._aim(name, tasks[name], parts, own)
+                functions().step(*self._inputs, *guesses, self._clean, *self._results)
+            finally:  # also where Ctrl-C ends the call
+                for place, numbers in own:
+                    self._numbers[place] = numbers
             return self._result.copy(), self._integers.copy()
 
     def _converted(self, name: str, task: Task, target: Any) -> list[Any]:
@@ -270,26 +316,30 @@ class PlainStep(Checked):
 
     def _takes_setting(self, robot: Robot, limits: Any) -> bool:
         """Copy the numbers of robot and limits; return whether they have the structure that was laid out."""
-        given = _given(limits)
-        if robot is not self._setting[0]:
-            self._own = with_own_limits(robot, given)[len(given) :]
-        leaves, structure = jax.tree.flatten((robot, (*given, *self._own)))
+        given, own = tuple(_given(limits)), self._own
+        if robot is not self._own_robot:
+            with jax.ensure_compile_time_eval():
+                own = with_own_limits(robot, given)[len(given) :]
+        leaves, structure = jax.tree.flatten((robot, (*given, *own)))
+        self._setting = (_UNKNOWN,)
         if structure != self._structure or not self._fill(self._parts, leaves):
             return False
-        self._setting = robot, *_given(limits)
+        self._own, self._own_robot, self._setting = own, robot, (robot, *given)
         return True
 
     def _takes_scheme(self, scheme: Scheme) -> bool:
-        """Copy the numbers of a scheme, whose structure is known; return whether none is traced."""
-        if not self._fill(self._of_scheme, jax.tree.leaves(scheme)):
+        """Copy the numbers of a scheme; return whether it has the structure that was laid out."""
+        leaves, structure = jax.tree.flatten(scheme)
+        self._scheme = _UNKNOWN
+        if structure != self._scheme_structure or not self._fill(self._of_scheme, leaves):
             return False
         self._scheme = scheme
         return True
 
     def _fill(self, places: Sequence[slice], leaves: Sequence[Any]) -> bool:
-        """Copy numbers to their places; return whether they have the sizes of these, and none is traced."""
+        """Copy numbers to their places; return whether they have the sizes of these, and stay as they are."""
         sizes = [place.stop - place.start for place in places]
-        if [np.size(leaf) for leaf in leaves] != sizes or _is_traced(leaves):
+        if [np.size(leaf) for leaf in leaves] != sizes or _is_open(leaves):
             return False
         for place, leaf in zip(places, leaves, strict=True):
             self._put(place, leaf)
@@ -304,33 +354,32 @@ class PlainStep(Checked):
             places, (leaves, structure) = self._leaves[name], jax.tree.flatten(task)
             if structure != self._structures[name]:
                 return False
+        self._seen[name] = _UNKNOWN
         if not self._fill(places, leaves):
             return False
         self._seen[name] = task
         self._look_at_gains()
         return True
 
-    def _aimed(self, name: str, task: Task, parts: Sequence[Any]) -> list[tuple[slice, np.ndarray]]:
-        """Put the parts of a target in their places; return these with the numbers that were there."""
-        before = []
+    def _aim(self, name: str, task: Task, parts: Sequence[Any], before: list[tuple[slice, np.ndarray]]) -> None:
+        """Put the parts of a target in their places, and those that were there into ``before``."""
         for place, part, own in zip(self._targets[name], parts, jax.tree.leaves(vars(task)["target"]), strict=True):
             if part is not own:
                 before.append((place, self._numbers[place].copy()))
                 self._put(place, part)
-        return before
 
     def _put(self, place: slice, part: Any) -> None:
         self._numbers[place] = np.asarray(part).ravel()  # NumPy's ravel would run JAX's
 
 
-def _is_aimed(task: Task, seen: Task) -> bool:
-    """Return whether a task is another one with nothing but another target."""
-    fields, before = vars(task), vars(seen)
-    if type(task) is not type(seen) or fields.keys() != before.keys() or fields.get("target") is None:
+def _is_aimed(task: Any, seen: Any) -> bool:
+    """Return whether a task is the one that was seen, with another target."""
+    if type(task) is not type(seen) or not isinstance(task, Task):
         return False
-    return before["target"] is not None and all(
-        before[name] is value or name == "target" for name, value in fields.items()
-    )
+    fields, before = vars(task), vars(seen)
+    if fields.keys() != before.keys() or fields.get("target") is None or before["target"] is None:
+        return False
+    return all(before[name] is value or name == "target" for name, value in fields.items())
 
 
 def _places(packed: Any, numbered: Any) -> list[slice]:
@@ -367,7 +416,7 @@ def _leaf_places(
     return of_numbers, of_labels
 
 
-@cache
+@lru_cache(maxsize=256)
 def _makers(
     scheme: type[Scheme], nv: int, rows: tuple[tuple[str, int], ...], labels: tuple[tuple[int, ...], ...]
 ) -> tuple[Callable[..., Solution], Callable[..., Solution]]:

@@ -100,12 +100,14 @@ def solve(
     plain = kept_step(robot, tasks, scheme, limits)
     if plain is None or not plain.has_checked(robot, tasks, limits, dt):
         check_setting("solve(robot, q, tasks)", robot, scheme, dt)
-        checked_limits(robot, limits)
+        limits = checked_limits(robot, limits)
         check_tasks(tasks, robot)
         warn_of_large_gains(tasks, dt)
         warn_of_ignored_priorities(scheme, tasks)
         warn_of_idle_tasks(robot, checked_configuration(robot, q), tasks, scheme)
-        plain = keep_step(robot, q, tasks, scheme, limits, dt)
+        plain = kept_step(robot, tasks, scheme, limits)
+        if plain is None or not plain.fits(tasks):
+            plain = keep_step(robot, q, tasks, scheme, limits, dt)
     check_target_names(tasks, targets)
     check_warm_start(warm_start)
     found = None if plain is None else plain.solution(robot, q, tasks, scheme, limits, dt, targets, warm_start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Callable, Sequence
 from ctypes import byref
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -61,7 +61,7 @@ def integrate(
 def _is_plain(numbers: Any) -> bool:
     """Return whether these are numbers in double precision, on the host and not traced."""
     kind = isinstance(numbers, jax.Array | np.ndarray) and not isinstance(numbers, Tracer)
-    return kind and numbers.dtype == np.float64 == float_now() and not cuda_is_default()
+    return kind and numbers.dtype == np.float64 == float_now() and not (cuda_is_default() or jax.config.jax_disable_jit)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @jax.jit
@@ -70,7 +70,7 @@ def _as_array(numbers: np.ndarray) -> Array:
     return numbers  # pyright: ignore[reportReturnType]
 
 
-@cache
+@lru_cache(maxsize=64)
 def plain_integration(tree: KinematicTree) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """Return the function from q and a velocity in unit time to the next configuration, by the core without XLA."""
     scalar_q, scalar_v, quaternions = layout(tree)

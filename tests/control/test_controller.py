@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import threading
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -108,6 +111,7 @@ def test_new_numbers_and_new_structures_are_seen(arm: osik.Robot) -> None:
         np.testing.assert_allclose(controller.step(q).velocity, wanted.velocity, atol=1e-9)
     scheme, limits = osik.HierarchicalQP(damping=1e-3), (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
     longer = arm.scaled(length={"link3": 1.2})
+    _plain_step._kept.clear()
     variants: list[tuple[osik.Robot, Any]] = [
         (arm, {"scheme": scheme}),
         (arm, {"limits": limits}),
@@ -179,6 +183,75 @@ def test_a_loop_is_a_rollout(arm: osik.Robot) -> None:
     np.testing.assert_allclose(controller.step(arm.q0).velocity, path.solution.velocity[0], atol=1e-9)
 
 
+def test_limits_of_any_iterable_hold(arm: osik.Robot) -> None:
+    slow = osik.VelocityLimit(arm, velocity={"*": 0.05})
+    for tasks in ({"hand": osik.FrameTask(arm, "hand")}, {"hand": osik.FrameTask(arm, "hand", hard=True)}):
+        for limits in ((one for one in [slow]), {"slow": slow}.values(), [slow]):
+            found: Any = osik.solve(arm, moved(arm, 1), tasks, limits=limits)  # pyright: ignore[reportArgumentType]
+            assert np.abs(found.velocity).max() <= 0.05
+        refuses(TypeError, "limits is VelocityLimit", osik.solve, arm, moved(arm, 1), tasks, limits=slow)
+
+
+@needs_core
+def test_what_a_refused_call_brought_is_not_kept(arm: osik.Robot) -> None:
+    """The own limits of another robot, whose given limit does not fit what was laid out."""
+    tasks, q = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm)}, moved(arm, 2)
+    limits = (osik.ConfigurationLimit(arm, gain=0.5),)
+    wanted = osik.solve(arm, q, tasks, limits=limits)
+    slow = eqx.tree_at(lambda robot: robot.velocity_limit, arm, 0.1 * arm.velocity_limit)
+    osik.solve(slow, q, tasks, limits=(osik.ConfigurationLimit(slow, gain=np.full(arm.nv, 0.5)),))
+    assert_same(osik.solve(arm, q, tasks, limits=limits), wanted)
+
+
+def test_numbers_changed_in_place_and_traced_ones_are_not_kept(arm: osik.Robot) -> None:
+    task, q, position = osik.FrameTask(arm, "hand"), moved(arm, 2), np.array([0.3, 0.2, 0.4])
+    tasks = {"hand": eqx.tree_at(lambda own: own.target, task, (position, np.eye(3)))}
+    for place in ([0.3, 0.2, 0.4], [0.4, 0.1, 0.3]):
+        position[:] = place
+        wanted = compiled(arm, q, {"hand": task.replace(target=(position, np.eye(3)))})
+        np.testing.assert_allclose(osik.solve(arm, q, tasks, dt=DT).velocity, wanted.velocity, atol=1e-9)
+    hard = osik.FrameTask(arm, "hand", hard=True)
+    with jax.checking_leaks():
+        jax.vmap(lambda p: osik.solve(arm, q, {"hand": hard.replace(target=(p, np.eye(3)))}).velocity)(np.ones((2, 3)))
+
+
+@needs_core
+def test_exchanged_parts_of_a_controller_are_seen(arm: osik.Robot) -> None:
+    tasks, q = {"hand": osik.FrameTask(arm, "hand", gain=50.0), "posture": osik.PostureTask(arm)}, moved(arm, 3)
+    controller = osik.Controller(arm, tasks, scheme=osik.NullSpace(), dt=DT)
+    for scheme in (osik.NullSpace(method="saturated"), osik.WeightedQP(), osik.WeightedQP(damping=1e-2)):
+        controller.scheme = scheme
+        assert_same(controller.step(q), compiled(arm, q, tasks, scheme=scheme))
+    controller = osik.Controller(arm, tasks, dt=DT)
+    velocity = controller.step(q).velocity
+    calm = osik.LowAccelerationTask(arm, weight=10.0)
+    controller.tasks["calm"] = calm
+    wanted = compiled(arm, q, {**tasks, "calm": calm.after(jax.numpy.asarray(velocity))})
+    np.testing.assert_allclose(controller.step(q).velocity, wanted.velocity, atol=1e-9)
+    del controller.tasks["calm"]
+    controller.tasks["posture"] = osik.PostureTask(arm, priority=2)
+    for same in (controller, copy.deepcopy(controller), pickle.loads(pickle.dumps(controller))):
+        assert_same(same.step(q), compiled(arm, q, controller.tasks))
+    given, before = q.copy(), controller.step(q).velocity
+    given[0] = np.nan
+    refuses(ValueError, "not finite", controller.integrate, given, before)
+    with pytest.warns(osik.OsikWarning, match="gain times dt"):
+        controller.tasks["hand"] = tasks["hand"].replace(gain=5000.0)
+        controller.step(q)
+
+
+@needs_core
+def test_a_step_that_ends_early_leaves_no_target(arm: osik.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, q = osik.Controller(arm, {"hand": osik.FrameTask(arm, "hand")}, dt=DT), moved(arm, 4)
+    wanted, real = controller.step(q), _plain_step.functions()
+    interrupted = real._replace(step=lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(_plain_step, "functions", lambda: interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        controller.step(q, {"hand": (np.array([0.1, 0.2, 0.3]), np.eye(3))})
+    monkeypatch.setattr(_plain_step, "functions", lambda: real)
+    assert_same(controller.step(q), wanted)
+
+
 def test_wrong_arguments_are_named(arm: osik.Robot) -> None:
     tasks = {"hand": osik.FrameTask(arm, "hand"), "posture": osik.PostureTask(arm)}
     controller = osik.Controller(arm, tasks, dt=DT)
@@ -196,6 +269,7 @@ def test_wrong_arguments_are_named(arm: osik.Robot) -> None:
         targets={"hand": (np.full(3, np.nan), np.eye(3))},
     )
     refuses(ValueError, "v has shape", controller.integrate, arm.q0, np.zeros(3))
+    refuses(TypeError, "inside jit", jax.jit(lambda q: controller.step(q).velocity), arm.q0)
     refuses(ValueError, "dt is -1", osik.Controller, arm, tasks, dt=-1.0)
     bounded = {**tasks, "hand": osik.FrameTask(arm, "hand", lower=-1.0, upper=1.0), "speed": osik.DampingTask(arm)}
     refuses(TypeError, "has no 'target'", osik.Controller(arm, bounded, dt=DT).step, arm.q0, {"speed": arm.q0})
