@@ -170,7 +170,9 @@ def inverse_kinematics(
     else:
         found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
     if not (traced or np.all(found.converged)):
-        found = dataclasses.replace(found, advice=advice(robot, route.asked(settings)))
+        missed = np.asarray(found.q)[~np.asarray(found.converged)]
+        said = advice(robot, route.asked(settings), route.held(settings), missed)
+        found = dataclasses.replace(found, advice=said)
     return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 

@@ -20,7 +20,8 @@ from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
-from ..tasks import FrameTask, Task
+from ..tasks import EqualityConstraintTask, FrameTask, JointCouplingTask, Task
+from ..tasks._stay import StayTask
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors, Pace
@@ -39,6 +40,8 @@ _RADIUS = 1.0
 _STOPPED = 1e-3
 _AT = 1e-6
 """A joint that is nearer to its limit is at it [rad or m]."""
+
+_TIES = EqualityConstraintTask, JointCouplingTask, StayTask
 
 
 class TaskParts(NamedTuple):
@@ -107,6 +110,10 @@ class TaskRoute(NamedTuple):
         """Return which rows of each frame the tasks use."""
         tasks = settings.parts.tasks.values()
         return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
+
+    def held(self, settings: Settings) -> dict[str, Task]:
+        """Return the goals that tie joints together or hold them: closed loops, coupled and frozen joints."""
+        return {name: task for name, task in settings.parts.tasks.items() if isinstance(task, _TIES) and is_goal(task)}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
         """Return whether a whole turn of each of these entries changes no goal."""
