@@ -214,23 +214,27 @@ def differences(function, at, step=1e-6):
     return np.stack([(function(*at + step * e) - function(*at - step * e)) / (2.0 * step) for e in np.eye(2)], -1)
 
 
-def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar):
+@pytest.mark.variants(slow=["True"])
+@pytest.mark.parametrize("by_tasks", [False, True])
+def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar, by_tasks):
     """In closed form: stretched towards the target, and with the first joint at its limit."""
 
     def find(p):
-        found = osik.inverse_kinematics(planar, {"tip": p}, seeds=4, steps=40)
+        goal = osik.FrameTask(planar, "tip", rows="position", target=p, weight=3.0) if by_tasks else p
+        found = osik.inverse_kinematics(planar, {"tip": goal}, seeds=4, steps=40)
         return found.q, found.position_error, found.orientation_error
 
-    both = jax.jit(jax.vmap(lambda p: (find(p), jax.jacfwd(find)(p), jax.jacrev(find)(p))))
+    slopes = (jax.jacfwd,) if by_tasks else (jax.jacfwd, jax.jacrev)
+    both = jax.jit(jax.vmap(lambda p: (find(p), *(slope(find)(p) for slope in slopes))))
     targets = np.array([[1.2, 0.3, 0.0], [-1.3, 0.05, 0.0], [3.0, 0.0, 0.0], [0.9005, 0.0, 0.0]])
-    (q, error, _), forward, reverse = both(targets)
+    (q, error, _), *rates = both(targets)
     for at, p in enumerate(targets):
         expected = nearest_of_two_links(*p[:2])
         np.testing.assert_allclose(q[at], expected, atol=2e-5)
         slope = differences(nearest_of_two_links, p[:2])
         distance = differences(lambda x, y: np.hypot(*tip_of_two_links(nearest_of_two_links(x, y)) - (x, y)), p[:2])
         assert error[at] == pytest.approx(np.hypot(*tip_of_two_links(expected) - p[:2]), abs=1e-7)
-        for moved, widened, turned in (forward, reverse):
+        for moved, widened, turned in rates:
             np.testing.assert_allclose(moved[at][:, :2], slope, atol=1e-4)
             np.testing.assert_allclose(widened[at][:2], distance, atol=1e-4)
             assert not np.asarray(turned[at]).any()
