@@ -13,6 +13,7 @@ from ..core import _cuda
 from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, scalar_layout
+from ..tasks import Task
 from ._chain import Chain, Layout, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
@@ -94,6 +95,11 @@ class ChainRoute(NamedTuple):
         """Return which rows of each frame are used."""
         del settings
         return dict(zip(self.frames, self.rows, strict=True))
+
+    def held(self, settings: Settings) -> dict[str, Task]:
+        """Return no tasks: poses tie no joints together."""
+        del settings
+        return {}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
         """Return whether a whole turn of each of these entries changes no pose."""

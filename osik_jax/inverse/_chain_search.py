@@ -231,7 +231,7 @@ class ChainSearch(eqx.Module):
     ) -> tuple[Float[Array, "lanes n"], Float[Array, " lanes"], Int[Array, " lanes"]]:
         """Return local optima from some starts, their errors [m], and the steps taken; lanes that are not open stay."""
         own, turned, gain = self._measuring(), lanes_last(goal), _GAIN * self.tolerance[0]
-        found = minimum(lambda x: own.model(x, turned), x.T, self.lower, self.upper, open_, gain)
+        found = minimum(lambda x: own.model(x, turned), x.T, self.lower[:, None], self.upper[:, None], open_, gain)
         return found.x.T, jnp.sqrt(2.0 * found.cost), found.steps
 
     def _measuring(self) -> ChainSearch:

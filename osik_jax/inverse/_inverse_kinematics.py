@@ -71,14 +71,17 @@ def inverse_kinematics(
     A target that is not found gets the configuration with the least error: the best of some local optima, each from the
     best of a group of searches. For poses that is the least sum of squared errors, where a radian counts as
     ``position_tolerance / orientation_tolerance`` metres. With tasks it is the local optimum by their weights that the
-    best search leads to; while tracing, and with ``nearest`` or ``all``, it is where that search ends.
+    best search leads to. While tracing, and with ``nearest`` or ``all``, that holds for goals of one level: those of a
+    ``WeightedQP`` without hard tasks, ball joints and limits other than joint ranges. Of others it is where the search
+    ends.
 
     Called with numbers, it runs as long as it has to. Where one of its arguments is traced, so inside ``jit``, ``vmap``
     or ``grad``, it takes ``seeds`` searches of ``steps`` steps each: a pure function of a limited amount of work. ``q``
     then is differentiable with respect to poses, the robot's numbers and limits, by the implicit function theorem: of
     the motions that keep the frames on their targets the shortest, joints at a limit staying there. Of poses out of
-    reach it is the motion of the least error, and ``position_error`` and ``orientation_error`` have derivatives too.
-    Other results are constants.
+    reach, and of goals of one level, it is the motion of the least error. ``position_error`` and ``orientation_error``
+    have derivatives too. Of other goals out of reach, the derivatives are those of the scheme's next step, not of the
+    answer; ``converged`` is False there. Other results are constants.
 
     Args:
         robot: the robot.
@@ -170,7 +173,9 @@ def inverse_kinematics(
     else:
         found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
     if not (traced or np.all(found.converged)):
-        found = dataclasses.replace(found, advice=advice(robot, route.asked(settings)))
+        missed = np.asarray(found.q)[~np.asarray(found.converged)]
+        said = advice(robot, route.asked(settings), route.held(settings), missed)
+        found = dataclasses.replace(found, advice=said)
     return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 

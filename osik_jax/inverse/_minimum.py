@@ -67,17 +67,17 @@ class _State(NamedTuple):
 def minimum(
     model: Model,
     x: Float[Array, "n lanes"],
-    lower: Float[Array, " n"],
-    upper: Float[Array, " n"],
+    lower: Float[Array, "n _"],
+    upper: Float[Array, "n _"],
     open_: Bool[Array, " lanes"],
-    gain: Float[Array, ""],
+    gain: Float[Array, "*lanes"],
 ) -> Minimum:
     """Descend from each start to a local minimum within the box.
 
     Args:
         model: the errors and their derivatives.
         x: starts, within the box.
-        lower: ends of the box, -inf where free.
+        lower: ends of the box, -inf where free; of all lanes or of each.
         upper: likewise.
         open_: lanes to work on; the others stay where they are.
         gain: a lane ends where a step promises to lower the length of the errors by less.
@@ -87,7 +87,7 @@ def minimum(
         return (state.open_ & (state.steps < _MOST)).any()
 
     def body(state: _State) -> _State:
-        return _step(model, lower[:, None], upper[:, None], gain, state)
+        return _step(model, lower, upper, gain, state)
 
     lanes = x.shape[1]
     nothing = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(model, x))

@@ -263,10 +263,11 @@ def explored(
         away = jax.vmap(jax.vmap(fixed_search.distance))(outcomes.x) if near else None
         best = choose(outcomes, away)
         x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
-        if not (go_on and route.starts_anew):
-            return outcomes, alone, Closest(x, jnp.zeros_like(x[:, 0]), best, jnp.zeros_like(best))
         score = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0]
         unmet, loose = score > 1.0, score > fixed_search.enough
+        if not (go_on and route.starts_anew):
+            x, more = fixed_search.settled(x, goals, unmet) if go_on else (x, jnp.zeros_like(best))
+            return outcomes, alone, Closest(x, jnp.zeros_like(score), best, more)
         # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch
         starts = jnp.where(unmet[:, None, None], outcomes.x, x[:, None])
         further = closest(fixed_search, goals, starts, loose, near=near)

@@ -14,18 +14,20 @@ from jaxtyping import Array, Float, Int
 from .._errors import OsikValueError
 from ..control._checks import check_tasks
 from ..kinematics import difference, forward_kinematics
-from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, with_own_limits
+from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, limit_box, with_own_limits
 from ..robot import Robot
 from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
-from ..tasks import FrameTask, Task
+from ..tasks import EqualityConstraintTask, FrameTask, JointCouplingTask, Task
+from ..tasks._stay import StayTask
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors, Pace
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
+from ._task_minimum import AT_LIMIT
 from ._task_search import Aims, TaskSearch, entry_limits, is_goal
 from ._turns import TURN, one_turn
 
@@ -37,8 +39,8 @@ _RADIUS = 1.0
 """Length by which the rounding of positions is judged [m]."""
 # least gradient, relative to its largest value for the error, at which a limit counts as stopping a joint
 _STOPPED = 1e-3
-_AT = 1e-6
-"""A joint that is nearer to its limit is at it [rad or m]."""
+
+_TIES = EqualityConstraintTask, JointCouplingTask, StayTask
 
 
 class TaskParts(NamedTuple):
@@ -108,6 +110,10 @@ class TaskRoute(NamedTuple):
         tasks = settings.parts.tasks.values()
         return {task.frame: task.kept for task in tasks if isinstance(task, FrameTask) and not task.bounded}
 
+    def held(self, settings: Settings) -> dict[str, Task]:
+        """Return the goals that tie joints together or hold them: closed loops, coupled and frozen joints."""
+        return {name: task for name, task in settings.parts.tasks.items() if isinstance(task, _TIES) and is_goal(task)}
+
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
         """Return whether a whole turn of each of these entries changes no goal."""
         tasks = settings.parts.tasks
@@ -116,8 +122,8 @@ class TaskRoute(NamedTuple):
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
         """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
         q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
-        fixed, here, aim = jax.lax.stop_gradient((search, q, goal))
-        residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(fixed, q, goal))(here, aim)
+        here = jax.lax.stop_gradient(q)
+        residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(search, q, goal))(q, goal)
         limit = next((limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit)), None)
         clearance, pair = (None, None) if limit is None else jax.vmap(lambda q: _clearance(robot, limit, q))(here)
         return InverseKinematicsSolution(
@@ -127,10 +133,10 @@ class TaskRoute(NamedTuple):
             orientation_error=errors.orientation,
             seed=seed,
             steps=steps,
-            residual=residual,
+            residual=jax.lax.stop_gradient(residual),
             at_limit=at_limit,
             beyond_reach=jnp.zeros(len(q), q.dtype),
-            base_moved=_base_moved(robot, fixed.first, here),
+            base_moved=_base_moved(robot, jax.lax.stop_gradient(search.first), here),
             clearance=clearance,
             nearest_pair=pair,
             joints=tuple(dof_names(robot)),
@@ -222,9 +228,9 @@ def _evaluated(
     levers = [jnp.sqrt(jnp.matmul(own.weight, own.jacobian**2, precision="highest")) for own in rows.values()]
     gradient: Any = sum(gradients)
     most: Any = sum(size * lever for size, lever in zip(sizes, levers, strict=True))
-    box = [limit.box(search.robot, q, 1.0) for limit in search.limits if isinstance(limit, ConfigurationLimit)]
-    low = sum((lower >= -_AT).astype(jnp.int32) for lower, _ in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
-    high = sum((upper <= _AT).astype(jnp.int32) for _, upper in box) > 0 if box else jnp.zeros(search.robot.nv, bool)
+    ranges = [limit for limit in search.limits if isinstance(limit, ConfigurationLimit)]
+    lower, upper = limit_box(search.robot, q, ranges, 1.0)
+    low, high = lower >= -AT_LIMIT, upper <= AT_LIMIT
     stopped = jnp.abs(gradient) > _STOPPED * most
     at_lower, at_upper = stopped & low & (gradient > 0.0), stopped & high & (gradient < 0.0)
     active = at_upper.astype(jnp.int32) - at_lower.astype(jnp.int32)
@@ -239,7 +245,7 @@ def _with_balls(search: TaskSearch, q: Array, gradient: Array, most: Array, acti
         at = search.robot.tree.qpos_address[joint]
         angle, axis = ball_rotation(q[at : at + 4])
         driven = jnp.dot(axis, gradient[dofs]) < -_STOPPED * jnp.max(most[dofs])
-        active = active.at[dofs[0]].set((driven & (angle >= search.angles[dofs[0]] - _AT)).astype(active.dtype))
+        active = active.at[dofs[0]].set((driven & (angle >= search.angles[dofs[0]] - AT_LIMIT)).astype(active.dtype))
     return active
 
 

@@ -24,6 +24,7 @@ from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
 from ._pool import Errors
 from ._seeds import unit_points
+from ._task_minimum import has_minimum, rate_at_rest, settled
 from ._turns import unwound
 
 _LONGEST = 1.0
@@ -115,7 +116,7 @@ class TaskSearch(eqx.Module):
             entry, dof = self.robot.tree.qpos_address[joint] + 1, self.robot.tree.dof_address[joint]
             greatest = jnp.minimum(self.angles[dof : dof + 3], jnp.pi)
             velocity = velocity.at[dof : dof + 3].set(greatest * share[entry : entry + 3])
-        return self._moved(q, velocity) if independent_balls(self.robot.tree) else q
+        return self.after(q, velocity) if independent_balls(self.robot.tree) else q
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
@@ -140,20 +141,29 @@ class TaskSearch(eqx.Module):
         velocity = self.scheme.solve(problem).velocity
         # a step that failed leaves the lane where it is, and the pool replaces it
         velocity = jnp.where(jnp.isfinite(velocity), jnp.clip(velocity, problem.lower, problem.upper), 0.0)
-        return jnp.where(errors.score <= self.enough, q, self._moved(q, velocity)), errors
+        return jnp.where(errors.score <= self.enough, q, self.after(q, velocity)), errors
 
     def newton_step(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, " nq"]:
         """Return the scheme's step by the goals alone."""
-        goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
-        return self._moved(q, self.scheme.solve(self._problem(q, goals)).velocity) - q
+        return self.after(q, self.scheme.solve(self._problem(q, goals_of(self.aimed(goal)))).velocity) - q
 
     def moved(self, q: Float[Array, " nq"], goal: Aims, rates: Any) -> Float[Array, " nq"]:
-        """Return the derivative of a solution q, for the rates of the search and the goal."""
-        return jax.jvp(lambda search, goal: search.newton_step(q, goal), (self, goal), rates)[1]
+        """Return the derivative of a solution q, or of a least error, for the rates of the search and the goal."""
+        along = jax.jvp(lambda search, goal: search.newton_step(q, goal), (self, goal), rates)[1]
+        if not has_minimum(self):
+            return along
+        reached = self.errors(q, goal)[1].score <= self.enough
+        return jnp.where(reached, along, rate_at_rest(self, q, goal, rates))
+
+    def settled(
+        self, q: Float[Array, "lanes nq"], goal: Aims, open_: Bool[Array, " lanes"]
+    ) -> tuple[Float[Array, "lanes nq"], Int[Array, " lanes"]]:
+        """Return the configurations of least error that q leads to, for goals of one level, and the steps taken."""
+        return settled(self, q, goal, open_)
 
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
         """Return the rows of the goals at q, and their errors."""
-        goals = {name: task for name, task in self.aimed(goal).items() if is_goal(task)}
+        goals = goals_of(self.aimed(goal))
         kinematics = forward_kinematics(self.robot, q)
         rows = rows_of(self.robot, kinematics, q, {name: task.during(1.0) for name, task in goals.items()})
         sizes = [sizes_of(goals[name], own) for name, own in rows.items()]
@@ -263,10 +273,11 @@ class TaskSearch(eqx.Module):
     def _problem(self, q: Array, tasks: dict[str, Task]) -> VelocityProblem:
         return velocity_problem(self.robot, forward_kinematics(self.robot, q), q, tasks, self.limits, 1.0)
 
-    def _moved(self, q: Array, velocity: Array) -> Array:
-        after = integrate(self.robot, q, velocity)
+    def after(self, q: Array, velocity: Array) -> Array:
+        """Return q after a motion, within the limits of the joints."""
+        moved = integrate(self.robot, q, velocity)
         bounded = jnp.isfinite(self.lower) | jnp.isfinite(self.upper)
-        clipped = jnp.where(bounded, jnp.clip(after, self.lower, self.upper), after)
+        clipped = jnp.where(bounded, jnp.clip(moved, self.lower, self.upper), moved)
         return with_balls_inside(self.robot.tree, clipped, self.angles)
 
 
@@ -289,6 +300,11 @@ def _faded(task: Task, gain: Array) -> Task:
 def is_goal(task: Task) -> bool:
     """Return whether a task has to be met for a configuration to be a solution."""
     return task.hard or task.is_goal
+
+
+def goals_of(tasks: dict[str, Task]) -> dict[str, Task]:
+    """Return the tasks that have to be met."""
+    return {name: task for name, task in tasks.items() if is_goal(task)}
 
 
 def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:

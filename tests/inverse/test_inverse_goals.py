@@ -179,3 +179,30 @@ def test_explain_counts_the_ways_a_frame_moves_and_not_its_joints():
     said = found(robot, {"tip": (np.array([0.5, 0.3, 0.2]), np.eye(3))}, closest=True).explain()
     assert "tip asks for 6 rows and its 7 joints move it 3 ways" in said
     assert "rows=(True, True, False, False, False, True)" in said
+
+
+@pytest.mark.slow
+def test_least_error_of_goals_that_disagree_has_the_derivative_of_differences(planar):
+    """A pose out of reach beside another frame's target, with a posture and weights; of q on the same branch."""
+    weights: Any = {"position_weight": 2.0, "orientation_weight": 0.3}
+    posture = osik.PostureTask(planar)
+
+    @jax.jit
+    @jax.vmap
+    def find(x):
+        def at(x):
+            turn = jnp.array([[jnp.cos(x), -jnp.sin(x), 0.0], [jnp.sin(x), jnp.cos(x), 0.0], [0.0, 0.0, 1.0]])
+            pose = jnp.array([1.1 + x, 0.5, 0.1]), turn
+            tasks = {"tip": osik.FrameTask(planar, "tip", target=pose, **weights), "posture": posture}
+            tasks["one"] = osik.FrameTask(planar, "one", target=(jnp.array([0.2, 0.0, 0.1]), jnp.eye(3)))
+            answer = osik.inverse_kinematics(planar, tasks, q0=jnp.array([0.3, 0.4, 0.5]), seeds=1, steps=24)
+            return answer.q, answer.position_error, answer.orientation_error
+
+        return at(x), jax.jacfwd(at)(x), jax.jacrev(at)(x)
+
+    step = 1e-5
+    values, forward, reverse = find(jnp.array([0.2 - step, 0.2, 0.2 + step]))
+    assert values[1][1] > 0.05
+    for value, *slopes in zip(values, forward, reverse, strict=True):
+        for slope in slopes:
+            np.testing.assert_allclose(slope[1], (value[2] - value[0]) / (2.0 * step), atol=1e-5)

@@ -150,6 +150,35 @@ def test_explain_counts_rows_and_names_those_to_leave_out(arm):
 
 
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
+@pytest.mark.variants(slow=["two"])
+@pytest.mark.parametrize(
+    "slide, ways", [("", 1), ('<joint name="slide" type="slide" axis="1 0 0"/>', 2)], ids=["one", "two"]
+)
+def test_explain_counts_the_motions_that_keep_closed_loops(slide, ways):
+    """Against the rank of MuJoCo's rows of loops and frame, where the open chain would allow more."""
+    text = mjcf("four_bar").replace('<joint name="rocker"', f'{slide}<joint name="rocker"')
+    robot = osik.Robot.from_mjcf(text)
+    tasks = {
+        "loops": osik.EqualityConstraintTask(robot, hard=True),
+        "end": osik.FrameTask(robot, "end", target=(np.array([0.35, 0.45, 0.1]), np.eye(3))),
+    }
+    found = osik.inverse_kinematics(robot, tasks, seeds=4, restarts=0)
+    said = found.explain()
+    model = robot.mj_model
+    data, frame = mujoco.MjData(model), np.zeros((6, model.nv))
+    data.qpos[:] = np.asarray(robot.mujoco_qpos(found.q))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_jacSite(model, data, frame[:3], frame[3:], data.site("end").id)
+    loops = data.efc_J.reshape(-1, model.nv)[: data.ne]
+    rank = lambda *parts: np.linalg.matrix_rank(np.concatenate(parts), tol=1e-6)  # noqa: E731
+    assert rank(loops, frame) - rank(loops) == ways
+    assert f"end asks for 6 rows and its 2 joints move it {ways} way{'s' * (ways > 1)} under 'loops'" in said
+    rows = eval(said.split("rows=")[1].split(")")[0] + ")")
+    moved = frame[list(rows)] @ (np.eye(model.nv) - np.linalg.pinv(loops, rcond=1e-6) @ loops)
+    assert sum(rows) == ways and np.linalg.svd(moved, compute_uv=False).min() > 1e-2
+
+
+@pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("kind, far", [(jnp.float64, 1e200), (jnp.float32, 1e30)])
 def test_a_target_whose_square_is_not_finite_has_a_finite_answer(kind, far):
     """While tracing and from the host; the neighbour is found."""
@@ -185,23 +214,27 @@ def differences(function, at, step=1e-6):
     return np.stack([(function(*at + step * e) - function(*at - step * e)) / (2.0 * step) for e in np.eye(2)], -1)
 
 
-def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar):
+@pytest.mark.variants(slow=["True"])
+@pytest.mark.parametrize("by_tasks", [False, True])
+def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar, by_tasks):
     """In closed form: stretched towards the target, and with the first joint at its limit."""
 
     def find(p):
-        found = osik.inverse_kinematics(planar, {"tip": p}, seeds=4, steps=40)
+        goal = osik.FrameTask(planar, "tip", rows="position", target=p, weight=3.0) if by_tasks else p
+        found = osik.inverse_kinematics(planar, {"tip": goal}, seeds=4, steps=40)
         return found.q, found.position_error, found.orientation_error
 
-    both = jax.jit(jax.vmap(lambda p: (find(p), jax.jacfwd(find)(p), jax.jacrev(find)(p))))
+    slopes = (jax.jacfwd,) if by_tasks else (jax.jacfwd, jax.jacrev)
+    both = jax.jit(jax.vmap(lambda p: (find(p), *(slope(find)(p) for slope in slopes))))
     targets = np.array([[1.2, 0.3, 0.0], [-1.3, 0.05, 0.0], [3.0, 0.0, 0.0], [0.9005, 0.0, 0.0]])
-    (q, error, _), forward, reverse = both(targets)
+    (q, error, _), *rates = both(targets)
     for at, p in enumerate(targets):
         expected = nearest_of_two_links(*p[:2])
         np.testing.assert_allclose(q[at], expected, atol=2e-5)
         slope = differences(nearest_of_two_links, p[:2])
         distance = differences(lambda x, y: np.hypot(*tip_of_two_links(nearest_of_two_links(x, y)) - (x, y)), p[:2])
         assert error[at] == pytest.approx(np.hypot(*tip_of_two_links(expected) - p[:2]), abs=1e-7)
-        for moved, widened, turned in (forward, reverse):
+        for moved, widened, turned in rates:
             np.testing.assert_allclose(moved[at][:, :2], slope, atol=1e-4)
             np.testing.assert_allclose(widened[at][:2], distance, atol=1e-4)
             assert not np.asarray(turned[at]).any()
