@@ -31,11 +31,12 @@ class Replaceable(eqx.Module):
             TypeError: a name is not one of this object's numbers; the message lists them.
             ValueError: a wrong shape or value.
         """
+        known = self.replaceable
         for name in changes:
-            if name not in _replaceable(type(self)) or vars(self)[name] is None:
+            if name not in known:
                 raise OsikTypeError(
                     f"{type(self).__name__} has no {name!r} to replace; "
-                    f"it has: {', '.join(self.replaceable)} (structure is fixed at construction)"
+                    f"it has: {', '.join(known)} (structure is fixed at construction)"
                 )
         if not changes:
             return self

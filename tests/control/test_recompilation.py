@@ -154,10 +154,10 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
 @pytest.mark.slow
 def test_what_is_static_compiles_again(arm):
     """The counter counts: an iteration cap, a priority, a task more, another number of steps."""
-    task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP()
+    task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP(backend="jax")  # the core's steps are no programs
     osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=osik.no_limits)
     changes = (
-        ({"posture": task}, osik.WeightedQP(max_iterations=50)),
+        ({"posture": task}, osik.WeightedQP(max_iterations=50, backend="jax")),
         ({"posture": osik.PostureTask(arm, priority=4, weight=1.0)}, scheme),
         ({"posture": task, "second": task}, scheme),
     )
