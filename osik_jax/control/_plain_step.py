@@ -6,6 +6,7 @@ they are recognised by their identity, and only the configuration and what is ne
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 import threading
 from collections import OrderedDict
@@ -430,7 +431,9 @@ def _makers(
     """
     warm_start = {HierarchicalQP: WorkingSet(0, 0), WeightedQP: 0}.get(scheme)  # pyright: ignore[reportArgumentType]
     by_name = dict.fromkeys(dict(rows), 0)
-    # a solution is made from its leaves, because its constructor takes as long as the step
-    structure = jax.tree.structure(Solution(0, 0, 0, 0, 0, 0, by_name, by_name, warm_start))  # pyright: ignore[reportArgumentType]
+    # without its constructor, which takes as long as a step and wants arrays
+    any_solution, fields = object.__new__(Solution), (field.name for field in dataclasses.fields(Solution))
+    vars(any_solution).update(zip(fields, (0, 0, 0, 0, 0, 0, by_name, by_name, warm_start), strict=True))
+    structure = jax.tree.structure(any_solution)
     unpacked = partial(_unpacked, structure, *_leaf_places(nv, dict(rows), labels))
     return unpacked, jax.jit(unpacked)

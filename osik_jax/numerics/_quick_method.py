@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar, cast
 
-_Method = TypeVar("_Method", bound=Callable[..., Any])
+_Method = TypeVar("_Method")
 
 
 def quick_method(method: _Method) -> _Method:
@@ -15,7 +15,7 @@ def quick_method(method: _Method) -> _Method:
     A module makes a new module of each method that it is asked for, so that the method is a pytree. That takes as long
     as a control step. A decorated method is a function that holds its module, and no pytree.
     """
-    return cast(_Method, _Quick(method))
+    return cast(_Method, _Quick(cast(Any, method)))
 
 
 class _Quick:
