@@ -20,8 +20,7 @@ from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
-from ..tasks import EqualityConstraintTask, FrameTask, JointCouplingTask, Task
-from ..tasks._stay import StayTask
+from ..tasks import FrameTask, Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
 from ._pool import Errors, Pace
@@ -39,8 +38,6 @@ _RADIUS = 1.0
 """Length by which the rounding of positions is judged [m]."""
 # least gradient, relative to its largest value for the error, at which a limit counts as stopping a joint
 _STOPPED = 1e-3
-
-_TIES = EqualityConstraintTask, JointCouplingTask, StayTask
 
 
 class TaskParts(NamedTuple):
@@ -112,7 +109,7 @@ class TaskRoute(NamedTuple):
 
     def held(self, settings: Settings) -> dict[str, Task]:
         """Return the goals that tie joints together or hold them: closed loops, coupled and frozen joints."""
-        return {name: task for name, task in settings.parts.tasks.items() if isinstance(task, _TIES) and is_goal(task)}
+        return {name: task for name, task in settings.parts.tasks.items() if task.ties_joints and is_goal(task)}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
         """Return whether a whole turn of each of these entries changes no goal."""

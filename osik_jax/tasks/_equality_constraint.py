@@ -74,6 +74,7 @@ class EqualityConstraintTask(Task):
     """
 
     is_goal: ClassVar[bool] = True
+    ties_joints: ClassVar[bool] = True
     constraints: tuple[Constraint, ...] = eqx.field(static=True)
     anchors: Float[Array, "k 2 3"]
     """Points that must coincide, in both frames of each connect and weld [m]."""

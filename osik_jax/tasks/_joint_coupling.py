@@ -51,6 +51,7 @@ class JointCouplingTask(Task):
     """
 
     is_goal: ClassVar[bool] = True
+    ties_joints: ClassVar[bool] = True
     joints: tuple[int, ...] = eqx.field(static=True)
     ratios: Float[Array, " k"]
     target: Float[Array, "1"] | None

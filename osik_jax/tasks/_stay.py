@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,6 +20,7 @@ class StayTask(Task):
     What the other task asks of a velocity is asked of the whole motion, with its rows, weights and priority.
     """
 
+    ties_joints: ClassVar[bool] = True
     moving: Task
     start: Float[Array, " nq"]
 

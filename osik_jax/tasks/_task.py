@@ -169,12 +169,15 @@ class Task(MadeForRobot, Replaceable):
         sees_places: whether a whole turn of a hinge leaves the task's error as it is, because it depends on the places
             of bodies alone (static).
         calms: whether the task calms a motion, which it cannot beneath tasks that leave its joints no freedom (static).
+        ties_joints: whether the task, once met, leaves other tasks fewer ways to move its joints, as a closed loop does
+            (static).
         units: unit of each number, by the field's name; that of ``""`` is of all numbers that are not named (static).
     """
 
     is_goal: ClassVar[bool] = False
     sees_places: ClassVar[bool] = False
     calms: ClassVar[bool] = False
+    ties_joints: ClassVar[bool] = False
     units: ClassVar[Mapping[str, str]] = MappingProxyType({"": "the task's own"})
     weight: Float[Array, "..."] = eqx.field(default=1.0, converter=as_own_weight, kw_only=True)
     gain: Gain = eqx.field(default=DEFAULT_GAIN, converter=lambda value: as_gain(value), kw_only=True)
