@@ -20,7 +20,7 @@ from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
 from ..kinematics import forward_kinematics
 from ..limits import Limit, NoLimits
 from ..numerics._arguments import concrete
-from ..numerics._host import float_now
+from ..numerics._host import float_now, is_traced
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._made_for import check_made_for, check_robot
@@ -184,8 +184,8 @@ def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
     seen = (dt, *gains)
     if len(seen) == len(_accepted_gains) and all(map(operator.is_, seen, _accepted_gains)):
         return
-    large = [float(getattr(gain, "maximum", gain)) for gain in gains if not _is_traced(gain)]
-    if _is_traced(dt) or len(large) < len(gains):
+    large = [float(getattr(gain, "maximum", gain)) for gain in gains if not is_traced(gain)]
+    if is_traced(dt) or len(large) < len(gains):
         return
     named = [
         f"{name} (gain {gain:g})" for name, gain in zip(tasks, large, strict=True) if gain * float(dt) > LARGEST_GAIN
@@ -235,7 +235,7 @@ def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme
         name: [other for other, own in tasks.items() if own.hard or (strict and own.priority < tasks[name].priority)]
         for name in calming
     }
-    if not any(above.values()) or _is_traced((robot, q, tasks)):
+    if not any(above.values()) or is_traced((robot, q, tasks)):
         return
     named = strict, *((name, type(task).__name__, task.priority, task.hard) for name, task in tasks.items())
     if named in _said_idle:
@@ -267,10 +267,6 @@ def _span(above: np.ndarray, rows: np.ndarray) -> bool:
     _, sizes, basis = np.linalg.svd(above / np.where(lengths > 0.0, lengths, 1.0), full_matrices=False)
     basis = basis[sizes > _SPAN * max(float(sizes.max(initial=0.0)), 1.0)]
     return bool(np.abs(rows - rows @ basis.T @ basis).max(initial=0.0) < _SPAN)
-
-
-def _is_traced(tree: Any) -> bool:
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def check_steps(steps: Any) -> None:

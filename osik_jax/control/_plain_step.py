@@ -101,7 +101,9 @@ def plain_step(
     bounds = with_own_limits(robot, _given(limits))
     if not is_compiled(robot, robot.q0, dict(tasks), chosen, bounds, np.float64(dt), None):
         return None
-    return None if missing_part(robot, tasks, chosen, bounds) else PlainStep(robot, tasks, scheme, limits, float(dt))
+    if missing_part(robot, tasks, chosen, bounds) is not None:
+        return None
+    return PlainStep(robot, tasks, scheme, limits, float(dt), chosen, bounds)
 
 
 def _is_open(tree: Any) -> bool:
@@ -178,22 +180,31 @@ class PlainStep(Checked):
         scheme: how they share the robot, None for the default.
         limits: beside the robot's own, as they are given.
         dt: time of a step [s].
+        chosen: the scheme that is used.
+        bounds: all limits, the given ones first.
 
     Attributes:
         as_arrays: from what ``solve`` returns to a solution, with JAX's arrays.
         unpacked: the same with NumPy's.
     """
 
-    def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any, dt: float) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        tasks: Mapping[str, Task],
+        scheme: Scheme | None,
+        limits: Any,
+        dt: float,
+        chosen: Scheme,
+        bounds: Sequence[Limit],
+    ) -> None:
         super().__init__(robot, tasks, scheme, limits)
-        self._default = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
-        bounds = with_own_limits(robot, _given(limits))
-        packed = pack(robot, tasks, self._default, bounds, dt)
+        packed = pack(robot, tasks, chosen, bounds, dt)
         of_robot, q, numbered, of_scheme, of_limits, of_dt, _ = packed.numbered
         self._q, self._of_dt = packed.place(q), packed.place(of_dt)
         self._dt: Any = dt
         self._parts, self._of_scheme = _places(packed, (of_robot, of_limits)), _places(packed, of_scheme)
-        self._structure, self._scheme_structure = jax.tree.structure((robot, bounds)), jax.tree.structure(self._default)
+        self._structure, self._scheme_structure = jax.tree.structure((robot, bounds)), jax.tree.structure(chosen)
         self._own, self._own_robot = bounds[len(_given(limits)) :], robot
         self._leaves = {name: _places(packed, task) for name, task in numbered.items()}
         self._targets = {name: _places(packed, getattr(task, "target", None)) for name, task in numbered.items()}
@@ -204,7 +215,7 @@ class PlainStep(Checked):
         sizes = [int(np.prod(shape)) for shape in self._labels]
         self._guess, self._integers = np.zeros(sum(sizes), np.int32), np.zeros(3 + sum(sizes), np.int32)
         counts = tuple(sorted(packed.rows.count.items()))
-        self.unpacked, self.as_arrays = _makers(type(self._default), robot.nv, counts, tuple(self._labels))
+        self.unpacked, self.as_arrays = _makers(type(chosen), robot.nv, counts, tuple(self._labels))
         self._free = functions().free  # while the process ends, modules are gone before objects
         self._handle = functions().new(packed.layout.ctypes.data, len(packed.layout))
         if not self._handle:

@@ -17,7 +17,8 @@ from .._errors import OsikTypeError, OsikValueError
 from ..control._checks import check_setting, checked_limits, checked_start
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
-from ..numerics._remembered import hold_numbers, holds_tracer, remembered
+from ..numerics._host import is_traced
+from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._plausible import warn_of_far_joints
@@ -143,7 +144,7 @@ def inverse_kinematics(
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
     settings = Settings(home, lower, upper, key, tolerance, seeds, problem.parts)
-    traced = not hold_numbers(robot) or holds_tracer((problem.goals, settings))
+    traced = not hold_numbers(robot) or is_traced((problem.goals, settings))
     if traced and isinstance(route, ChainRoute):
         route = route._replace(by_core=False)
     if all and traced:
@@ -238,7 +239,7 @@ def _inward(bound: Array, sign: float) -> Array:
     """Return a single-precision bound moved inside by one number, against rounding beyond the wanted one."""
     if bound.dtype != jnp.float32:
         return bound
-    if not holds_tracer(bound):
+    if not is_traced(bound):
         seen = np.asarray(bound)
         return np.where(np.isfinite(seen), np.nextafter(seen, np.float32(sign * np.inf)), seen)  # pyright: ignore
     inner = jnp.nextafter(bound, jnp.full_like(bound, sign * jnp.inf))
@@ -247,11 +248,11 @@ def _inward(bound: Array, sign: float) -> Array:
 
 def _together(values: Sequence[Any]) -> Any:
     """Return the stacked values, by NumPy unless traced, because JAX's dispatch costs more than a search."""
-    return (jnp if holds_tracer(values) else np).stack(values)
+    return (jnp if is_traced(values) else np).stack(values)
 
 
 def checked_tolerance(value: Any, dtype: Any) -> Any:
-    out = (jnp if holds_tracer(value) else np).asarray(value, dtype)
+    out = (jnp if is_traced(value) else np).asarray(value, dtype)
     seen = concrete(out)
     if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen > 0.0)):
         raise OsikValueError(f"a tolerance is {value!r}; it is one positive number, in metres or radians")

@@ -14,10 +14,11 @@ from jaxtyping import Array
 
 from .._errors import OsikValueError
 from ..execution._platform import on_host
+from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import concrete
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
-from ..tasks._targets import as_pose, matrix_of, pose_array, pose_parts
+from ..tasks._targets import as_pose, pose_array, pose_parts
 from ._chain_search import Goal
 
 _POSITION = (True,) * 3 + (False,) * 3
@@ -89,7 +90,7 @@ def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool
         raise OsikValueError(f"got rotations of shape {rotation.shape}; many are (n, 3, 3), or (n, 4): w x y z")
     _check_finite(position)
     if rotation.ndim == 2:
-        return position, matrix_of(exact_quaternion(rotation, "rotation")), _POSE
+        return position, rotation_matrix(exact_quaternion(rotation, "rotation")), _POSE
     return position, exact_rotation(rotation, "rotation"), _POSE
 
 

@@ -7,16 +7,10 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any
 
-import jax
-from jax.core import Tracer
+from ._host import is_traced
 
 _MOST = 32
 """Results that are kept; each keeps its arguments, too, so that no other object has their place in memory."""
-
-
-def holds_tracer(tree: Any) -> bool:
-    """Return whether a leaf of a pytree is traced."""
-    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -34,7 +28,7 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
         if found is not None:
             return found[1]
         result = function(*objects, **static)
-        if result is not None and not holds_tracer(result):
+        if result is not None and not is_traced(result):
             kept[key] = objects, result
             while len(kept) > _MOST:
                 kept.popitem(last=False)
@@ -46,4 +40,4 @@ def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
 @remembered
 def hold_numbers(*objects: Any) -> bool | None:
     """Return True if no number of the objects is traced, else None."""
-    return None if holds_tracer(objects) else True
+    return None if is_traced(objects) else True

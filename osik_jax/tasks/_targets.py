@@ -116,13 +116,6 @@ def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"]) -> Float[Numbe
     return exact_rotation(given, "the target's rotation")
 
 
-def matrix_of(quaternion: Float[Array, "*B 4"]) -> Float[Array, "*B 3 3"]:
-    """Return the rotation matrices of unit quaternions w, x, y, z; by NumPy of NumPy's array."""
-    if isinstance(quaternion, np.ndarray):
-        return rotation_matrix(quaternion)
-    return jaxlie.SO3(quaternion).as_matrix()
-
-
 def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
     seen = concrete(matrix)
     if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _LAST_ROW:
