@@ -138,26 +138,11 @@ class Checked:
         given = robot, *_given(limits)
         return len(given) == len(self._setting) and all(map(operator.is_, given, self._setting))
 
-    def solution(
-        self,
-        robot: Robot,
-        q: Any,
-        tasks: Mapping[str, Task],
-        scheme: Any,
-        limits: Any,
-        dt: Any,
-        targets: Any,
-        warm_start: Any,
-    ) -> Solution | None:
-        """Return the answer of ``solve``, which has checked all but q; None: it takes a program of JAX."""
-        del q, scheme, targets, dt, warm_start
-        if _is_open((robot, dict(tasks), limits)):
-            return None
-        self._setting = robot, *_given(limits)
-        if any(self._seen[name] is not task for name, task in tasks.items()):
-            self._seen = dict(tasks)
+    def note(self, robot: Robot, tasks: Mapping[str, Task], limits: Any) -> None:
+        """Recognise these arguments from now on, which were checked, unless their numbers may change."""
+        if not _is_open((robot, dict(tasks), limits)):
+            self._setting, self._seen = (robot, *_given(limits)), dict(tasks)
             self._look_at_gains()
-        return None
 
     def fits(self, tasks: Mapping[str, Task]) -> bool:
         """Return whether tasks of the same structure have numbers of the sizes that are known."""

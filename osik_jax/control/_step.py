@@ -41,7 +41,7 @@ from ._checks import (
     warn_of_large_gains,
 )
 from ._compiled_step import compiled, is_compiled
-from ._plain_step import keep_step, kept_step
+from ._plain_step import PlainStep, keep_step, kept_step
 from ._solution import Solution
 
 Tasks = Mapping[str, Task]
@@ -108,11 +108,14 @@ def solve(
         plain = kept_step(robot, tasks, scheme, limits)
         if plain is None or not plain.fits(tasks):
             plain = keep_step(robot, q, tasks, scheme, limits, dt)
+        elif not isinstance(plain, PlainStep):
+            plain.note(robot, tasks, limits)
     check_target_names(tasks, targets)
     check_warm_start(warm_start)
-    found = None if plain is None else plain.solution(robot, q, tasks, scheme, limits, dt, targets, warm_start)
-    if found is not None:
-        return found
+    if isinstance(plain, PlainStep):
+        found = plain.solution(robot, q, tasks, scheme, limits, dt, targets, warm_start)
+        if found is not None:
+            return found
     q = checked_configuration(robot, q)
     warn_of_degrees(robot, q)
     aimed, bounds = aim(dict(tasks), targets), checked_limits(robot, limits)
