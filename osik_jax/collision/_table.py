@@ -26,7 +26,7 @@ class ShapeTable(NamedTuple):
 
     Attributes:
         kind: ``ShapeKind`` of each; ``ABSENT`` rows are skipped. (k,)
-        size: sphere ``(radius, 0, 0)``; capsule and cylinder ``(radius, half length, 0)``, along z; box, half its edges;
+        size: sphere ``(radius, 0, 0)``; capsule, cylinder ``(radius, half length, 0)``, along z; box, half its edges;
             hull ``(radius, 0, 0)``: it is all points within ``radius`` of the hull of its vertices [m]. (k, 3)
         position: of the centre; of a half space, any point of its surface [m]. (k, 3)
         rotation: from the shape's axes to the body's or the world's; z points out of a half space. (k, 3, 3)
