@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -72,9 +73,9 @@ def inverse_kinematics(
     A target that is not found gets the configuration with the least error: the best of some local optima, each from the
     best of a group of searches. For poses that is the least sum of squared errors, where a radian counts as
     ``position_tolerance / orientation_tolerance`` metres. With tasks it is the local optimum by their weights that the
-    best search leads to. While tracing, and with ``nearest`` or ``all``, that holds for goals of one level: those of a
-    ``WeightedQP`` without hard tasks, ball joints and limits other than joint ranges. Of others it is where the search
-    ends.
+    best search leads to. While tracing, and with ``nearest`` or ``all``, that holds for goals of one level: all hard,
+    or those of a ``WeightedQP`` or of one priority, with no task above. With ball joints, limits other than joint
+    ranges, and of goals of several levels, it is where the search ends.
 
     Called with numbers, it runs as long as it has to. Where one of its arguments is traced, so inside ``jit``, ``vmap``
     or ``grad``, it takes ``seeds`` searches of ``steps`` steps each: a pure function of a limited amount of work. ``q``
@@ -151,33 +152,35 @@ def inverse_kinematics(
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     how, given = Searches(seeds, warm=q0 is not None, near=nearest, every=all), (robot, problem.goals, settings)
     most, by_core = once * (1 + restarts), not traced and whole_is_possible(route)
-    if by_core and not problem.many:
-        at_once = found_at_once(*given, most, steps, how, route=route)
-        if at_once is not None and all:
-            batched = at_once._replace(found=jax.tree.map(lambda a: np.asarray(a)[None], at_once.found))
-            more = {name: a[0] for name, a in _all_of(*given, batched, route).items()}
-            return dataclasses.replace(at_once.found, **_as_arrays(more))
-        if at_once is not None:
-            return at_once.found
-    if traced or nearest or all:
-        options: dict[str, Any] = dict(settings=settings, how=how, steps=steps, route=route, go_on=closest)
-        if by_core:
-            run = partial(explored_by_core, robot, most=most, **options)
+    # inside jit, operations on numbers would be traced too
+    with nullcontext() if traced else jax.ensure_compile_time_eval():
+        if by_core and not problem.many:
+            at_once = found_at_once(*given, most, steps, how, route=route)
+            if at_once is not None and all:
+                batched = at_once._replace(found=jax.tree.map(lambda a: np.asarray(a)[None], at_once.found))
+                more = {name: a[0] for name, a in _all_of(*given, batched, route).items()}
+                return dataclasses.replace(at_once.found, **_as_arrays(more))
+            if at_once is not None:
+                return at_once.found
+        if traced or nearest or all:
+            options: dict[str, Any] = dict(settings=settings, how=how, steps=steps, route=route, go_on=closest)
+            if by_core:
+                run = partial(explored_by_core, robot, most=most, **options)
+            else:
+                run = partial(explored, robot, fall_back=nearest and traced, **options)
+            results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
+            found = results.found
+            if not traced:
+                found = searched_on(*given, found, most, steps, route=route, warm=how.warm, near=nearest)
+            if all:
+                found = dataclasses.replace(found, **_all_of(*given, results._replace(found=found), route))
         else:
-            run = partial(explored, robot, fall_back=nearest and traced, **options)
-        results = run(problem.goals) if traced else in_chunks(lambda goals, _: run(goals), problem.goals)
-        found = results.found
-        if not traced:
-            found = searched_on(*given, found, most, steps, route=route, warm=how.warm, near=nearest)
-        if all:
-            found = dataclasses.replace(found, **_all_of(*given, results._replace(found=found), route))
-    else:
-        found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
-    if not (traced or np.all(found.converged)):
-        missed = np.asarray(found.q)[~np.asarray(found.converged)]
-        said = advice(robot, route.asked(settings), route.held(settings), missed)
-        found = dataclasses.replace(found, advice=said)
-    return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
+            found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
+        if not (traced or np.all(found.converged)):
+            missed = np.asarray(found.q)[~np.asarray(found.converged)]
+            said = advice(robot, route.asked(settings), route.held(settings), missed)
+            found = dataclasses.replace(found, advice=said)
+        return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 
 # a program that returns its arguments makes arrays of them in a sixth of the time that jax.device_put takes

@@ -8,13 +8,13 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .._errors import OsikValueError
 from ..control._checks import check_tasks
 from ..kinematics import difference, forward_kinematics
 from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, limit_box, with_own_limits
+from ..numerics._host import is_traced, on_host
 from ..robot import Robot
 from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
@@ -165,9 +165,9 @@ def _in_background(tasks: dict[str, Task]) -> dict[str, Task]:
     beside = {name: task for name, task in tasks.items() if not is_goal(task) and task.priority <= lowest}
     if not beside:
         return tasks
-    weights = [[task.weight for task in own] for own in (beside.values(), goals)]
-    # by NumPy unless traced, because JAX's dispatch costs more
-    numbers: Any = jnp if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(weights)) else np
+    # by NumPy unless traced, because JAX's dispatch costs more; inside jit its maximum of an array of JAX is traced
+    weights = [[on_host(task.weight) for task in own] for own in (beside.values(), goals)]
+    numbers: Any = jnp if is_traced(weights) else np
     heaviest, light = (numbers.max(numbers.stack([numbers.max(weight) for weight in own])) for own in weights)
     share = numbers.minimum(1.0, _BACKGROUND * light / numbers.where(heaviest > 0.0, heaviest, 1.0))
     if numbers is np and share >= 1.0:

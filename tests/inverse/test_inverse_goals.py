@@ -56,6 +56,15 @@ def test_tasks_on_velocities_are_preferences_that_give_way(planar, name):
     assert answer.converged and set(answer.residual) == {"tip"}
 
 
+def test_a_heavy_preference_gives_way_inside_jit_too(planar):
+    """Tasks that are made outside, of which only a target is traced."""
+    tasks = {"tip": tip(planar), "rest": osik.PostureTask(planar, weight=1e3)}
+    answer = jax.jit(lambda place: found(planar, tasks, targets={"tip": place}))(REACH - [0.1, 0, 0])
+    assert answer.converged
+    where = osik.forward_kinematics(planar, answer.q).frame_pose(planar, "tip")[0]
+    np.testing.assert_allclose(where, REACH - [0.1, 0, 0], atol=1e-3)
+
+
 def test_frozen_joints_stay_as_in_q0_or_are_no_solution(planar):
     q0 = jnp.array([0.7, 1.0, -0.3])
     held = found(planar, {"tip": tip(planar), "still": osik.FreezeTask(planar, ("b",))}, q0=q0)

@@ -159,6 +159,21 @@ def test_nearest_finds_what_the_plain_call_finds(rng):
     assert np.asarray(fixed).any() and (np.asarray(traced) >= np.asarray(fixed)).all()
 
 
+@pytest.mark.parametrize("options", [{}, {"nearest": True}])
+def test_numbers_inside_jit_are_searched_as_outside(planar, options):
+    """Of a target out of reach, where the search goes on to the least error."""
+    target = np.array([1.2, 0.3, 0.0])
+    outside = osik.inverse_kinematics(planar, {"tip": target}, seeds=4, restarts=0, **options)
+
+    def inside(angle):
+        found = osik.inverse_kinematics(planar, {"tip": target}, seeds=4, restarts=0, **options)
+        return found.q + angle, found.position_error
+
+    q, error = jax.jit(inside)(0.5)
+    np.testing.assert_allclose(q - 0.5, outside.q, atol=1e-12)
+    assert error == outside.position_error == pytest.approx(np.hypot(1.2, 0.3) - 0.9, abs=1e-9)
+
+
 def test_one_and_many_and_each_way_to_write_a_pose(arm):
     position, rotation = mujoco_pose(arm, np.asarray(arm.q0) + 0.1, "hand")
     quaternion = np.zeros(4)
