@@ -265,9 +265,12 @@ def explored(
         x = jnp.take_along_axis(outcomes.x, best[:, None, None], 1)[:, 0]
         score = jnp.take_along_axis(outcomes.errors.score, best[:, None], 1)[:, 0]
         unmet, loose = score > 1.0, score > fixed_search.enough
-        if not (go_on and route.starts_anew):
-            x, more = fixed_search.settled(x, goals, unmet) if go_on else (x, jnp.zeros_like(best))
-            return outcomes, alone, Closest(x, jnp.zeros_like(score), best, more)
+        if not go_on:
+            return outcomes, alone, Closest(x, jnp.zeros_like(score), best, jnp.zeros_like(best))
+        if not route.starts_anew:
+            rest, more = fixed_search.settled(x, goals, loose)
+            takes = unmet | (jax.vmap(fixed_search.errors)(rest, goals)[1].score <= 1.0)
+            return outcomes, alone, Closest(jnp.where(takes[:, None], rest, x), jnp.zeros_like(score), best, more)
         # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch
         starts = jnp.where(unmet[:, None, None], outcomes.x, x[:, None])
         further = closest(fixed_search, goals, starts, loose, near=near)

@@ -23,11 +23,18 @@ AT_LIMIT = 1e-6
 """A joint that is nearer to its limit is at it [rad or m]: in single precision searches keep just inside."""
 
 
+def ranks(search: Any) -> dict[str, int]:
+    """Return the level of each task by name: -1 for hard tasks, else the priority if the scheme has priorities."""
+    ranked = not isinstance(search.scheme, WeightedQP)
+    return {name: -1 if task.hard else task.priority if ranked else 0 for name, task in search.tasks.items()}
+
+
 def has_minimum(search: Any) -> bool:
     """Return whether goals of one level in joint ranges are all that counts, so that a sum of squares is minimised."""
-    ranges = all(isinstance(limit, ConfigurationLimit) for limit in search.limits)
-    soft = not any(task.hard for task in search.tasks.values())
-    return isinstance(search.scheme, WeightedQP) and soft and ranges and not independent_balls(search.robot.tree)
+    rank, ranges = ranks(search), all(isinstance(limit, ConfigurationLimit) for limit in search.limits)
+    # preferences of lower levels give way to the goals
+    top = all(rank[name] == min(rank.values()) for name, task in search.tasks.items() if task.is_goal or task.hard)
+    return top and ranges and not independent_balls(search.robot.tree)
 
 
 def settled(

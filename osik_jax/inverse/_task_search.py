@@ -18,13 +18,13 @@ from ..numerics._arguments import numbers_for
 from ..robot import Robot
 from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
-from ..schemes import Scheme, VelocityProblem, WeightedQP
+from ..schemes import Scheme, VelocityProblem
 from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
 from ._pool import Errors
 from ._seeds import unit_points
-from ._task_minimum import has_minimum, rate_at_rest, settled
+from ._task_minimum import has_minimum, ranks, rate_at_rest, settled
 from ._turns import unwound
 
 _LONGEST = 1.0
@@ -174,9 +174,7 @@ class TaskSearch(eqx.Module):
         return rows, Errors(position, orientation, score, jnp.asarray(cost))
 
     def _cost(self, q: Float[Array, " nq"], goal: Aims) -> Float[Array, ""]:
-        rows, _ = self.errors(q, goal)
-        ranked = not isinstance(self.scheme, WeightedQP)
-        rank = {name: -1 if task.hard else task.priority if ranked else 0 for name, task in self.tasks.items()}
+        rows, rank = self.errors(q, goal)[0], ranks(self)
         lowest = max(rank[name] for name in rows)
         levels = sorted({rank[name] for name in rows} | {lowest})
         squares = [

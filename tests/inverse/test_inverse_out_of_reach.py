@@ -214,17 +214,20 @@ def differences(function, at, step=1e-6):
     return np.stack([(function(*at + step * e) - function(*at - step * e)) / (2.0 * step) for e in np.eye(2)], -1)
 
 
-@pytest.mark.variants(slow=["True"])
-@pytest.mark.parametrize("by_tasks", [False, True])
-def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar, by_tasks):
-    """In closed form: stretched towards the target, and with the first joint at its limit."""
+@pytest.mark.variants(slow=["a task", "a level", "hard"])
+@pytest.mark.parametrize("by", ["a pose", "a task", "a level", "hard"])
+def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar, by):
+    """In closed form: stretched towards the target, and with the first joint at its limit; a posture gives way."""
 
     def find(p):
-        goal = osik.FrameTask(planar, "tip", rows="position", target=p, weight=3.0) if by_tasks else p
-        found = osik.inverse_kinematics(planar, {"tip": goal}, seeds=4, steps=40)
+        goal = osik.FrameTask(planar, "tip", rows="position", target=p, weight=3.0, priority=1, hard=by == "hard")
+        tasks: Any = {"tip": p if by == "a pose" else goal}
+        if by in ("a level", "hard"):
+            tasks["posture"] = osik.PostureTask(planar, target=[1.0, 1.0], priority=2)
+        found = osik.inverse_kinematics(planar, tasks, seeds=4, steps=40)
         return found.q, found.position_error, found.orientation_error
 
-    slopes = (jax.jacfwd,) if by_tasks else (jax.jacfwd, jax.jacrev)
+    slopes = (jax.jacfwd, jax.jacrev) if by == "a pose" else (jax.jacfwd,)
     both = jax.jit(jax.vmap(lambda p: (find(p), *(slope(find)(p) for slope in slopes))))
     targets = np.array([[1.2, 0.3, 0.0], [-1.3, 0.05, 0.0], [3.0, 0.0, 0.0], [0.9005, 0.0, 0.0]])
     (q, error, _), *rates = both(targets)
