@@ -24,6 +24,8 @@ _SCRIPT = re.compile(
     re.DOTALL,
 )
 """Scripts from elsewhere and for them: require.js, MathJax, and a module that loads Mermaid's diagrams."""
+_ELSEWHERE = re.compile(r'<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)="https?://[^"]*|@import [^;]*https?://[^;]*')
+"""What a browser would fetch from another host."""
 
 
 class _Page(HTMLExporter):
@@ -42,8 +44,15 @@ def _as_mathml(found: re.Match[str]) -> str:
 
 
 def page_of(notebook: Path) -> str:
-    """Return the page of an executed notebook."""
-    return _SCRIPT.sub("", _Page().from_filename(str(notebook))[0])
+    """Return the page of an executed notebook.
+
+    Raises:
+        ValueError: the page would load something from another host.
+    """
+    page = _SCRIPT.sub("", _Page().from_filename(str(notebook))[0])
+    if loads := _ELSEWHERE.search(page):
+        raise ValueError(f"the page of {notebook.name} loads {loads[0]}; add its tag to _SCRIPT")
+    return page
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
