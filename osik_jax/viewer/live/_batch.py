@@ -17,7 +17,7 @@ from ...limits import Limits
 from ...robot import Robot
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
-from ...tasks import FrameTask, Task
+from ...tasks import Task
 from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
@@ -168,10 +168,10 @@ class BatchView(Served):
     def _retarget(self, name: str, lane: int, target: Any, *, together: bool, owner: int | None) -> None:
         """Set the target of the robot in a lane; if ``together``, move those of the others by the same displacement."""
         own: Any = self._tasks[lane][name]
-        new = jax.tree.map(np.asarray, own.replace(target=target).target)
+        new = own.replace(target=target)
         others: list[Any] = [tasks[name] for tasks in self._tasks]
         each = [_displaced(task, own, new) if together else task.target for task in others]
-        each[lane] = new
+        each[lane] = jax.tree.map(np.asarray, new.target)
         self.loop.aim(name, jax.tree.map(lambda *rows: np.stack(rows), *each), owner=owner)
 
     def _gone(self, client: ClientHandle) -> None:
@@ -184,12 +184,12 @@ class BatchView(Served):
         self.loop.stop()
 
 
-def _displaced(task: Any, led: Any, new: Any) -> Any:
-    """Return a task's target, moved and rotated as the dragged one was."""
-    if not isinstance(task, FrameTask):
-        return np.asarray(task.target) + new - np.asarray(led.target)
-    (position, rotation), (old, turned) = task.target, led.target
-    return position + new[0] - old, new[1] @ turned.T @ rotation
+def _displaced(task: Task, led: Task, new: Task) -> Any:
+    """Return a task's target, moved and rotated as the target of a dragged task was from ``led`` to ``new``."""
+    grips = [one.grip() for one in (task, led, new)]
+    (position, rotation), (old, turned), (there, turn) = (grip for grip in grips if grip is not None)
+    turn = np.eye(3) if rotation is None or turned is None or turn is None else turn @ turned.T @ rotation
+    return task.gripped(np.asarray(position + there - old), np.asarray(turn))
 
 
 def serve_batch(

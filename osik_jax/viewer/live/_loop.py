@@ -21,13 +21,12 @@ from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
-from ._hold import targets_here
 from ._obstacles import moved
 from ._priority import CONTROL, be_nice
 from ._push import Push
 from ._recorder import Recorder
 from ._snapshot import Recording, Snapshot
-from ._step import Controller, Program, State, with_targets
+from ._step import Controller, Program, State, targets_here, with_targets
 from ._timing import Stopwatch, Timing
 
 _LATE = 5
@@ -284,6 +283,7 @@ class ControlLoop:
                 # numbers may have changed during compilation, so the wanted controller runs, not the compiled one
                 self._running, self._is_behind = self._wanted, False
                 self._job = _Job(program, with_targets(self._running, self._targets).numbers())
+        self._here(list(controller.tasks))  # compiled here, so that the control thread need not
 
     def _not_compiled(self, controller: Controller, error: Exception) -> None:
         """Return to the running controller and report the error."""
@@ -364,9 +364,16 @@ class ControlLoop:
         """Set the targets of these tasks to the robot's current pose."""
         if not names:
             return
-        q, tasks = self._snapshot.q, self._running.tasks
-        each = [targets_here(self.robot, row, tasks, names) for row in np.atleast_2d(q)]
-        here = jax.tree.map(lambda *rows: np.stack(rows), *each) if self._batched else each[0]
+        here = self._here(names)
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
             self._retarget(here)
+
+    def _here(self, names: list[str]) -> dict[str, Any]:
+        """Return the targets that tasks meet at the robot's current configuration."""
+        q, tasks = self._snapshot.q, {name: self._running.tasks[name] for name in names if name in self._running.tasks}
+        if not self._batched:
+            return targets_here(self.robot, q, tasks, names)
+        own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
+        each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
+        return jax.tree.map(lambda *rows: np.stack(rows), *each)
