@@ -11,9 +11,9 @@ from PIL import Image
 
 from ..collision import CollisionShape
 from ..robot import Robot
+from ..robot._mujoco import mujoco_poses, robot_com
 from ._animate import paint_over
 from ._fixed import fixed_parts
-from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer

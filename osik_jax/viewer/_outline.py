@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..robot import Robot
-from ._mujoco import mujoco_poses
+from ..robot._mujoco import mujoco_poses
 from ._parts import RobotParts, robot_parts
 
 

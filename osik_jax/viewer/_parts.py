@@ -16,8 +16,8 @@ from scipy.spatial import ConvexHull, QhullError
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._look import Look
+from ..robot._mujoco import home_poses, model_bodies
 from ..robot.loading._mjmodel import rotation_matrix
-from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
 
@@ -194,7 +194,7 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 def _sticks(robot: Robot) -> RobotParts:
     """Return dots on bodies with joints, and sticks from each body to its parent and to its tip."""
-    model, tips, data = robot.mj_model, _tips(robot), next(mujoco_poses(robot, np.asarray(robot.q0)))
+    model, tips, data = robot.mj_model, _tips(robot), home_poses(robot)
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
     length[: model.nbody][model.body_parentid == 0] = 0.0

@@ -13,8 +13,8 @@ import osik_jax as osik
 from osik_jax import tasks as module
 from osik_jax.batching._names import leaf_names
 from osik_jax.control._units import unit_of
+from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from osik_jax.tasks._task import CoreCard
-from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 
 CLASSES = {name for name, own in vars(module).items() if isinstance(own, type) and issubclass(own, osik.Task)} - {
     "Task"

@@ -16,7 +16,8 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import viewer
-from osik_jax.viewer import _animate, _mujoco, _opengl
+from osik_jax.robot import _mujoco
+from osik_jax.viewer import _animate, _opengl
 from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster

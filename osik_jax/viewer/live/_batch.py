@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,17 +14,17 @@ from ..._errors import OsikValueError, unknown_name
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
+from ...robot._mujoco import mujoco_poses
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import Task
-from .._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._gizmos import Gizmos, Pose, gizmo_target
 from ._loop import ControlLoop
 from ._readout import error_text, state_text, timing_text
 from ._robot_nodes import RobotNodes, add_label, side_by_side
-from ._server import FRAME, WORDS, Served
+from ._server import FRAME, WORDS, Driving, show_texts
 from ._step import Controller, stacked
 from ._surroundings import add_surroundings
 
@@ -36,7 +35,7 @@ _APART = 0.6
 """Least distance between robots, in sizes of a robot, so that they can move."""
 
 
-class BatchView(Served):
+class BatchView(Driving):
     """Page that runs a batch of robots; ``serve_batch`` says what it has."""
 
     def __init__(
@@ -115,11 +114,10 @@ class BatchView(Served):
 
     def _send_motion(self, event: GuiEvent[Any]) -> None:
         """Send the recording to the visitor, in the format of ``osik demo``."""
-        recording, buffer = self.loop.recorded(), io.BytesIO()
+        recording = self.loop.recorded()
         if len(recording.time) and event.client is not None:
             runs = {f"q_{name}": recording.q[:, lane] for lane, name in enumerate(self.names)}
-            np.savez_compressed(buffer, allow_pickle=False, time=recording.time, **runs)
-            event.client.send_file_download("motion.npz", buffer.getvalue(), save_immediately=True)
+            event.client.send_file_download("motion.npz", recording.to_npz(**runs), save_immediately=True)
 
     def _run(self) -> None:
         count = 0
@@ -135,9 +133,7 @@ class BatchView(Served):
     def _tell(self) -> None:
         snapshot = self.loop.snapshot
         texts = (state_text(snapshot), timing_text(snapshot, self.loop.timing), self._table())
-        for handle, text in zip((self._state, self._timing, self._errors), texts, strict=True):
-            if handle.content != text:
-                handle.content = text
+        show_texts(zip((self._state, self._timing, self._errors), texts, strict=True))
 
     def _table(self) -> str:
         """Return a table of all tasks' errors for all robots."""
@@ -158,10 +154,8 @@ class BatchView(Served):
             if phase != "end":
                 target = gizmo_target(self._tasks[lane][name], pose)
                 self._retarget(name, lane, target, together=self._together.value, owner=visitor)
-            elif visitor in self._server.get_clients():
-                self.loop.let_go(visitor)
             else:
-                self.loop.release(visitor)
+                self._let_go(visitor)
 
         return drag
 
@@ -179,9 +173,6 @@ class BatchView(Served):
         for gizmos in self._gizmos:
             gizmos.drop(client.client_id)
         self.loop.release(client.client_id)
-
-    def _close(self) -> None:
-        self.loop.stop()
 
 
 def _displaced(task: Task, led: Task, new: Task) -> Any:

@@ -117,7 +117,7 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
     run = step if batch is None else jax.vmap(step)
     q, still = jnp.broadcast_to(robot.q0, (*lead, robot.nq)), jnp.zeros((*lead, robot.nv), robot.q0.dtype)
     traced = jax.eval_shape(run, numbers, (q, still, None), still)
-    cold = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), traced[0][2])
+    cold = jax.tree.map(jnp.zeros_like, traced[0][2])
     return Program(jax.jit(run).lower(numbers, (q, still, cold), still).compile(), cold)
 
 
