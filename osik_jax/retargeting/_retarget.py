@@ -33,8 +33,7 @@ from ._lanes import (
 )
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
-from ._path import with_path
-from ._person import read_person
+from ._person import read_person, with_path
 from ._profile import Limb, Profile
 from ._retargeted import Retargeted, as_retargeted
 from ._source_motion import SourceMotion
