@@ -24,8 +24,8 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.cli import read_robot
 from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.runtime import configure_cpu
-from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._default import find_hands

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.viewer._animate import paint_over, write_gif
-from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer._opengl import make_renderer
 from osik_jax.viewer._outline import floor_height
 from osik_jax.viewer._overlay import INK, ORANGE, Canvas

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from ._messages import CommandError, progress, told, writing
 from ._robots import read_robot
@@ -55,10 +55,7 @@ class Demo:
         from rich.console import Console
         from rich.markup import escape
 
-        from .._progress import spoken
-        from ..demo._demo import run_demo
-        from ..demo._estimate import estimate_seconds
-        from ..demo._folder import writable_folder
+        from ..demo._demo import run_demo, writable_folder
 
         console = Console()
         motion, dt = demo_motion(self), 1.0 / self.frequency
@@ -66,11 +63,19 @@ class Demo:
             out = writable_folder(self.out, motion, schemes=len(self.schemes), dt=dt)
         for note in motion.notes:
             console.print(f"[yellow]note:[/yellow] {escape(note)}")
-        settings: Any = dict(schemes=self.schemes, dt=dt, animation=self.animation, physics=self.physics)
-        console.print(f"{escape(motion.title)}: this will take about {spoken(estimate_seconds(motion, **settings))}")
-        settings |= dict(picture=self.picture, renderer=self.renderer)
+        console.print(escape(motion.title))
         with writing(out), progress(console) as announce:
-            shown, _ = run_demo(motion, out, announce=announce, **settings)
+            shown, _ = run_demo(
+                motion,
+                out,
+                schemes=self.schemes,
+                dt=dt,
+                physics=self.physics,
+                animation=self.animation,
+                picture=self.picture,
+                renderer=self.renderer,
+                announce=announce,
+            )
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)
         return 0

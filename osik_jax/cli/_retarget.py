@@ -33,6 +33,8 @@ _COLUMNS = {
 }
 _MOST_ROWS, _MOST_NOTES = 50, 10
 _LIVE = ("look_ahead", "iterations", "budget")
+_HELD_OUT = 4
+"""Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,24 +157,27 @@ def _fit(command: Retarget, file: Path) -> None:
     """Write a profile found by a folder's clips."""
     from rich.console import Console
 
-    from ..retargeting._command import fit_to_file
+    from .. import retargeting
 
     with told():
         if not os.path.isdir(command.clip):
             raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
-        found, learned, held_out = fit_to_file(
+        motions: Any = _reader(command).all_in(Path(command.clip))
+        held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]
+        learned = [motion for number, motion in enumerate(motions, 1) if number % _HELD_OUT]
+        found = retargeting.fit(
             _robot_to_retarget(command.robot, command.base),
-            Path(command.clip),
-            file,
+            learned,
+            held_out=held_out,
             profile=_profile(command.profile),
             mapping=_mapping(command.mapping),
             acceleration=command.acceleration,
-            reader=_reader(command),
         )
+        retargeting.save_profile(found.profile, file)
     step, losses = found.step, found.losses
-    said = f"step {step} of {len(losses) - 1}: the loss of {learned} clips is {losses[step]:.3f} times what it was"
+    said = f"step {step} of {len(losses) - 1}: the loss of {len(learned)} clips is {losses[step]:.3f} times what it was"
     if held_out:
-        said += f", of {held_out} held out {found.held_out[step]:.3f} times"
+        said += f", of {len(held_out)} held out {found.held_out[step]:.3f} times"
     _say(Console(), f"{said}\nwritten to {file}")
 
 

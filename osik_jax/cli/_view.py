@@ -44,7 +44,8 @@ class View:
 
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends."""
-        from ..viewer.live import _open, _server
+        from ..viewer.live import _open, _playback, _server, load_session, serve
+        from ..viewer.live._export import write_page
         from ..viewer.live._source import RobotSource
 
         with told():
@@ -55,22 +56,23 @@ class View:
             refuse(self, self.file is not None, ("support",), "a robot to drag, not with a file")
             _server.import_viser()
             _server.check_port(self.host, 0 if self.html is not None else self.port)
-            source = RobotSource(self.robot, FLOATING[self.base])
+            options: Any = dict(host=self.host, port=self.port)
             if self.file is not None and saved:
-                view = _open.open_session(self.file, host=self.host, port=self.port)
+                view = serve(load_session(self.file), **options)
+            elif self.file is None:
+                robot = read_robot(self.robot, self.base)
+                source = RobotSource(self.robot, FLOATING[self.base])
+                view = _open.open_robot(robot, source, self.support or _feet(robot), **options)
+            elif _open.is_map(self.file):
+                view = _open.open_map(self.file, read_robot(self.robot, self.base), **options)
             else:
-                robot = read_robot(source.robot, self.base)
-                options: Any = dict(host=self.host, port=self.port)
-                if self.file is not None and self.html is not None:
-                    _open.write_motion(self.file, robot, self.html)
+                robot = read_robot(self.robot, self.base)
+                motion = _playback.read_motion(self.file, robot)
+                if self.html is not None:
+                    write_page(robot, motion, self.html, title=self.file.stem)
                     print(f"written: {self.html}")
                     return 0
-                if self.file is not None:
-                    opened = _open.open_map if _open.is_map(self.file) else _open.open_motion
-                    view = opened(self.file, robot, **options)
-                else:
-                    feet = self.support or _feet(robot)
-                    view = _open.open_robot(robot, source, feet, **options)
+                view = _playback.Player(robot, motion, title=self.file.name, **options)
         print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
         if self.browser:
             webbrowser.open(view.url)

@@ -112,7 +112,9 @@ def simulate(
     step = partial(program, static=static)
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
-    memory = _cold_start(lambda state: step(0.0, *state, (None, None), _at(paths, 0))[1], (held, held))
+    # traced and not run, so that the first step finds its program compiled
+    first = jax.eval_shape(lambda: step(0.0, held, held, (None, None), _at(paths, 0))[1])
+    memory = jax.tree.map(jnp.zeros_like, (first.velocity, first.warm_start))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_step is not None:
@@ -160,15 +162,6 @@ def _control_step(
         return command(robot, last, sensed, solution.velocity, dt), solution
     start, time = (last, dt) if command is None else (sensed, command)
     return integrate(robot, start, solution.velocity, time), solution
-
-
-def _cold_start(step: Callable[[Any], Solution], state: Any) -> Any:
-    """Return zeros in the shape of the last velocity and of a warm start, from a step that is traced and not run.
-
-    So the first one compiles no program.
-    """
-    one = jax.eval_shape(step, state)
-    return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), (one.velocity, one.warm_start))
 
 
 def _at(paths: Targets | None, k: int) -> Targets | None:

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
+from ..robot._mujoco import mujoco_frame_pose
 from ..robot._tree import FREE
-from ._world import World, frame_pose
+from ._world import World
 
 FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6
 """A robot has fallen whose base has turned by more from upright, or is lower than this part of its first height."""
@@ -129,7 +130,7 @@ class Simulation:
         Raises:
             KeyError: no such frame.
         """
-        return frame_pose(self.world.robot, self.data, frame)
+        return mujoco_frame_pose(self.world.robot, self.data, frame)
 
     def com(self) -> Float[np.ndarray, "3"]:
         """Return the centre of mass [m] of the robot. (3,)."""

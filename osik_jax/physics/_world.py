@@ -17,7 +17,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._forward import body_masses
 from ..robot import Robot
 from ..robot._feet import with_corners
-from ..robot._own_masses import own_masses
+from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose, own_masses
 from ..robot._tree import BALL, FREE
 from ..robot.loading._mjmodel import element_names
 from ._servo import Servo as Servo
@@ -38,15 +38,8 @@ _COPIED = (
 
 _GEARED = dict(solref=(0.004, 1.0), solimp=(0.99, 0.999, 0.001, 0.5, 2.0))
 """One motor that turns two joints is stiffer than MuJoCo's default for an equality."""
-
-
-_SHAPES = (
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-    mujoco.mjtGeom.mjGEOM_CAPSULE,
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX,
-)
+_SHAPES = range(int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_BOX) + 1)
+"""Geom types that a world shows: sphere, capsule, ellipsoid, cylinder and box."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +109,8 @@ def build_world(
     body_masses(robot)  # raises if there is no mass
     points = _contact_points(robot, feet)
     drives = choose_servos(robot, servos or {})
-    home = _home(robot)
-    poses = {foot: frame_pose(robot, home, foot) for foot in points}
+    home = home_poses(robot)
+    poses = {foot: mujoco_frame_pose(robot, home, foot) for foot in points}
     lowest = [float((p + points[foot] @ R.T)[:, 2].min()) for foot, (p, R) in poses.items()]
     height = (min(lowest) if lowest else 0.0) if floor is None else float(floor)
     spec = mujoco.MjSpec()
@@ -167,13 +160,13 @@ def _in_frame(robot: Robot, frame: str, points: Float[np.ndarray, "k 3"]) -> Flo
 
 def sole_points(robot: Robot, frame: str) -> Float[np.ndarray, "k 3"]:
     """Return the lower corners, at home, of colliding boxes on the frame's body; without boxes, its corner sites."""
-    model, data = robot.mj_model, _home(robot)
-    body = _model_body(robot, robot.tree.frame_bodies[robot.tree.frame(frame)])
+    model, data = robot.mj_model, home_poses(robot)
+    body = model_bodies(robot)[robot.tree.frame_bodies[robot.tree.frame(frame)]]
     solid = (model.geom_bodyid == body) & ((model.geom_contype != 0) | (model.geom_conaffinity != 0))
     boxes = np.flatnonzero(solid & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX))
     if not len(boxes):
         return contact_corners(robot, frame)
-    origin, rotation = frame_pose(robot, data, frame)
+    origin, rotation = mujoco_frame_pose(robot, data, frame)
     corners = np.concatenate([_lower_corners(model, data, int(g)) for g in boxes])
     return (corners - origin) @ rotation
 
@@ -186,30 +179,6 @@ def _lower_corners(model: mujoco.MjModel, data: mujoco.MjData, box: int) -> Floa
     face = data.geom_xpos[box] - np.sign(turn[2, down]) * turn[:, down]
     left = b if a[0] * b[1] > a[1] * b[0] else -b
     return np.array([face + a + left, face - a + left, face - a - left, face + a - left])
-
-
-def _home(robot: Robot) -> mujoco.MjData:
-    """Return MuJoCo's data of the robot's own model at ``robot.q0``."""
-    data = mujoco.MjData(robot.mj_model)
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(robot.q0))
-    mujoco.mj_kinematics(robot.mj_model, data)
-    return data
-
-
-def frame_pose(
-    robot: Robot, data: mujoco.MjData, frame: str
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return position [m] and rotation of a frame in MuJoCo's data of the robot's own model or of its world."""
-    index = robot.tree.frame(frame)
-    body = _model_body(robot, robot.tree.frame_bodies[index])
-    turn = data.xmat[body].reshape(3, 3)
-    position = data.xpos[body] + turn @ np.asarray(robot.frame_position[index])
-    return position, turn @ np.asarray(robot.frame_rotation[index])
-
-
-def _model_body(robot: Robot, body: int) -> int:
-    """Return MuJoCo's number of a body of the tree."""
-    return element_names(robot.mj_model, "body").index(robot.tree.body_names[body])
 
 
 def _set_options(spec: mujoco.MjSpec, timestep: float, source: mujoco.MjModel) -> None:
@@ -246,7 +215,7 @@ def _add_bodies(spec: mujoco.MjSpec, model: mujoco.MjModel) -> list[mujoco.MjsBo
 def _add_shape(body: mujoco.MjsBody, model: mujoco.MjModel, g: int) -> None:
     """Add a geom for display alone; meshes and height fields are left out."""
     kind = mujoco.mjtGeom(int(model.geom_type[g]))
-    if kind in _SHAPES:
+    if int(kind) in _SHAPES:
         look = dict(type=kind, pos=model.geom_pos[g], quat=model.geom_quat[g], size=model.geom_size[g])
         body.add_geom(**look, rgba=model.geom_rgba[g], group=model.geom_group[g], contype=0, conaffinity=0, mass=0.0)
 
@@ -290,7 +259,7 @@ def _add_contacts(
 ) -> None:
     """Add a massless sphere on each contact point, placed up along the floor's normal as the foot stands at home."""
     index = robot.tree.frame(foot)
-    body = bodies[_model_body(robot, robot.tree.frame_bodies[index])]
+    body = bodies[model_bodies(robot)[robot.tree.frame_bodies[index]]]
     up = rotation.T @ np.array([0.0, 0.0, CONTACT_RADIUS])
     centers = np.asarray(robot.frame_position[index]) + (points + up) @ np.asarray(robot.frame_rotation[index]).T
     for k, center in enumerate(centers):

@@ -71,8 +71,6 @@ def _skeleton_beside(path: Path) -> Path:
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"no such file: {path}")
     text = path.read_text(encoding="utf-8", errors="replace")
     rows = [(number, line.split("#")[0].split()) for number, line in enumerate(text.splitlines(), 1)]
     return [(number, words) for number, words in rows if words]

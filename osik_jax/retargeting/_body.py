@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -25,7 +24,7 @@ from ._contact import stretches
 from ._facing import facing_at_home
 from ._goals import Goals
 from ._person import Person, axes_from, directions, palm_axes
-from ._profile import Limb, Profile
+from ._profile import Limb, Profile, world_points
 from ._roles import LEGS, SIDES
 from ._rotations import moved_poses
 from ._terms import ORIGIN, Bounds, reach_length
@@ -145,11 +144,10 @@ class Build:
     @classmethod
     def of(cls, robot: Robot, profile: Profile) -> Build:
         """Measure a robot at its home configuration."""
-        kinematics = jax.tree.map(np.asarray, home_kinematics(robot))
+        kinematics = home_kinematics(robot)
         root, origin = robot.tree.body_names[robot.tree.root], (0.0, 0.0, 0.0)
         places = [*profile.keypoints.values(), *profile.corners, (profile.pelvis, origin), (root, origin)]
-        positions, turns = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
-        positions = positions + np.einsum("kij,kj->ki", turns, np.array([point for _, point in places]))
+        positions = world_points(robot, kinematics, places)
         points = dict(zip(profile.keypoints, positions, strict=False))
         lengths = {(a, b): float(np.linalg.norm(points[b] - points[a])) for a, b in measured(profile)}
         lengths |= {limb: reach_length(robot, profile, limb) for limb in profile.reached if limb in lengths}
@@ -166,7 +164,7 @@ class Build:
             ankle=ankle,
             root=0.5 * (points["left_hip"] + points["right_hip"]) if profile.walks else positions[-2],
             base=positions[-1],
-            turn=turns[-1],
+            turn=np.asarray(kinematics.frame_pose(robot, root)[1]),
             facing=palm_axes(points) if profile.is_hand else facing_at_home(robot, profile.across),
             start=_with_bent_limbs(robot, profile),
             free=robot.tree.qpos_address[bases[0]] if bases else None,

@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from .._errors import OsikKeyError, OsikValueError, warn
 from ._bvh_lines import Lines
 from ._motion import HumanMotion
-from ._rest_frames import rest_frames
 from ._rotations import UNTURNED, continuous, forward
 from ._up import UPS, Up, checked_up, find_up, named, standing_up
 
@@ -29,6 +28,14 @@ _SLOWEST, _FASTEST = 1.0, 1e-5
 """Longest and shortest accepted frame time [s]."""
 _UPRIGHT = 0.6
 """Least height of the head above the feet in an upright rest pose, as a share of the path length along the joints."""
+_LIKE = np.radians(30.0)
+"""Largest rotation of a joint relative to the root in a frame taken for the rest pose [rad]; legs in CMU files have 21
+degrees in their first frame.
+"""
+_JUMP = 5.0
+"""Speed of a joint relative to the root above which the step out of the rest pose counts as a jump [m/s]."""
+_ABOVE_ALL = 3.0
+"""Least ratio of that step to every other step of the clip."""
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 
 
@@ -80,7 +87,7 @@ def read_bvh(
     )
     expected = rest_up or find_up(motion, "y")[0]
     motion = standing_up(source, motion, up, expected, rest_up)
-    count = rest_frames(motion) if trim else 0
+    count = _rest_frames(motion) if trim else 0
     if not count:
         return motion
     warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out; trim=False keeps it")
@@ -90,10 +97,27 @@ def read_bvh(
     )
 
 
+def _rest_frames(motion: HumanMotion) -> int:
+    """Return the number of rest-pose frames put before a clip's motion; 0 unless that is certain.
+
+    In these frames all joints are rotated as the root within 30 degrees. The step to the next frame moves a joint
+    relative to the root at over 5 m/s, and three times farther than any other step of the clip. So a person who starts
+    from the rest pose loses no frame. 0 if rotations or the rest pose are unknown.
+    """
+    turns = motion.rotations
+    if turns is None or motion.rest_positions is None or motion.frames < 3:
+        return 0
+    beside = motion.positions - motion.positions[:, :1]
+    steps = np.linalg.norm(np.diff(beside, axis=0), axis=-1).max(1)
+    count = int(np.argmax(steps)) + 1
+    others = np.delete(steps, count - 1)
+    jumps = steps[count - 1] * motion.fps > _JUMP and steps[count - 1] > _ABOVE_ALL * others.max()
+    alike = np.abs(np.sum(turns * turns[:, :1], -1)).min(1) > np.cos(0.5 * _LIKE)
+    return count if jumps and motion.frames - count > 1 and alike[:count].all() and not alike[count] else 0
+
+
 def _text(path: Path) -> str:
     """Return the file's text: UTF-8 with invalid bytes replaced, or UTF-16 if it starts with a byte order mark."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no such file: {path}")
     content = path.read_bytes()
     wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")

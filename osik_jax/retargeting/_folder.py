@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from .._errors import OsikValueError
+from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._lock import only_job
 from ..scaling._progress import Progress, reported
 from ._command import write_json, write_motion
-from ._lanes import Clip, one_a_core, shared_length
+from ._lanes import Clip, shared_length
 from ._load import Reader, clips_in
 from ._page import write_index
 from ._profile import Limb
@@ -118,7 +119,7 @@ class _Work:
         found = {name: _finished(out / name, of, page) for name, of in sources.items()}
         self.found = {name: own for name, own in found.items() if own is not None}
         self.failed: dict[str, str] = {}
-        self._lanes = cores() if one_a_core() else min(chunk, max(1, len(sources) - len(self.found)))
+        self._lanes = cores() if cpu_is_default() else min(chunk, max(1, len(sources) - len(self.found)))
         self._lengths = _Lengths()
         self._waiting: dict[tuple[int, tuple[Limb, ...]], list[tuple[str, Clip]]] = {}
 

@@ -15,14 +15,14 @@ from ..kinematics._home import home_kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
 from ..robot._feet import find_feet
-from ..robot._own_masses import own_masses
+from ..robot._mujoco import own_masses
 from ..robot._tree import BALL, FREE, HINGE
 from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
 from ._hand import guess_hand
 from ._limbs import ORIGIN, Chain, Limb, base_body, find_arm, find_chains, find_leg
 from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
-from ._profile import Capsule, Foot, Place, Point, Profile
+from ._profile import Capsule, Foot, Place, Point, Profile, world_points
 from ._roles import CHAINS, FINGERS, LEGS, LIMBS, NEEDED, SIDES
 
 # A foot without shapes, as shares of half the leg (ankle height: of the leg); the heel's share of its length.
@@ -325,9 +325,9 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
 
     plain = _plain_capsules(kinematics, profile, robot)
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
-    soles = [kinematics.frame_pose(robot, frame) for frame, _ in profile.corners]
-    corners = zip(soles, profile.corners, profile.rises, strict=True)
-    floor = min((float((p + R @ np.array(x))[2]) - rise for (p, R), (_, x), rise in corners), default=-np.inf)
+    floor = -np.inf
+    if profile.corners:
+        floor = float((world_points(robot, kinematics, profile.corners)[:, 2] - profile.rises).min())
     return _apart_at_home(robot, kinematics, [*seen, *missing], floor)
 
 
@@ -340,9 +340,8 @@ def _apart_at_home(robot: Robot, kinematics: Kinematics, capsules: list[Capsule]
     """
     tree, out = robot.tree, []
     bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
-    poses = [kinematics.frame_pose(robot, c.frame) for c in capsules]
-    axes = [[np.asarray(p) + np.asarray(R) @ np.array(x) for x in (c.start, c.end)]
-            for c, (p, R) in zip(capsules, poses, strict=True)]  # fmt: skip
+    ends = [(c.frame, point) for c in capsules for point in (c.start, c.end)]
+    axes = world_points(robot, kinematics, ends).reshape(-1, 2, 3) if ends else np.zeros((0, 2, 3))
     share = np.ones(len(capsules))
     for i, j in itertools.combinations(range(len(capsules)), 2):
         if joints_between(robot, bodies[i], bodies[j]) < JOINTS_APART:
@@ -475,9 +474,7 @@ def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> l
     """
 
     def place(role: str) -> np.ndarray:
-        frame, point = profile.keypoints[role]
-        position, rotation = kinematics.frame_pose(robot, frame)
-        return np.asarray(position) + np.asarray(rotation) @ np.array(point)
+        return world_points(robot, kinematics, [profile.keypoints[role]])[0]
 
     def inside(frame: str, start: np.ndarray, end: np.ndarray) -> tuple[Point, Point]:
         position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))

@@ -17,7 +17,7 @@ from ..robot._joint_selection import scalar_layout
 from ._goals import Weights
 from ._limbs import ORIGIN, Chain, find_end
 from ._person import palm_axes
-from ._profile import Place, Profile
+from ._profile import Place, Profile, world_points
 from ._roles import FINGERS
 
 _PARTS = r"(?=j\d|base|hub|meta|knuck|prox|mid|dist)"
@@ -161,9 +161,7 @@ def _bent(robot: Robot, places: list[Place], by: float = _FLEXED) -> np.ndarray:
     hinges, q = scalar & np.asarray(robot.tree.turning), np.array(robot.q0)
     room = np.asarray(robot.position_upper) + np.asarray(robot.position_lower) - 2.0 * q[index]
     q[index[hinges]] += by * np.sign(np.where(np.isfinite(room), room, 0.0))[hinges]
-    kinematics = forward_kinematics(robot, jnp.asarray(q))
-    positions, rotations = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
-    return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
+    return world_points(robot, forward_kinematics(robot, jnp.asarray(q)), places)
 
 
 def is_other_hand(robot: Robot, profile: Profile, person: Mapping[str, Float[np.ndarray, "F 3"]]) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ._motion import CONTACT_POINTS, LARGEST, HumanMotion
+from ._motion import CONTACT_POINTS, LARGEST, HumanMotion, as_number
 from ._optitrack import is_optitrack, read_optitrack
 from ._rotations import continuous
 from ._smpl import arrays_to_read, is_smpl, read_smpl
@@ -105,8 +105,6 @@ def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
 
 def _from_csv(path: Path) -> tuple[HumanMotion, Up]:
     """Return the motion in a CSV table, and the up axis expected of this kind of table."""
-    if not path.is_file():
-        raise FileNotFoundError(f"no such file: {path}")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             # a spreadsheet writes an empty line as commas
@@ -166,10 +164,7 @@ def _row(path: Path, number: int, row: list[str], headings: list[str]) -> list[f
         raise OsikValueError(f"{path}, line {number}: {len(row)} values, but there are {len(headings)} headings")
     out = []
     for heading, text in zip(headings, row, strict=True):
-        try:
-            value = float(text)
-        except ValueError:
-            value = np.nan
+        value = as_number(text)
         if not abs(value) <= LARGEST:
             raise OsikValueError(
                 f"{path}, line {number}, column {heading}: {text!r} is no finite number up to {LARGEST:g}"

@@ -13,6 +13,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..limits import Limit
 from ..scaling import sharded
@@ -74,11 +75,6 @@ def even(count: int, most: int) -> int:
     return -(-count // -(-count // most)) if most > 0 else most
 
 
-def one_a_core() -> bool:
-    """Return whether each CPU core works on one clip at a time, instead of one program for all clips."""
-    return jax.default_backend() == "cpu"
-
-
 _Lane = tuple[Goals, Array, Bounds, Array]
 
 
@@ -88,9 +84,9 @@ def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
     XLA programs release Python's lock, so threads run in parallel. ``shared``: the arguments of ``solve_lane`` after
     the lane.
     """
-    if not one_a_core() and len(jax.devices()) > 1:
+    if not cpu_is_default() and len(jax.devices()) > 1:
         return _over_devices(len(shared))(lanes, *shared)
-    if not one_a_core() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
+    if not cpu_is_default() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
         return solve_lanes(lanes, *shared)
 
     def one(i: int) -> Solved:
@@ -121,7 +117,7 @@ def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
     def one(lane: _Lane) -> Solved:
         return solve_lane(lane, *shared)
 
-    if one_a_core():
+    if cpu_is_default():
         # one after another: side by side they would wait for the slowest, and leave the cache in between
         return jax.lax.map(one, lanes)
     return jax.vmap(one)(lanes)

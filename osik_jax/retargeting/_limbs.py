@@ -13,6 +13,7 @@ from jaxtyping import Float
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
+from ..robot._mujoco import home_poses
 from ..robot._tree import BALL, HINGE
 from ._link_shapes import SHAPES, geom_points
 from ._profile import Place, Point
@@ -262,9 +263,7 @@ def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.nda
         most: largest length accepted without meshes [m].
     """
     model = robot.mj_model
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(robot.q0))
-    mujoco.mj_kinematics(model, data)
+    data = home_poses(robot)
     own = model.body(robot.tree.body_names[body]).id
     fixed = [b for b in range(model.nbody) if model.body_weldid[b] == model.body_weldid[own]]
     geoms = np.flatnonzero(np.isin(model.geom_bodyid, fixed) & np.isin(model.geom_type, SHAPES))

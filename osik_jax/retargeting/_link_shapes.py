@@ -26,6 +26,8 @@ _ROUND = 1e-6
 """Relative difference below which semi-axes count as equal."""
 
 _GEOM = mujoco.mjtGeom
+SHAPES = range(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_MESH) + 1)
+"""Kinds of geoms with a size: sphere, capsule, ellipsoid, cylinder, box and mesh."""
 
 
 class Extent(NamedTuple):
@@ -95,10 +97,8 @@ def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
 
 def geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
     """Return the corners of the box around a geom, or the vertices of a mesh, in the body's frame [m]."""
-    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-    if kind in _HALVES:
-        corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * _HALVES[kind](size)
-    else:
+    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * model.geom_aabb[geom, 3:]
+    if model.geom_type[geom] == _GEOM.mjGEOM_MESH:
         corners = mesh_vertices(model, geom)
     return model.geom_pos[geom] + corners @ rotation_matrix(model.geom_quat[geom]).T
 
@@ -122,15 +122,3 @@ def _unread_points(robot: Robot, body: int) -> list[Float[np.ndarray, "k 3"]]:
                 continue
             out.append(np.array(mesh.position) + points @ np.array(mesh.rotation).T)
     return out
-
-
-_HALVES = {
-    int(_GEOM.mjGEOM_SPHERE): lambda size: np.full(3, size[0]),
-    int(_GEOM.mjGEOM_CAPSULE): lambda size: np.array([size[0], size[0], size[0] + size[1]]),
-    int(_GEOM.mjGEOM_CYLINDER): lambda size: np.array([size[0], size[0], size[1]]),
-    int(_GEOM.mjGEOM_ELLIPSOID): np.array,
-    int(_GEOM.mjGEOM_BOX): np.array,
-}
-"""Half lengths of the box around a geom [m], from MuJoCo's sizes."""
-SHAPES = (*_HALVES, int(_GEOM.mjGEOM_MESH))
-"""Kinds of geoms with a size."""

@@ -43,17 +43,17 @@ def load_motion(
         KeyError: no such unit.
     """
     ending = Path(path).suffix.lower()
+    if ending not in ENDINGS and (ending or Path(path).exists()):  # a misspelt folder has no ending, and is missing
+        raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
+    if unit is not None and ending in ENDINGS and ending != ".bvh":
+        raise OsikValueError("unit goes with BVH files; keypoints are metres, and an .asf says its unit")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no such file: {path}")
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up, trim=trim)
-    if ending == ".amc" and unit is None:
+    if ending == ".amc":
         motion = read_amc(Path(path))
         return standing_up(str(path), motion, checked_up(up), "y", find_rest_up(motion))
-    if ending not in ENDINGS:
-        if not ending and not Path(path).exists():  # e.g. a misspelt folder, whose missing ending is not the fault
-            raise FileNotFoundError(f"no such file: {path}")
-        raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
-    if unit is not None:
-        raise OsikValueError("unit goes with BVH files; keypoints are metres, and an .asf says its unit")
     return read_keypoints(path, up=up)
 
 
@@ -88,6 +88,16 @@ class Reader:
         ending = path.suffix.lower()
         unit, fps = self.unit if ending == ".bvh" else None, self.fps if ending == ".csv" else None
         return dataclasses.replace(self, unit=unit, fps=fps)(path)
+
+    def all_in(self, folder: Path) -> list[HumanMotion | SourceMotion]:
+        """Read all clips of a folder in order of name; an error's message starts with the clip's name."""
+        motions = []
+        for name, path in clips_in(folder)[0].items():
+            try:
+                motions.append(self.in_folder(path))
+            except (ValueError, KeyError) as error:
+                raise type(error)(f"{name}: {error.args[0]}") from error
+        return motions
 
     def options(self) -> dict[str, Any]:
         """Return the options that change what the reader returns, as numbers and strings."""

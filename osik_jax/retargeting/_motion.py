@@ -151,12 +151,17 @@ def check_rate(fps: float) -> float:
     return fps
 
 
+def as_number(word: str) -> float:
+    """Return a word as a number; NaN if it is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
+
+
 def finite_numbers(path: Path, number: int, words: list[str]) -> list[float]:
     """Return words of a line of a file as numbers, or raise ValueError that names the line."""
-    try:
-        values = [float(word) for word in words]
-    except ValueError:
-        values = [np.nan]
+    values = [as_number(word) for word in words]
     if not np.isfinite(values).all():
         raise OsikValueError(f"{path}, line {number}: not finite numbers: {' '.join(words)[:60]}")
     return values

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .._errors import OsikValueError
-from ._motion import HumanMotion
+from ._motion import HumanMotion, as_number
 from ._rotations import continuous
 
 _UNITS = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
@@ -72,10 +72,7 @@ def read_optitrack(path: Path, rows: Rows) -> HumanMotion:
 
 def _number(path: Path, line: int, row: list[str], column: int | None) -> float:
     assert column is not None
-    try:
-        value = float(row[column])
-    except (ValueError, IndexError):
-        value = np.nan
+    value = as_number("".join(row[column : column + 1]))
     if not np.isfinite(value):
         raise OsikValueError(f"{path}, line {line}, column {column + 1}: no finite number; fill gaps before exporting")
     return value

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError, warn
-from ._contact import find_contact, find_noise
+from ._contact import find_contact, find_noise, mean_over, noise_steps
 from ._floor import Floor, find_floor
 from ._motion import CONTACT_POINTS, HumanMotion, Touch
 from ._profile import Limb
@@ -29,6 +29,9 @@ _FLAT = 0.05
 _TALL = 0.05
 # Lengths of a leg [m] outside which the file's unit must be wrong.
 _LEGS = (0.1, 3.0)
+
+_CENTERED = 0.02
+"""Largest distance of the middle of the hips from the origin in all frames of such a clip [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -366,3 +369,33 @@ def _heel(points: Mapping[str, np.ndarray], flat: Mapping[str, np.ndarray], side
     heel = ankle - _HEEL * (toe - ankle)
     heel[2] = toe[2]
     return points[f"{side}_ankle"] + axes(points) @ (axes(flat)[0].T @ (heel - ankle))
+
+
+def with_path(motion: HumanMotion, roles: Mapping[str, str]) -> HumanMotion:
+    """Return a clip with the person's path, if the middle of the hips is its origin, as pose estimators have it.
+
+    The lowest of heels and toes (of ankles without these) is on the floor in each frame, and does not move to the next.
+    So a jump has no flight. An ``OsikWarning`` says that the path is inferred.
+
+    Args:
+        motion: the clip, z up.
+        roles: joint name of the clip for each role (``find_roles``).
+    """
+    points = {role: motion.track(name) for role, name in roles.items()}
+    ends = [f"{side}_{part}" for side in SIDES for part in ("heel", "toe")]
+    ends = [role for role in ends if role in points] or [f"{side}_ankle" for side in SIDES]
+    if not {*ends, "left_hip", "right_hip"} <= set(points):
+        return motion
+    if np.linalg.norm(points["left_hip"] + points["right_hip"], axis=-1).max() > 2.0 * _CENTERED:
+        return motion
+    feet = np.stack([points[role] for role in ends], 1)
+    steps = noise_steps(find_noise(feet), motion.fps)
+    feet = mean_over(feet.reshape(motion.frames, -1), steps).reshape(feet.shape)
+    # a point that stands is among the lowest before and after a step
+    lowest = np.maximum(feet[:-1, :, 2], feet[1:, :, 2]).argmin(1)
+    path = np.zeros((motion.frames, 3))
+    path[1:] = -np.cumsum(np.diff(feet, axis=0)[np.arange(len(lowest)), lowest], 0)
+    path[:, 2] = -feet[..., 2].min(1)
+    warn(f"{motion.name} has the hips at the origin in all frames; its path is inferred from the lowest foot")
+    moved = {name: poses + np.pad(path, ((0, 0), (0, 4))) for name, poses in motion.objects.items()}
+    return dataclasses.replace(motion, positions=motion.positions + path[:, None], objects=moved)

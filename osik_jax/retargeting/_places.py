@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ..physics._world import frame_pose
 from ..robot import Robot
+from ..robot._mujoco import mujoco_frame_pose
 from ._profile import Profile
 
 
@@ -55,7 +55,7 @@ def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"])
     for f, own in enumerate(qpos):
         data.qpos[:] = own
         mujoco.mj_kinematics(robot.mj_model, data)
-        poses = {frame: frame_pose(robot, data, frame) for frame in frames}
+        poses = {frame: mujoco_frame_pose(robot, data, frame) for frame in frames}
         mujoco.mj_comPos(robot.mj_model, data)
         center[f] = data.subtree_com[root]
         points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+
+import numpy as np
+from jaxtyping import Float
 
 from .._errors import OsikValueError, unknown_name
+from ..kinematics import Kinematics
+from ..robot import Robot
 from ._goals import Weights
 from ._roles import FINGER_REACHES, FINGERS, HAND, LIMBS, NEEDED, REACHES, STANDING
 
@@ -196,6 +201,12 @@ class Profile:
         """Return the height of each corner above the floor in contact: the radius of its foot [m]."""
         each = 8 // max(len(self.feet), 1)
         return tuple(self.feet[name].radius for name in sorted(self.feet) for _ in range(each))
+
+
+def world_points(robot: Robot, kinematics: Kinematics, places: Sequence[Place]) -> Float[np.ndarray, "k 3"]:
+    """Return where places of a robot are in the world [m]."""
+    positions, rotations = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
+    return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
 
 
 def _middle(a: Point, b: Point) -> Point:

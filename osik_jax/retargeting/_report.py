@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from ..physics._world import frame_pose
+from ..robot._mujoco import model_qpos
 from ..tasks._polygon import hull
 from ._body import JOINTS_APART, joints_between
 from ._contact import stretches
@@ -22,7 +22,6 @@ from ._notes import notes
 from ._places import Places, find_places
 from ._profile import Profile
 from ._retargeted import Retargeted
-from ._robot_motion import in_model
 from ._roles import CHAINS, SIDES
 
 JUMP, AT_SPEED, AT_END = 15.0, 0.97, 0.01
@@ -70,7 +69,7 @@ def report(result: Retargeted) -> dict[str, Any]:
       degrees away from the person's, on joints at an end of their range in most frames, on a left hand that follows a
       right one, and on clips whose feet stand in less than 20 % of the frames.
     """
-    places = find_places(result.robot, result.profile, in_model(result.robot, result.q))
+    places = find_places(result.robot, result.profile, model_qpos(result.robot, result.q))
     figures = {
         "frames": len(result.q),
         "fps": result.motion.fps,
@@ -188,16 +187,12 @@ def _penetration(result: Retargeted, ends: Float[np.ndarray, "F k 2 3"]) -> floa
 def _pairs(result: Retargeted, model: mujoco.MjModel, data: mujoco.MjData) -> list[tuple[int, int]]:
     tree, capsules = result.robot.tree, result.profile.capsules
     bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
-    home = mujoco.MjData(result.robot.mj_model)
-    home.qpos[:] = np.asarray(result.robot.mujoco_qpos(result.robot.q0))
-    mujoco.mj_kinematics(result.robot.mj_model, home)
-    poses = [frame_pose(result.robot, home, c.frame) for c in capsules]
-    placed = [[p + R @ np.array(x) for x in (c.start, c.end)] for c, (p, R) in zip(capsules, poses, strict=True)]
-    _place(model, data, np.array(placed))
+    robot = result.robot
+    _place(model, data, find_places(robot, result.profile, model_qpos(robot, robot.q0)).capsules[0])
     return [
         (i, j)
         for i, j in itertools.combinations(range(len(bodies)), 2)
-        if joints_between(result.robot, bodies[i], bodies[j]) >= JOINTS_APART
+        if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
         and mujoco.mj_geomDistance(model, data, i, j, 0.1, None) >= 0.0
     ]
 
@@ -252,7 +247,7 @@ def _trunk(result: Retargeted, places: Places, person: dict[str, Float[np.ndarra
     robot, profile = result.robot, result.profile
     if profile.is_hand:
         return dict.fromkeys(("pelvis", "chest", "hips-shoulders"))
-    home = find_places(robot, profile, np.asarray(robot.mujoco_qpos(robot.q0))[None]).turns[0, :2]
+    home = find_places(robot, profile, model_qpos(robot, robot.q0)).turns[0, :2]
     turns = places.turns[:, :2] @ np.swapaxes(home, -1, -2) @ facing_at_home(robot, profile.across)
     off = Rotation.from_matrix((np.swapaxes(turns, -1, -2) @ result.turns).reshape(-1, 3, 3)).magnitude()
     pelvis, chest = np.degrees(off.reshape(-1, 2).mean(0))

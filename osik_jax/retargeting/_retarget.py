@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from .._errors import OsikValueError, warn
+from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..robot import Robot
 from ..scaling import run_in_chunks
@@ -25,7 +26,6 @@ from ._lanes import (
     Solved,
     as_lane,
     even,
-    one_a_core,
     padded,
     shared_length,
     solve_lane,
@@ -33,8 +33,7 @@ from ._lanes import (
 )
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
-from ._path import with_path
-from ._person import read_person
+from ._person import read_person, with_path
 from ._profile import Limb, Profile
 from ._retargeted import Retargeted, as_retargeted
 from ._source_motion import SourceMotion
@@ -138,7 +137,7 @@ class Retargeter(OnRobot):
         if any(self._for(motion) is not self for motion in motions):
             return self._from_sources(motions, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
-        if one_a_core():
+        if cpu_is_default():
             with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
                 made = []
                 for one in pool.map(self._made_by_a_core, checked):
@@ -210,7 +209,7 @@ class Retargeter(OnRobot):
             for each clip a function that makes its record; it raises ValueError where the motion is not finite.
         """
         batch = [as_lane(clip, length) for clip in clips]
-        if not one_a_core():
+        if not cpu_is_default():
             batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
         results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0].touching)))

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
 from ..robot import Robot
+from ..robot._mujoco import model_qpos
 from ..robot._tree import FREE
 from ._keypoints import load_arrays
 from ._motion import check_rate, finite_numbers, instants
@@ -133,15 +134,9 @@ def joints_in_mujoco_order(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name, kind in zip(tree.joint_names, tree.joint_types, strict=True) if kind != FREE)
 
 
-def in_model(robot: Robot, q: Float[np.ndarray, "F nq"]) -> Float[np.ndarray, "F full"]:
-    """Return configurations of the robot's MuJoCo model, with locked and coupled joints."""
-    index, coefficient = robot.tree.qpos_source
-    return q[:, index] * coefficient + np.asarray(robot.qpos_offset)
-
-
 def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
     """Return a motion with all joints of the robot's model, locked and coupled joints included."""
-    tree, qpos = robot.tree, in_model(robot, q)
+    tree, qpos = robot.tree, model_qpos(robot, q)
     joints = [int(tree.full_qpos_address[j]) for j, kind in enumerate(tree.joint_types) if kind != FREE]
     return RobotMotion(float(fps), joints_in_mujoco_order(robot), qpos[:, [*base_columns(robot), *joints]])
 

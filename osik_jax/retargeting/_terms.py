@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -23,7 +22,7 @@ from ..tasks._rotation import dot, rotation_log
 from ._balance import mass_fractions, overhang
 from ._facing import facing_at_home
 from ._goals import Goals, Weights
-from ._profile import Limb, Place, Profile
+from ._profile import Limb, Place, Profile, world_points
 from ._roles import SIDES, chain
 
 # Guard of a limb's direction: a shorter limb [m] has none.
@@ -138,12 +137,9 @@ class Body(eqx.Module):
 
 def reach_length(robot: Robot, profile: Profile, limb: Limb) -> float:
     """Return the nominal length of a reach [m]: that at home, at most ``STANDING_SHARE`` of the stretched limb."""
-    known = [role for role in chain(limb) if role in profile.keypoints]
-    kinematics, points = home_kinematics(robot), []
-    for frame, point in (profile.keypoints[role] for role in known):
-        position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-        points.append(position + rotation @ np.array(point))
-    stretched = sum(float(np.linalg.norm(b - a)) for a, b in itertools.pairwise(points))
+    known = [profile.keypoints[role] for role in chain(limb) if role in profile.keypoints]
+    points = world_points(robot, home_kinematics(robot), known)
+    stretched = float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
     bent = min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
     return stretched if profile.is_hand else bent
 

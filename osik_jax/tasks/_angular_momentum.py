@@ -91,6 +91,10 @@ class AngularMomentumTask(Task):
         wanted = error if self.target is None else self.target
         return TaskRows(error, jacobian, wanted, wanted, weight, is_equality=True)
 
+    def error_bounds(self) -> tuple[Any, Any] | None:
+        """Return None: the bounds are on the momentum, and the error is 0."""
+        return None
+
     def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
         """Return a task for little turning of mass from q0."""
         del robot

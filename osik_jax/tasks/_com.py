@@ -122,6 +122,19 @@ class ComTask(Task):
         counts = np.asarray(below) | (self.subtree is None and bool(np.asarray(tree.is_own)[1:].all()))
         return CoreCard(CENTER, rows, [int(number) for number in (edges, *axes, *counts)])
 
+    def error_bounds(self) -> tuple[Any, Any] | None:
+        """Return the bounds on the coordinates, or on the distances along the normals of the polygon's edges [m]."""
+        return super().error_bounds() if self.polygon is None else (-np.inf, self.polygon.offsets)
+
+    def grip(self) -> tuple[Array, Array | None] | None:
+        """Return the target if it has all three coordinates."""
+        return None if self.target is None or self.axes != "xyz" else (self.target, None)
+
+    def gripped(self, position: Float[np.ndarray, "3"], rotation: np.ndarray) -> Any:
+        """Return the target at a position."""
+        del rotation
+        return position
+
     def core_leaves(self) -> list[Any]:
         """Return the leaves in the order of ``StepRows::add_task``."""
         bounds = [self.lower, self.upper, self.target, None]
@@ -170,7 +183,7 @@ class ComTask(Task):
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         if self.target is None:
             return super()._held(robot, kinematics, q)
-        return dict(target=center_of_mass(robot, kinematics, self.subtree))
+        return dict(target=center_of_mass(robot, kinematics, self.subtree)[axis_numbers(self.axes)])
 
     def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
         """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""

@@ -133,6 +133,15 @@ class FrameTask(PoseTask):
         """Return the card of a pose, or in words why there is none."""
         return self._core_card(robot) if type(self) is FrameTask else super().core(robot)
 
+    def grip(self) -> tuple[Array, Array | None] | None:
+        """Return the target's pose, or None if the task has bounds."""
+        position, rotation = self.target
+        return None if self.bounded else (position, rotation if any(self.kept[3:]) else None)
+
+    def gripped(self, position: Float[np.ndarray, "3"], rotation: np.ndarray) -> Any:
+        """Return the target at a pose; a target that does not turn keeps its rotation."""
+        return position, rotation if any(self.kept[3:]) else self.target[1]
+
     def rows_at(
         self,
         positions: Float[Array, "1 3"],

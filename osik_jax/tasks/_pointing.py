@@ -85,6 +85,10 @@ class PointingTask(FramedTask):
         """Return that no row is in metres."""
         return np.zeros(count, bool)
 
+    def error_bounds(self) -> tuple[Any, Any] | None:
+        """Return the bounds on the angle of a cone [rad], rounded off as the angle is."""
+        return None if self.half_angle is None else (-np.inf, _rounded(self.half_angle**2))
+
     @property
     def frames(self) -> tuple[str, ...]:
         """Return the name of the frame, then that of the target if it has one."""

@@ -228,6 +228,24 @@ class Task(MadeForRobot, Replaceable):
         """Return which of ``count`` rows are in metres; the other rows are in radians. Other units count as metres."""
         return np.ones(count, bool)
 
+    def error_bounds(self) -> tuple[Any, Any] | None:
+        """Return lower and upper bounds on the error (``TaskRows.error``) of an inequality task; None: an equality."""
+        lower, upper = getattr(self, "lower", None), getattr(self, "upper", None)
+        if lower is None and upper is None:
+            return None
+        return -np.inf if lower is None else lower, np.inf if upper is None else upper
+
+    def grip(self) -> tuple[Array, Array | None] | None:
+        """Return position [m] and rotation of the target as a viewer drags it, world axes; None: nothing to drag.
+
+        The rotation is None if dragging moves the target and does not turn it.
+        """
+        return None
+
+    def gripped(self, position: Float[np.ndarray, "3"], rotation: np.ndarray) -> Any:
+        """Return the target whose ``grip`` is at a position [m] and a rotation, a matrix or a unit quaternion."""
+        raise OsikTypeError(f"this {type(self).__name__} has no target to drag")
+
     def core(self, robot: Robot) -> CoreCard | str:
         """Return the card by which the compiled step computes the rows, or in words why JAX computes them.
 

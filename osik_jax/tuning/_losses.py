@@ -17,7 +17,7 @@ from ..control import Trajectory
 from ..kinematics import center_of_mass, forward_kinematics
 from ..robot._joint_selection import scalar_layout
 from ..robot._tree import FREE
-from ..tasks import ComTask, SupportPolygon, Task
+from ..tasks import SupportPolygon, Task
 from ._loop import Loop
 
 LossFunction = Callable[[Trajectory, Loop], Float[Array, ""]]
@@ -95,14 +95,11 @@ def _tasks_in_time(loop: Loop, time: Float[Array, " steps"]) -> Mapping[str, Tas
 
 
 def _squared_miss(error: Float[Array, "steps m"], task: Task) -> Float[Array, " steps"]:
-    lower, upper = getattr(task, "lower", None), getattr(task, "upper", None)
-    if isinstance(task, ComTask) and task.polygon is not None:
-        upper = task.polygon.offsets
-    low = error if lower is None and upper is None else jnp.zeros_like(error)
-    if lower is not None:
-        low = jnp.minimum(error - lower, 0.0)
-    high = jnp.zeros_like(error) if upper is None else jnp.maximum(error - upper, 0.0)
-    return jnp.sum(low**2 + high**2, -1)
+    bounds = task.error_bounds()
+    if bounds is not None:
+        lower, upper = bounds
+        error = jnp.minimum(error - lower, 0.0) + jnp.maximum(error - upper, 0.0)
+    return jnp.sum(error**2, -1)
 
 
 def _mean_over_time(values: Float[Array, " steps"], counted: Array) -> Float[Array, ""]:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from .._errors import OsikValueError
 from ..robot import Robot
-from ._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
+from ..robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer

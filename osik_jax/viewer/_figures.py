@@ -11,13 +11,12 @@ from PIL import Image
 
 from ..collision import CollisionShape
 from ..robot import Robot
+from ..robot._mujoco import mujoco_poses, robot_com
 from ._animate import paint_over
-from ._fixed import fixed_parts
-from ._mujoco import mujoco_poses, robot_com
 from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer
-from ._parts import robot_parts
+from ._parts import fixed_parts, robot_parts
 from ._stage import Camera, Stage, frame_camera
 
 _LONG_LENS = 10.0

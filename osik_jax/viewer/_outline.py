@@ -11,9 +11,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..robot import Robot
-from ._mujoco import mujoco_poses
+from ..robot._mujoco import mujoco_poses
 from ._parts import RobotParts, robot_parts
-from ._shapes import lowest_points
 
 
 class Outline(NamedTuple):
@@ -37,6 +36,13 @@ def robot_outline(robot: Robot, q: ArrayLike) -> Outline:
     heights = lowest_points(shape, data)
     size = float(np.linalg.norm(np.ptp(shape.corners(data), axis=0)))
     return Outline(size, float(heights.min()), _base_height(shape, heights))
+
+
+def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
+    """Return the height of each part's lowest point in the world [m]; exact for meshes, boxes and round shapes."""
+    position, rotation = shape.poses(data)
+    down = -rotation[:, 2]  # in each part's frame
+    return position[:, 2] - np.array([part.reach(way) for part, way in zip(shape.parts, down, strict=True)])
 
 
 def _base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> float:

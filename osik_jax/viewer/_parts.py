@@ -14,10 +14,12 @@ from jaxtyping import Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from .._errors import OsikValueError
+from ..collision import CollisionShape
+from ..collision._geometry import Kind
 from ..robot import Robot
 from ..robot._look import Look
+from ..robot._mujoco import home_poses, model_bodies
 from ..robot.loading._mjmodel import rotation_matrix
-from ._mujoco import model_bodies, mujoco_poses
 
 Style = Literal["auto", "geoms", "sticks"]
 
@@ -27,6 +29,12 @@ _DRAWN = range(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_MESH) + 1)
 _PLAIN = np.array([0.80, 0.82, 0.86, 1.0])
 _STICK = np.array([0.42, 0.49, 0.60, 1.0])
 _JOINT = np.array([0.93, 0.50, 0.13, 1.0])
+_KINDS = {
+    Kind.SEGMENT: _GEOM.mjGEOM_CAPSULE,
+    Kind.BOX: _GEOM.mjGEOM_BOX,
+    Kind.CYLINDER: _GEOM.mjGEOM_CYLINDER,
+}
+_ORANGE = np.array([0.95, 0.61, 0.22, 1.0])
 _MUJOCO_DEFAULT = np.array([0.5, 0.5, 0.5, 1.0])
 _HIDDEN_GROUP = 3
 """First geom group of collision shapes by MuJoCo's convention; its viewer hides these groups."""
@@ -194,7 +202,7 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 def _sticks(robot: Robot) -> RobotParts:
     """Return dots on bodies with joints, and sticks from each body to its parent and to its tip."""
-    model, tips, data = robot.mj_model, _tips(robot), next(mujoco_poses(robot, np.asarray(robot.q0)))
+    model, tips, data = robot.mj_model, _tips(robot), home_poses(robot)
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
     length[: model.nbody][model.body_parentid == 0] = 0.0
@@ -241,3 +249,28 @@ def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "link
         mujoco.mju_quatZ2Vec(quaternion, way)
         mujoco.mju_quat2Mat(frame, quaternion)
     return frames.reshape(-1, 3, 3)
+
+
+def fixed_parts(robot: Robot, shapes: Iterable[CollisionShape]) -> RobotParts:
+    """Return shapes of the world as parts that the world's body carries.
+
+    Raises:
+        ValueError: a shape on a frame of the robot, a half-space or a convex hull.
+    """
+    shapes = tuple(shapes)
+    for shape in shapes:
+        if shape.frame is not None or shape.kind not in _KINDS:
+            raise OsikValueError(
+                f"a {shape.kind.name.lower()} on frame {shape.frame!r} is not drawn; shapes are spheres, capsules, "
+                "boxes and cylinders of the world"
+            )
+    parts = tuple(Part(k, _geom_type(shape), np.asarray(shape.size, float), _ORANGE) for k, shape in enumerate(shapes))
+    positions = np.array([shape.position for shape in shapes], float).reshape(-1, 3)
+    rotations = np.array([shape.rotation for shape in shapes], float).reshape(-1, 3, 3)
+    return RobotParts(robot.mj_model, "look", parts, np.zeros(len(parts), int), (positions, rotations))
+
+
+def _geom_type(shape: CollisionShape) -> mujoco.mjtGeom:
+    """Return MuJoCo's geom type; a segment of length 0 is a sphere."""
+    is_sphere = shape.kind is Kind.SEGMENT and float(shape.size[1]) == 0.0
+    return _GEOM.mjGEOM_SPHERE if is_sphere else _KINDS[shape.kind]

@@ -16,8 +16,8 @@ from refusals import refuses
 from task_checks import moved_by
 
 import osik_jax as osik
+from osik_jax.robot._mujoco import mujoco_poses, robot_com
 from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
-from osik_jax.viewer._mujoco import mujoco_poses, robot_com
 
 DT = 0.01
 LANES = 3

@@ -9,9 +9,9 @@ import osik_jax as osik
 from benchmarks.hard._reach import farthest
 from benchmarks.robots import workload
 from osik_jax.numerics._constants import COST_FRACTION, MIN_RADIUS
+from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
 from osik_jax.solvers._damping import level_damping, narrow_box
-from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
 
 DT, STEPS = 0.005, 800
 LATE = 400

@@ -9,7 +9,7 @@ import pytest
 from example_files import example_file
 
 import osik_jax as osik
-from osik_jax.viewer._mujoco import mujoco_frame_pose, mujoco_poses
+from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
 
 pytestmark = pytest.mark.slow
 

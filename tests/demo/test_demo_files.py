@@ -8,14 +8,13 @@ from mujoco_states import mujoco_at
 from task_checks import kinematics_at
 
 import osik_jax as osik
-from osik_jax.demo._estimate import estimate_seconds
 from osik_jax.demo._figures import figures
 from osik_jax.demo._file import file_motion
-from osik_jax.demo._run import TITLES, run_scheme
+from osik_jax.demo._run import run_scheme
 from osik_jax.demo._sway import JointPath, strides, sway_of
 from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._mujoco import mujoco_frame_pose
 from osik_jax.viewer._crouch import crouched
-from osik_jax.viewer._mujoco import mujoco_frame_pose
 from osik_jax.viewer._outline import robot_outline
 
 LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>
@@ -155,10 +154,3 @@ def test_a_walker_stands_on_the_floor():
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
     assert motion.notes == ()
-
-
-def test_estimates_grow_with_the_work():
-    motion = file_motion(osik.load_robot("arm7"), name="arm7", duration=4.0)
-    short = estimate_seconds(motion, schemes=("weighted",), dt=0.005, animation=False)
-    long = estimate_seconds(motion, schemes=tuple(TITLES) * 3, dt=0.005)
-    assert 0.0 < short < long

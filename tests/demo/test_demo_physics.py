@@ -12,7 +12,7 @@ from osik_jax.demo import _nao
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import figures
 from osik_jax.physics import build_world
-from osik_jax.viewer._mujoco import mujoco_poses
+from osik_jax.robot._mujoco import mujoco_poses
 
 DT = 0.005
 

@@ -16,7 +16,6 @@ import osik_jax as osik
 
 pytest.importorskip("flatbuffers", reason="the extra export")
 
-from osik_jax import interop
 from osik_jax.interop import export_controller, load_exported
 
 ELSEWHERE = """
@@ -198,7 +197,6 @@ def test_what_does_not_fit_is_told(remembering):
     refuses(ValueError, r"q has shape \(6,\), expected \(7,\)", loaded, robot.q0[:6])
     refuses(ValueError, r"hand\.target\[0\] has shape \(2,\)", loaded, robot.q0, {"hand.target[0]": robot.q0[:2]})
     refuses(ValueError, "no bytes of export_controller", load_exported, b"something else")
-    refuses(ImportError, "has load_exported", getattr, interop, "load_controller")
     with jax.enable_x64(False), pytest.raises(ValueError, match="jax_enable_x64"):
         loaded(np.zeros(7))
     refused: list[dict[str, Any]] = [{"batch": 0}, {"batch": "many"}, {"batch": 2.5}, {"platforms": ("tpu",)}]

@@ -27,8 +27,7 @@ from small_robots import quietly, robot_of
 
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Retargeter, load_motion, report
-from osik_jax.retargeting._path import with_path
-from osik_jax.retargeting._person import read_person
+from osik_jax.retargeting._person import read_person, with_path
 from osik_jax.retargeting._skeletons import find_roles
 
 SIDES = {"Left": "left", "Right": "right"}

@@ -258,7 +258,7 @@ def test_many_clips_give_what_each_gives_alone(nao, dance, danced, monkeypatch):
     short = dataclasses.replace(motion, name="short", positions=motion.positions[:21], rotations=None)
     own = Retargeter(nao)
     with monkeypatch.context() as batched:  # as on a GPU
-        batched.setattr("osik_jax.retargeting._retarget.one_a_core", lambda: False)
+        batched.setattr("osik_jax.retargeting._retarget.cpu_is_default", lambda: False)
         together = own.retarget_all([motion, short, motion], chunk=2, progress=False)
     assert [len(result.q) for result in together] == [30, 21, 30]
     np.testing.assert_allclose(together[0].q, danced.q, atol=1e-5)

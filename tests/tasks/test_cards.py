@@ -2,6 +2,7 @@
 
 import ast
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ import osik_jax as osik
 from osik_jax import tasks as module
 from osik_jax.batching._names import leaf_names
 from osik_jax.control._units import unit_of
+from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from osik_jax.tasks._task import CoreCard
 
 CLASSES = {name for name, own in vars(module).items() if isinstance(own, type) and issubclass(own, osik.Task)} - {
@@ -26,11 +28,21 @@ def named_in(node: ast.AST) -> set[str]:
     return CLASSES & set(names)
 
 
+def is_asked(call: ast.Call) -> bool:
+    """Return whether a call asks for the class of an object."""
+    return getattr(call.func, "id", "") in ("isinstance", "issubclass")
+
+
 def lists_of_classes(tree: ast.Module) -> list[set[str]]:
-    """Return the task classes of each ``isinstance``, of what follows each ``in``, and of each constant."""
+    """Return the task classes of each function's ``isinstance``, each ``match``, ``in`` and constant."""
     found = []
     for node in ast.walk(tree):
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("isinstance", "issubclass"):
+        if isinstance(node, ast.FunctionDef):
+            asked = [own for own in ast.walk(node) if isinstance(own, ast.Call) and is_asked(own)]
+            found.append(set().union(*(named_in(own.args[1]) for own in asked)))
+        if isinstance(node, ast.Match):
+            found.append(set().union(*(named_in(case.pattern) for case in node.cases)))
+        if isinstance(node, ast.Call) and is_asked(node):
             found.append(named_in(node.args[1]))
         if isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
             found.append(named_in(node.comparators[0]))
@@ -43,13 +55,16 @@ def lists_of_classes(tree: ast.Module) -> list[set[str]]:
 
 
 def test_no_other_part_keeps_a_list_of_task_classes():
-    apart = {"tasks", "viewer", "demo", "saving"}
+    apart = {"tasks", "saving"}
     files = [file for file in PACKAGE.rglob("*.py") if file.relative_to(PACKAGE).parts[0] not in apart]
     assert len(files) > 100
     lists = {str(file): lists_of_classes(ast.parse(file.read_text())) for file in files}
     assert not {file: own for file, own in lists.items() if own}
     assert lists_of_classes(ast.parse("KINDS = (ComTask, osik.FrameTask)")) == [{"ComTask", "FrameTask"}]
     assert lists_of_classes(ast.parse("f(isinstance(a, ComTask | FrameTask))")) == [{"ComTask", "FrameTask"}]
+    apart = "def f(a):\n return isinstance(a, ComTask) or isinstance(a, FrameTask)"
+    matched = "match a:\n case ComTask(): pass\n case FrameTask(frame=f): pass"
+    assert lists_of_classes(ast.parse(apart)) == lists_of_classes(ast.parse(matched)) == [{"ComTask", "FrameTask"}]
 
 
 def test_a_card_of_the_core_has_the_rows_of_its_task(arm):
@@ -95,6 +110,42 @@ def test_a_task_says_the_unit_of_each_of_its_numbers(arm, name, unit):
     tasks = all_tasks(arm)
     assert name in leaf_names(tasks)
     assert unit_of(tasks, name) == unit
+
+
+def test_a_task_says_the_bounds_of_its_error(arm):
+    tasks = all_tasks(arm) | {"room": osik.PostureTask(arm, lower=-0.1, upper=0.1)}
+    q = arm.q0 + 0.4 * np.random.default_rng(0).normal(size=arm.nq)
+    rows = osik.build_problem(arm, q, tasks).rows
+    known = {name: np.broadcast_arrays(*own) for name, task in tasks.items() if (own := task.error_bounds())}
+    assert known.keys() == {"bounds", "axis", "over", "room"}
+    assert all(not rows[name].is_equality for name in known)
+    for name, (lower, upper) in known.items():
+        error = np.asarray(rows[name].error)
+        # a row that asks for a velocity of one sign is outside
+        asks = (np.asarray(rows[name].lower) > 0.0) | (np.asarray(rows[name].upper) < 0.0)
+        np.testing.assert_array_equal((error > upper) | (error < lower), asks, err_msg=name)
+    assert (np.asarray(rows["room"].error) > 0.1).any()
+
+
+def test_a_task_whose_grip_is_dragged_to_a_pose_is_met_there(arm):
+    tasks = all_tasks(arm) | {"point": osik.FrameTask(arm, "link4", rows="position")}
+    grips = {name: grip for name, task in tasks.items() if (grip := task.grip()) is not None}
+    assert {name: rotation is not None for name, (_, rotation) in grips.items()} == {
+        "frame": True,
+        "com": False,
+        "point": False,
+    }
+    q = arm.q0 + 0.3 * np.random.default_rng(1).normal(size=arm.nq)
+    data = next(mujoco_poses(arm, q))
+    poses = {name: mujoco_frame_pose(arm, data, frame) for name, frame in (("frame", "hand"), ("point", "link4"))}
+    poses["com"] = robot_com(arm, data), np.eye(3)
+    dragged = {name: tasks[name].replace(target=tasks[name].gripped(*pose)) for name, pose in poses.items()}
+    for name, own in osik.build_problem(arm, q, dragged).rows.items():
+        np.testing.assert_allclose(own.error, 0.0, atol=1e-9, err_msg=name)
+    point: Any = tasks["point"]
+    assert point.gripped(np.zeros(3), np.eye(3))[1] is point.target[1]
+    with pytest.raises(TypeError, match="no target to drag"):
+        tasks["look"].gripped(np.zeros(3), np.eye(3))
 
 
 def test_a_task_says_which_rows_are_lengths(arm):

@@ -19,11 +19,11 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import tuning
+from osik_jax.robot._mujoco import mujoco_poses, robot_com
 from osik_jax.schemes import SchemeAnswer
 from osik_jax.solvers import Status
 from osik_jax.tuning._history import History
 from osik_jax.tuning._parameters import ParameterSpace
-from osik_jax.viewer._mujoco import mujoco_poses, robot_com
 
 DT, STEPS = 0.05, 6
 

@@ -18,8 +18,9 @@ from refusals import refuses
 from waiting import until as until_within
 
 import osik_jax as osik
+from osik_jax.robot._mujoco import robot_com
 from osik_jax.viewer.live._loop import ControlLoop
-from osik_jax.viewer.live._step import Controller
+from osik_jax.viewer.live._step import Controller, targets_here
 from osik_jax.viewer.live._timing import Stopwatch
 
 ROBOT = osik.load_robot("arm7")
@@ -120,6 +121,20 @@ def test_an_abandoned_target_leaves_the_robot_at_rest_where_it_is(loop: ControlL
     assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() < 1e-3))
     assert np.linalg.norm(hand(loop.snapshot.q) - target_of(loop)) < 1e-3
     assert np.linalg.norm(hand(loop.snapshot.q) - far[0]) > 0.05
+
+
+def test_targets_here_are_what_mujoco_has() -> None:
+    q = np.asarray(ROBOT.q0) + 0.2
+    own = tasks(
+        above=osik.ComTask(ROBOT, axes="zx"), part=osik.ComTask(ROBOT, subtree="link4"), calm=osik.DampingTask(ROBOT)
+    )
+    here, data = targets_here(ROBOT, q, own, [*own, "nobody"]), mujoco_at(ROBOT, q)
+    assert here.keys() == {"hand", "posture", "above", "part"}
+    np.testing.assert_allclose(here["hand"][0], data.site("hand").xpos, atol=1e-9)
+    np.testing.assert_allclose(here["hand"][1], data.site("hand").xmat.reshape(3, 3), atol=1e-9)
+    np.testing.assert_allclose(here["above"], robot_com(ROBOT, data)[[2, 0]], atol=1e-9)
+    np.testing.assert_allclose(here["part"], data.body("link4").subtree_com, atol=1e-9)
+    np.testing.assert_array_equal(here["posture"], q)
 
 
 def test_a_target_that_was_let_go_stays(loop: ControlLoop) -> None:

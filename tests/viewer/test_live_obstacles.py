@@ -16,7 +16,7 @@ from waiting import until
 
 import osik_jax as osik
 from osik_jax.collision._geometry import Kind
-from osik_jax.viewer._mujoco import model_bodies, mujoco_poses
+from osik_jax.robot._mujoco import model_bodies, mujoco_poses
 from osik_jax.viewer._parts import RobotParts, robot_parts
 from osik_jax.viewer.live._covers import link_covers
 from osik_jax.viewer.live._default import default_session

@@ -8,6 +8,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -227,6 +228,16 @@ def _area(vertices: Any) -> float:
 def test_readings() -> None:
     task = osik.FrameTask(ARM, "hand")
     assert error_text(task, np.array([3e-3, 4e-3, 0.0, np.pi / 180.0, 0.0, 0.0])) == "5.0 mm, 1.0°"
+    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    polygon: Any = osik.SupportPolygon(*map(jnp.asarray, (normals, np.full(4, 0.1), 0.1 * normals)))
+    balance = osik.ComTask(ARM, polygon=polygon)
+    assert error_text(balance, np.array([0.08, 0.0, -0.08, 0.0])) == "20 mm inside"
+    assert error_text(balance, np.array([0.13, 0.0, -0.13, 0.0])) == "30.0 mm outside"
+    height = osik.FrameTask(ARM, "hand", rows="position", lower=-0.1)
+    assert error_text(height, np.array([0.0, -0.13, -0.14])) == "50.0 mm outside"
+    assert error_text(height, np.array([0.0, 0.2, 0.0])) == "inside"
+    assert error_text(osik.LookAtTask(ARM, "hand", target=[1.0, 0.0, 0.0]), np.array([0.0, np.pi / 6])) == "30.0°"
+    assert error_text(osik.PostureTask(ARM), np.array([0.0, 2.0])) == "2"
     lower, upper = np.asarray(ARM.position_lower), np.asarray(ARM.position_upper)
     q = 0.5 * (lower + upper)
     q[3] = lower[3] + 0.02 * (upper[3] - lower[3])

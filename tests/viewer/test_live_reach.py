@@ -18,8 +18,8 @@ from waiting import until
 import osik_jax as osik
 from osik_jax.cli import main
 from osik_jax.reachability._map import ReachabilityMap
+from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.viewer import serve_reach
-from osik_jax.viewer._mujoco import mujoco_poses
 from osik_jax.viewer.live._open import is_map, open_map
 from osik_jax.viewer.live._reach import _FAINT, ReachView, slice_picture, slice_words
 

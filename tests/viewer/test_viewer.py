@@ -16,12 +16,13 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import viewer
-from osik_jax.viewer import _animate, _mujoco, _opengl
+from osik_jax.robot import _mujoco
+from osik_jax.viewer import _animate, _opengl
 from osik_jax.viewer._opengl import check_opengl
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
-from osik_jax.viewer._shapes import part_surface
 from osik_jax.viewer._stage import Camera, Stage
+from osik_jax.viewer.live._surfaces import part_triangles
 
 CAMERA = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
 BALL = """<mujoco><worldbody><body name="ball" pos="0 0 0.5"><joint name="j" axis="0 0 1"/>
@@ -58,10 +59,10 @@ def surface_distance(kind, size, p):
     return np.max(np.abs(p) - size, axis=-1)
 
 
-def signed_volume(quads):
+def signed_volume(triangles):
     """Positive where faces run counter-clockwise seen from outside."""
-    a, b, c, d = np.moveaxis(quads, 1, 0)
-    return (np.sum(a * np.cross(b, c), -1) + np.sum(a * np.cross(c, d), -1)).sum() / 6.0
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    return np.sum(a * np.cross(b, c)) / 6.0
 
 
 def test_faces_lie_on_mujocos_geoms(shapes):
@@ -79,7 +80,8 @@ def test_faces_lie_on_mujocos_geoms(shapes):
 def robot_surface_of(robot, data, geom):
     shape = robot_parts(robot)
     position, rotation = (each[geom] for each in shape.poses(data))
-    return part_surface(shape.parts[geom], 6) @ rotation.T + position
+    vertices, faces = part_triangles(shape.parts[geom])
+    return vertices[faces] @ rotation.T + position
 
 
 @pytest.mark.parametrize(

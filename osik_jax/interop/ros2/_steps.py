@@ -88,10 +88,6 @@ class Steps:
         self.references = _references(self.robot)
         self.begin = jax.jit(self._begin)
         self.advance = jax.jit(self._advance)
-        self._look_at_warm_start()
-
-    def _look_at_warm_start(self) -> None:
-        """Find the shapes of a warm start."""
         q, tasks, poses = self.begin(self.robot.q0)
         targets, still = {frame: poses[frame] for frame in self.task_names}, jnp.zeros(self.robot.nv)
         warm = jax.eval_shape(self._advance, q, still, None, tasks, targets).warm_start

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -15,17 +14,17 @@ from ..._errors import OsikValueError, unknown_name
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
+from ...robot._mujoco import mujoco_poses
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
-from ...tasks import FrameTask, Task
-from .._mujoco import mujoco_poses
+from ...tasks import Task
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._gizmos import Gizmos, Pose, gizmo_target
 from ._loop import ControlLoop
 from ._readout import error_text, state_text, timing_text
 from ._robot_nodes import RobotNodes, add_label, side_by_side
-from ._server import FRAME, WORDS, Served
+from ._server import FRAME, WORDS, Driving, show_texts
 from ._step import Controller, stacked
 from ._surroundings import add_surroundings
 
@@ -36,7 +35,7 @@ _APART = 0.6
 """Least distance between robots, in sizes of a robot, so that they can move."""
 
 
-class BatchView(Served):
+class BatchView(Driving):
     """Page that runs a batch of robots; ``serve_batch`` says what it has."""
 
     def __init__(
@@ -115,11 +114,10 @@ class BatchView(Served):
 
     def _send_motion(self, event: GuiEvent[Any]) -> None:
         """Send the recording to the visitor, in the format of ``osik demo``."""
-        recording, buffer = self.loop.recorded(), io.BytesIO()
+        recording = self.loop.recorded()
         if len(recording.time) and event.client is not None:
             runs = {f"q_{name}": recording.q[:, lane] for lane, name in enumerate(self.names)}
-            np.savez_compressed(buffer, allow_pickle=False, time=recording.time, **runs)
-            event.client.send_file_download("motion.npz", buffer.getvalue(), save_immediately=True)
+            event.client.send_file_download("motion.npz", recording.to_npz(**runs), save_immediately=True)
 
     def _run(self) -> None:
         count = 0
@@ -135,9 +133,7 @@ class BatchView(Served):
     def _tell(self) -> None:
         snapshot = self.loop.snapshot
         texts = (state_text(snapshot), timing_text(snapshot, self.loop.timing), self._table())
-        for handle, text in zip((self._state, self._timing, self._errors), texts, strict=True):
-            if handle.content != text:
-                handle.content = text
+        show_texts(zip((self._state, self._timing, self._errors), texts, strict=True))
 
     def _table(self) -> str:
         """Return a table of all tasks' errors for all robots."""
@@ -158,20 +154,18 @@ class BatchView(Served):
             if phase != "end":
                 target = gizmo_target(self._tasks[lane][name], pose)
                 self._retarget(name, lane, target, together=self._together.value, owner=visitor)
-            elif visitor in self._server.get_clients():
-                self.loop.let_go(visitor)
             else:
-                self.loop.release(visitor)
+                self._let_go(visitor)
 
         return drag
 
     def _retarget(self, name: str, lane: int, target: Any, *, together: bool, owner: int | None) -> None:
         """Set the target of the robot in a lane; if ``together``, move those of the others by the same displacement."""
         own: Any = self._tasks[lane][name]
-        new = jax.tree.map(np.asarray, own.replace(target=target).target)
+        new = own.replace(target=target)
         others: list[Any] = [tasks[name] for tasks in self._tasks]
         each = [_displaced(task, own, new) if together else task.target for task in others]
-        each[lane] = new
+        each[lane] = jax.tree.map(np.asarray, new.target)
         self.loop.aim(name, jax.tree.map(lambda *rows: np.stack(rows), *each), owner=owner)
 
     def _gone(self, client: ClientHandle) -> None:
@@ -180,16 +174,13 @@ class BatchView(Served):
             gizmos.drop(client.client_id)
         self.loop.release(client.client_id)
 
-    def _close(self) -> None:
-        self.loop.stop()
 
-
-def _displaced(task: Any, led: Any, new: Any) -> Any:
-    """Return a task's target, moved and rotated as the dragged one was."""
-    if not isinstance(task, FrameTask):
-        return np.asarray(task.target) + new - np.asarray(led.target)
-    (position, rotation), (old, turned) = task.target, led.target
-    return position + new[0] - old, new[1] @ turned.T @ rotation
+def _displaced(task: Task, led: Task, new: Task) -> Any:
+    """Return a task's target, moved and rotated as the target of a dragged task was from ``led`` to ``new``."""
+    grips = [one.grip() for one in (task, led, new)]
+    (position, rotation), (old, turned), (there, turn) = (grip for grip in grips if grip is not None)
+    turn = np.eye(3) if rotation is None or turned is None or turn is None else turn @ turned.T @ rotation
+    return task.gripped(np.asarray(position + there - old), np.asarray(turn))
 
 
 def serve_batch(

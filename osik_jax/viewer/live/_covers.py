@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from ...collision import CollisionShape
 from ...robot import Robot
-from .._mujoco import model_bodies, mujoco_poses
+from ...robot._mujoco import home_poses, model_bodies
 from .._parts import RobotParts
 from ._surfaces import part_triangles
 
@@ -27,7 +27,7 @@ def link_covers(robot: Robot, shapes: RobotParts) -> dict[str, CollisionShape]:
 
 def _clouds(robot: Robot, shapes: RobotParts) -> tuple[dict[str, Float[np.ndarray, "k 3"]], float]:
     """Return the visual shape's points of each moving body in its frame [m], and the size of the robot [m]."""
-    data = next(mujoco_poses(robot, np.asarray(robot.q0)))
+    data = home_poses(robot)
     weld, own = shapes.model.body_weldid, model_bodies(robot)
     names = {int(weld[body]): name for name, body in zip(robot.tree.body_names, own, strict=True) if weld[body] == body}
     found: dict[int, list[np.ndarray]] = {}

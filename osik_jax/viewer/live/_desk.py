@@ -20,11 +20,10 @@ from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
 from .._parts import RobotParts
 from ._covers import link_covers
-from ._hold import targets_here
 from ._loop import ControlLoop
 from ._obstacles import PARKED, Obstacle, free_slot, keeps_off_world, moved, obstacles_in, own_limit, world_limit
 from ._session import Session
-from ._step import Controller, with_targets
+from ._step import Controller, targets_here, with_targets
 
 _DAMPING = 1e-6
 """Damping of the hierarchical scheme. Without it joints oscillate where an obstacle blocks a task of high priority."""

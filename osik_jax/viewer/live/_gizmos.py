@@ -1,43 +1,83 @@
-"""Draggable handles: one for each task with a target in space."""
+"""Draggable handles in a page, and those of tasks with a target in space."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ...robot.loading._mjmodel import quaternion
-from ...tasks import ComTask, FrameTask, Task
-from ._handles import Handles, Pose
+from ...tasks import Task
 
 if TYPE_CHECKING:
-    from viser import SceneApi
+    from viser import SceneApi, TransformControlsEvent, TransformControlsHandle
 
+Pose = tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]
+"""Position [m] and quaternion w x y z."""
 Dragged = Callable[[str, Pose, int, str], None]
 """Arguments of a drag callback: task, pose, visitor, and phase (start, update or end)."""
 _UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+_MOVED = 1e-9
+"""Change of a position [m] or of a quaternion's entries below which it is rounding and is not sent to the page."""
 
 
-def gizmo_pose(task: Task) -> Pose | None:
-    """Return the pose of a task's handle; None if the task has no target in space."""
-    if isinstance(task, FrameTask) and not task.bounded:
-        position, rotation = (np.asarray(part, float) for part in task.target)
-        if not turns(task):
-            return position, _UPRIGHT
-        return position, quaternion(rotation)
-    if isinstance(task, ComTask) and task.target is not None and task.axes == "xyz":
-        return np.asarray(task.target, float), _UPRIGHT
-    return None
+class Handles:
+    """Handles of one kind, by name."""
+
+    def __init__(self, scene: SceneApi, dragged: Dragged) -> None:
+        """Take viser's scene and the callback of a drag."""
+        self._scene, self._dragged = scene, dragged
+        self._handles: dict[str, TransformControlsHandle] = {}
+        self._held: dict[str, int] = {}
+
+    @property
+    def held(self) -> Mapping[str, int]:
+        """Return the visitor who drags each handle, by name."""
+        return dict(self._held)
+
+    def drop(self, visitor: int) -> None:
+        """Release everything that a visitor who left was dragging."""
+        for name in [name for name, holder in self._held.items() if holder == visitor]:
+            self._held.pop(name, None)
+
+    def keep(self, names: Collection[str]) -> None:
+        """Remove all other handles."""
+        for name in [name for name in self._handles if name not in names]:
+            self._handles.pop(name).remove()
+            self._held.pop(name, None)
+
+    def put(self, name: str, node: str, pose: Pose, **look: Any) -> None:
+        """Add a handle as a node of the scene, or move it to the pose unless a visitor holds it."""
+        if name not in self._handles:
+            self._handles[name] = self._added(name, node, pose, look)
+        elif name not in self._held:
+            handle, (position, quaternion) = self._handles[name], pose
+            if np.abs(np.asarray(handle.position) - position).max() > _MOVED:
+                handle.position = position
+            if np.abs(np.asarray(handle.wxyz) - quaternion).max() > _MOVED:
+                handle.wxyz = quaternion
+
+    def _added(self, name: str, node: str, pose: Pose, look: Mapping[str, Any]) -> TransformControlsHandle:
+        handle = self._scene.add_transform_controls(node, position=pose[0], wxyz=pose[1], depth_test=False, **look)
+
+        @handle.on_update
+        async def _(event: TransformControlsEvent) -> None:
+            visitor = event.client_id if event.client_id is not None else -1
+            if event.phase == "end":
+                self._held.pop(name, None)
+            else:
+                self._held[name] = visitor
+            at = np.asarray(event.target.position), np.asarray(event.target.wxyz)
+            self._dragged(name, at, visitor, event.phase)
+
+        return handle
 
 
 def gizmo_target(task: Task, pose: Pose) -> Any:
     """Return the target of a task whose handle is at a pose."""
-    if isinstance(task, ComTask):
-        return pose[0]
-    if isinstance(task, FrameTask) and not turns(task):
-        return pose[0], task.target[1]
-    return pose[0], pose[1] / np.linalg.norm(pose[1])
+    return task.gripped(pose[0], pose[1] / np.linalg.norm(pose[1]))
 
 
 class Gizmos(Handles):
@@ -51,15 +91,12 @@ class Gizmos(Handles):
 
     def show(self, tasks: Mapping[str, Task]) -> None:
         """Show a handle at the target of each given task that has one in space; remove other handles."""
-        poses = {name: pose for name, task in tasks.items() if (pose := gizmo_pose(task)) is not None}
+        grips = {name: grip for name, task in tasks.items() if (grip := task.grip()) is not None}
+        turns = {name: rotation is not None for name, (_, rotation) in grips.items()}
         # a task that begins or ceases to turn its frame gets another handle
-        self.keep([name for name in poses if self._turns.get(name) == turns(tasks[name])])
-        self._turns = {name: turns(tasks[name]) for name in poses}
-        for name, pose in poses.items():
-            look = dict(scale=self._scale, disable_rotations=not self._turns[name], opacity=0.85)
+        self.keep([name for name in grips if self._turns.get(name) == turns[name]])
+        self._turns = turns
+        for name, (position, rotation) in grips.items():
+            pose = np.asarray(position, float), _UPRIGHT if rotation is None else quaternion(np.asarray(rotation))
+            look = dict(scale=self._scale, disable_rotations=rotation is None, opacity=0.85)
             self.put(name, f"{self._below}/targets/{name}", pose, **look)
-
-
-def turns(task: Task) -> bool:
-    """Return whether a task tracks an orientation."""
-    return isinstance(task, FrameTask) and any(task.kept[3:])

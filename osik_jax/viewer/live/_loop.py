@@ -21,14 +21,11 @@ from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
-from ._hold import targets_here
 from ._obstacles import moved
-from ._priority import CONTROL, be_nice
 from ._push import Push
-from ._recorder import Recorder
-from ._snapshot import Recording, Snapshot
-from ._step import Controller, Program, State, with_targets
-from ._timing import Stopwatch, Timing
+from ._snapshot import Recorder, Recording, Snapshot
+from ._step import Controller, Program, State, targets_here, with_targets
+from ._timing import CONTROL, Stopwatch, Timing, be_nice
 
 _LATE = 5
 """Number of periods of delay after which a loop restarts its schedule instead of catching up."""
@@ -89,10 +86,8 @@ class ControlLoop:
         for row in self._start if self._batched else [start]:
             robot.check_configuration(row, "q0")
         still = np.zeros((*self._start.shape[:-1], robot.nv), self._start.dtype)
-        self._editing, self._lock = threading.Lock(), threading.Lock()
+        self._lock = threading.RLock()
         self._wanted = self._running = controller
-        self._targets: dict[str, Any] = {}
-        self._told = (self._wanted, self._targets, controller)
         self._leases: dict[str, _Lease] = {}
         self._job: _Job | None = None
         self._is_behind, self._problem = False, ""
@@ -150,10 +145,7 @@ class ControlLoop:
     @property
     def controller(self) -> Controller:
         """Return the requested controller, which runs as soon as it is compiled; the same object until it changes."""
-        with self._lock:
-            if self._told[0] is not self._wanted or self._told[1] is not self._targets:
-                self._told = self._wanted, self._targets, with_targets(self._wanted, self._targets)
-            return self._told[2]
+        return self._wanted
 
     @property
     def timing(self) -> Timing:
@@ -175,21 +167,14 @@ class ControlLoop:
         Raises:
             Whatever ``edit`` raises; the controller then stays.
         """
-        with self._editing:
-            with self._lock:
-                known = dict(self._targets)
-            wanted = edit(with_targets(self._wanted, known))
-            with self._lock:
-                # targets set while the edit ran are kept; older ones are part of the edited controller
-                self._targets = {k: new for k, new in self._targets.items() if new is not known.get(k)}
-                self._wanted, self._problem = wanted, ""
-                self._is_behind = wanted.structure() != self._running.structure()
-                if not self._is_behind:
-                    self._running = wanted
-                    self._refresh()
-                behind = self._is_behind or self._job is None
-            if behind:
-                self._compiler.ask(wanted)
+        with self._lock:
+            self._wanted, self._problem = edit(self._wanted), ""
+            self._is_behind = self._wanted.structure() != self._running.structure()
+            if not self._is_behind:
+                self._running = self._wanted
+                self._refresh()
+            if self._is_behind or self._job is None:
+                self._compiler.ask(self._wanted)
 
     def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
         """Set the target of a task, also while another structure is being compiled.
@@ -217,16 +202,12 @@ class ControlLoop:
             self._leases.pop(name, None)
             if owner is not None or timeout is not None:
                 self._leases[name] = _Lease(owner, until)
-            self._retarget({name: new})
+            self._edit_both(lambda controller: with_targets(controller, {name: new}))
 
     def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
         """Set position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``) in all controllers."""
-        with self._editing, self._lock:
-            both = self._wanted is self._running
-            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, **changes))
-            ran = self._running.limits
-            self._running = self._wanted if both else replace(self._running, limits=moved(ran, obstacle, **changes))
-            self._refresh()
+        with self._lock:
+            self._edit_both(lambda own: replace(own, limits=moved(own.limits, obstacle, **changes)))
 
     def let_go(self, owner: Hashable) -> None:
         """Keep the targets where their owner left them, without a timeout."""
@@ -265,13 +246,15 @@ class ControlLoop:
         return self._recorder.stop()
 
     def _refresh(self) -> None:
-        """Copy the requested numbers to the running program; the caller holds the lock."""
+        """Copy the controller's numbers to the running program; the caller holds the lock."""
         if self._job is not None:
-            self._job = self._job._replace(numbers=with_targets(self._running, self._targets).numbers())
+            self._job = self._job._replace(numbers=self._running.numbers())
 
-    def _retarget(self, targets: dict[str, Any]) -> None:
-        """Set targets in the running and the pending controller; the caller holds the lock."""
-        self._targets = self._targets | targets
+    def _edit_both(self, edit: Callable[[Controller], Controller]) -> None:
+        """Change numbers of the running and of the requested controller; the caller holds the lock."""
+        is_one = self._wanted is self._running
+        self._wanted = edit(self._wanted)
+        self._running = self._wanted if is_one else edit(self._running)
         self._refresh()
 
     def _compiled(self, controller: Controller, program: Program) -> None:
@@ -283,7 +266,8 @@ class ControlLoop:
             if controller.structure() == self._wanted.structure():
                 # numbers may have changed during compilation, so the wanted controller runs, not the compiled one
                 self._running, self._is_behind = self._wanted, False
-                self._job = _Job(program, with_targets(self._running, self._targets).numbers())
+                self._job = _Job(program, self._running.numbers())
+        self._here(list(controller.tasks))  # compiled here, so that the control thread need not
 
     def _not_compiled(self, controller: Controller, error: Exception) -> None:
         """Return to the running controller and report the error."""
@@ -364,9 +348,16 @@ class ControlLoop:
         """Set the targets of these tasks to the robot's current pose."""
         if not names:
             return
-        q, tasks = self._snapshot.q, self._running.tasks
-        each = [targets_here(self.robot, row, tasks, names) for row in np.atleast_2d(q)]
-        here = jax.tree.map(lambda *rows: np.stack(rows), *each) if self._batched else each[0]
+        here = self._here(names)
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
-            self._retarget(here)
+            self._edit_both(lambda controller: with_targets(controller, here))
+
+    def _here(self, names: list[str]) -> dict[str, Any]:
+        """Return the targets that tasks meet at the robot's current configuration."""
+        q, tasks = self._snapshot.q, {name: self._running.tasks[name] for name in names if name in self._running.tasks}
+        if not self._batched:
+            return targets_here(self.robot, q, tasks, names)
+        own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
+        each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
+        return jax.tree.map(lambda *rows: np.stack(rows), *each)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...robot.loading._mjmodel import quaternion, rotation_matrix
-from ._handles import Handles, Pose
+from ._gizmos import Handles, Pose
 from ._obstacles import Obstacle
 
 if TYPE_CHECKING:

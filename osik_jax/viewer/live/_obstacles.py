@@ -20,7 +20,7 @@ from ...collision._geometry import Kind
 from ...collision._pairs import candidate_pairs, members
 from ...limits import CollisionAvoidanceLimit, Limit
 from ...robot import Robot
-from .._mujoco import mujoco_frame_pose, mujoco_poses
+from ...robot._mujoco import mujoco_frame_pose, mujoco_poses
 
 SLOTS = {"ball": 3, "box": 3}
 """Number of obstacles of each kind that a page may have."""

@@ -1,4 +1,4 @@
-"""Choice of view for ``osik view``: session file, motion file, map or robot."""
+"""Pages of ``osik view`` for a robot and for a map."""
 
 from __future__ import annotations
 
@@ -14,11 +14,8 @@ from ...reachability import load_map
 from ...robot import Robot
 from .._parts import robot_parts
 from ._default import default_session
-from ._export import write_page
 from ._page import LiveView, serve
-from ._playback import Player, read_motion
 from ._reach import ReachView, check_map, serve_reach
-from ._session import load_session
 from ._source import RobotSource
 from ._stance import sole_polygon, standing
 
@@ -34,12 +31,6 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
     session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
     return serve(session, host=host, port=port)
-
-
-def open_motion(path: Path, robot: Robot, *, host: str, port: int) -> Player:
-    """Open a page that plays a motion."""
-    motion = read_motion(path, robot)
-    return Player(robot, motion, host=host, port=port, title=path.name)
 
 
 def is_map(path: Path) -> bool:
@@ -59,13 +50,3 @@ def open_map(path: Path, robot: Robot, *, host: str, port: int) -> ReachView:
     except ValueError as error:
         raise OsikValueError(f"{path}: {error}; say which with --robot") from None
     return serve_reach(robot, found, host=host, port=port)
-
-
-def write_motion(path: Path, robot: Robot, page: Path) -> None:
-    """Write a page that plays a motion without a server."""
-    write_page(robot, read_motion(path, robot), page, title=path.stem)
-
-
-def open_session(path: Path, *, host: str, port: int) -> LiveView:
-    """Open a page that resumes a saved session."""
-    return serve(load_session(path), host=host, port=port)

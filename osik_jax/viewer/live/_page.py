@@ -13,20 +13,19 @@ from ..._errors import OsikValueError
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
+from ...robot._mujoco import mujoco_poses, robot_com
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
-from .._mujoco import mujoco_poses, robot_com
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._desk import Desk
 from ._gizmos import Gizmos, Pose, gizmo_target
-from ._loop import ControlLoop
 from ._marks import BalanceMarks
 from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
-from ._server import FRAME, WORDS, Served
+from ._server import FRAME, WORDS, Driving
 from ._session import Session
 from ._source import RobotSource
 from ._surroundings import add_surroundings
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from viser import ClientHandle
 
 
-class LiveView(Served):
+class LiveView(Driving):
     """Page that runs a session; ``serve`` says what it has."""
 
     def __init__(self, session: Session, *, host: str, port: int) -> None:
@@ -44,6 +43,7 @@ class LiveView(Served):
         robot = session.robot
         shapes, data = robot_parts(robot), next(mujoco_poses(robot, session.q))
         self._desk = Desk(session, shapes)
+        self.loop = self._desk.loop
         seen, floor = shapes.corners(data), floor_height(robot, shapes, [data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
         add_surroundings(self._server, seen, floor)
@@ -55,13 +55,8 @@ class LiveView(Served):
         self._polygon: SupportPolygon | None = None
         self._drawn: Session | None = None
         self._server.on_client_disconnect(self._gone)
-        self._desk.loop.start()
+        self.loop.start()
         self._thread.start()
-
-    @property
-    def loop(self) -> ControlLoop:
-        """Return the control loop."""
-        return self._desk.loop
 
     @property
     def session(self) -> Session:
@@ -76,9 +71,6 @@ class LiveView(Served):
             TypeError, ValueError: no such target.
         """
         self.loop.aim(task, target, timeout=timeout)
-
-    def _close(self) -> None:
-        self.loop.stop()
 
     def _run(self) -> None:
         """Run the drawing thread."""
@@ -117,10 +109,8 @@ class LiveView(Served):
         """Apply a visitor's drag of a handle; a visitor who left stops the robot."""
         if phase != "end":
             self.loop.aim(name, gizmo_target(self._desk.session.tasks[name], pose), owner=visitor)
-        elif visitor in self._server.get_clients():
-            self.loop.let_go(visitor)
         else:
-            self.loop.release(visitor)
+            self._let_go(visitor)
 
     def _gone(self, client: ClientHandle) -> None:
         """Release the handles and the dragged robots of a visitor who closed the page."""

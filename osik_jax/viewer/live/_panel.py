@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
 from ._obstacles import SLOTS, keeps_off_world
 from ._readout import error_table, joint_table, state_text, timing_text
+from ._server import show_texts
 from ._session import session_from_json
 
 if TYPE_CHECKING:
@@ -65,9 +65,7 @@ class Panel:
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
             (self._joints, joint_table(session.robot, snapshot.q, snapshot.velocity)),
         )
-        for handle, text in texts:
-            if handle.content != text:
-                handle.content = text
+        show_texts(texts)
 
     def refill(self) -> None:
         """Show the session after tasks changed or another session was loaded."""
@@ -250,9 +248,7 @@ class Panel:
         recording = self._desk.loop.recorded()
         if not len(recording.time):
             raise OsikValueError("nothing was recorded")
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, time=recording.time, q_live=recording.q)
-        self._send(event, "motion.npz", buffer.getvalue())
+        self._send(event, "motion.npz", recording.to_npz(q_live=recording.q))
 
     def _send(self, event: Any, name: str, content: bytes) -> None:
         """Send a file to the visitor who asked for it."""

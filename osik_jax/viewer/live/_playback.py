@@ -14,7 +14,7 @@ from jaxtyping import Float
 from ..._errors import OsikValueError
 from ..._npz import open_npz
 from ...robot import Robot
-from .._mujoco import mujoco_poses
+from ...robot._mujoco import mujoco_poses
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes, add_label, side_by_side

@@ -13,7 +13,7 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 from ...reachability._map import ReachabilityMap
 from ...reachability._slices import NOTHING, cell_edges, nearest, share_colors, slice_colors
 from ...robot import Robot
-from .._mujoco import mujoco_poses
+from ...robot._mujoco import home_poses, mujoco_poses
 from .._parts import robot_parts
 from ._robot_nodes import RobotNodes
 from ._server import FRAME, Served
@@ -54,7 +54,7 @@ class ReachView(Served):
         super().__init__(host, port, f"Reach of {found.frame}")
         self.map, self._robot = found, robot
         self._axes = found.axes
-        corners = robot_parts(robot).corners(next(mujoco_poses(robot, np.asarray(robot.q0))))
+        corners = robot_parts(robot).corners(home_poses(robot))
         seen = np.concatenate([corners, found.positions[found.reached.any(-1)]])
         add_surroundings(self._server, seen, float(seen[:, 2].min()))
         self._nodes = RobotNodes(self._server.scene, robot)

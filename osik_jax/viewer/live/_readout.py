@@ -10,11 +10,13 @@ from jaxtyping import Float
 from ...robot import Robot
 from ...robot._joint_selection import scalar_layout
 from ...solvers import Status
-from ...tasks import ComTask, FrameTask, Task
+from ...tasks import Task
 from ._snapshot import Snapshot
 from ._timing import Timing
 
 _NEAREST = 5
+_VISIBLE = 5e-4
+"""Distance [m or rad] outside of bounds below which an error counts as inside: it would read as 0 mm outside."""
 
 
 def state_text(snapshot: Snapshot) -> str:
@@ -50,18 +52,24 @@ def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
     """Return an error with its unit; for an inequality, its violation."""
     if error is None:
         return "…"
-    if isinstance(task, FrameTask) and not task.bounded:
-        count = sum(task.kept[:3])
-        parts = [f"{1e3 * np.linalg.norm(error[:count]):.1f} mm"] if count else []
-        turned = error[count:]
-        return ", ".join(parts + ([f"{np.rad2deg(np.linalg.norm(turned)):.1f}°"] if len(turned) else []))
-    if isinstance(task, ComTask) and task.polygon is not None:
-        outside = float(np.max(error - np.asarray(task.polygon.offsets)))
-        # half a millimetre, below which the rounded text would read 0 mm outside
-        return f"{1e3 * outside:.1f} mm outside" if outside > 5e-4 else f"{-1e3 * outside:.0f} mm inside"
-    if isinstance(task, ComTask) and task.target is not None:
-        return f"{1e3 * np.linalg.norm(error):.1f} mm"
-    return f"{np.linalg.norm(error):.3g}"
+    bounds = task.error_bounds()
+    if bounds is None:
+        return _length_text(task, error)
+    lower, upper = (np.asarray(bound) for bound in bounds)
+    outside = np.maximum(lower - error, error - upper)
+    if outside.max() > _VISIBLE:
+        return f"{_length_text(task, np.maximum(outside, 0.0))} outside"
+    return f"{-1e3 * outside.max():.0f} mm inside" if task.unit_of("error") == "m" else "inside"
+
+
+def _length_text(task: Task, error: Float[np.ndarray, " m"]) -> str:
+    """Return the length of an error: of rows in metres in mm, of rows in radians in degrees, of others as a number."""
+    unit = task.unit_of("error")
+    if unit not in ("m", "rad", "m or rad"):
+        return f"{np.linalg.norm(error):.3g}"
+    lengths = task.are_lengths(len(error))
+    parts = [f"{1e3 * np.linalg.norm(error[lengths]):.1f} mm"] if lengths.any() else []
+    return ", ".join([*parts, *([] if lengths.all() else [f"{np.rad2deg(np.linalg.norm(error[~lengths])):.1f}°"])])
 
 
 def joint_table(robot: Robot, q: Float[np.ndarray, " nq"], velocity: Float[np.ndarray, " nv"]) -> str:

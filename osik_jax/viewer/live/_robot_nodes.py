@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...robot import Robot
-from .._mujoco import mujoco_poses
+from ...robot._mujoco import home_poses
 from .._parts import RobotParts, robot_parts
 from ._surfaces import Surface, part_triangles
 
@@ -35,7 +35,7 @@ class RobotNodes:
     ) -> None:
         """Add the robot at ``robot.q0``, moved by an offset [m], as a node of this name."""
         shapes = robot_parts(robot)
-        data = next(mujoco_poses(robot, np.asarray(robot.q0)))
+        data = home_poses(robot)
         scene.add_frame(f"/{name}", show_axes=False, position=np.zeros(3) if offset is None else offset)
         self._frames: dict[int, FrameHandle] = {}
         for body, pieces in _by_body(shapes, data).items():

@@ -9,15 +9,17 @@ import socket
 import threading
 import webbrowser
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from types import ModuleType
 from typing import TYPE_CHECKING, Self
 
 from ..._errors import missing_extra
-from ._priority import DRAWING, be_nice
+from ._loop import ControlLoop
+from ._timing import DRAWING, be_nice
 from ._visitors import guard
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import GuiMarkdownHandle, ViserServer
 
 FRAME = 1.0 / 30.0
 """Time between pictures [s]."""
@@ -75,6 +77,29 @@ class Served(ABC):
 
     def _close(self) -> None:  # noqa: B027 (a page that plays a file runs nothing)
         """End everything that runs beside the page."""
+
+
+class Driving(Served):
+    """Base class of a page that runs a control loop, whose handles several visitors may drag."""
+
+    loop: ControlLoop
+
+    def _let_go(self, visitor: int) -> None:
+        """Keep the targets of a visitor who let go of a handle; stop the robot of a visitor who has left."""
+        if visitor in self._server.get_clients():
+            self.loop.let_go(visitor)
+        else:
+            self.loop.release(visitor)
+
+    def _close(self) -> None:
+        self.loop.stop()
+
+
+def show_texts(texts: Iterable[tuple[GuiMarkdownHandle, str]]) -> None:
+    """Show each text by its handle; one that is shown already is not sent again."""
+    for handle, text in texts:
+        if handle.content != text:
+            handle.content = text
 
 
 def import_viser() -> ModuleType:

@@ -21,16 +21,6 @@ class RobotSource:
     robot: str
     floating_base: bool | None = None
 
-    @property
-    def is_file(self) -> bool:
-        """Return whether the source is a file rather than a name."""
-        return is_file(self.robot)
-
-    @property
-    def is_mjcf(self) -> bool:
-        """Return whether the source is an MJCF file."""
-        return self.is_file and is_mjcf(self.robot)
-
     def load(self) -> Robot:
         """Return the robot.
 
@@ -42,6 +32,6 @@ class RobotSource:
     def python(self) -> str:
         """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
         base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
-        if not self.is_file:
+        if not is_file(self.robot):
             return f"osik.load_robot({self.robot!r}{base})"
-        return f"osik.Robot.{'from_mjcf' if self.is_mjcf else 'from_urdf'}({self.robot!r}{base})"
+        return f"osik.Robot.{'from_mjcf' if is_mjcf(self.robot) else 'from_urdf'}({self.robot!r}{base})"

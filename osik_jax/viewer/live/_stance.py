@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ...robot import Robot
+from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from ...tasks import SupportPolygon, support_polygon
 from .._crouch import crouched
-from .._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
+from .._outline import lowest_points
 from .._parts import RobotParts
-from .._shapes import lowest_points
 from ._surfaces import part_triangles
 
 _SOLE = 0.006

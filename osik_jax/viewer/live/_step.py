@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from ..._errors import OsikValueError
+from ..._errors import OsikTypeError, OsikValueError
 from ...control._checks import checked_limits
 from ...control._rollout import remembering
 from ...control._step import in_type_of
 from ...control._step import step as one_step
-from ...kinematics import integrate
+from ...kinematics import forward_kinematics, integrate
 from ...limits import Limit
 from ...robot import Robot
 from ...schemes import Scheme
@@ -60,6 +61,17 @@ def with_targets(controller: Controller, targets: Mapping[str, Any]) -> Controll
     """Return the controller with some targets replaced; unknown or unsuitable targets are ignored."""
     aimed = {name: _aimed(task, targets[name]) for name, task in controller.tasks.items() if name in targets}
     return dataclasses.replace(controller, tasks={**controller.tasks, **aimed}) if aimed else controller
+
+
+def targets_here(
+    robot: Robot, q: Float[np.ndarray, " nq"], tasks: Mapping[str, Task], names: Iterable[str]
+) -> dict[str, Any]:
+    """Return the targets that the named tasks meet at q; tasks without such a target are left out."""
+    kinematics, found = forward_kinematics(robot, jnp.asarray(q)), {}
+    for name in tasks.keys() & set(names):
+        with suppress(OsikTypeError):
+            found[name] = tasks[name]._held(robot, kinematics, jnp.asarray(q)).get("target")
+    return {name: jax.tree.map(np.asarray, target) for name, target in found.items() if target is not None}
 
 
 def _aimed(task: Any, target: Any) -> Task:
@@ -105,7 +117,7 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
     run = step if batch is None else jax.vmap(step)
     q, still = jnp.broadcast_to(robot.q0, (*lead, robot.nq)), jnp.zeros((*lead, robot.nv), robot.q0.dtype)
     traced = jax.eval_shape(run, numbers, (q, still, None), still)
-    cold = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), traced[0][2])
+    cold = jax.tree.map(jnp.zeros_like, traced[0][2])
     return Program(jax.jit(run).lower(numbers, (q, still, cold), still).compile(), cold)
 
 

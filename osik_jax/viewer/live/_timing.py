@@ -1,11 +1,26 @@
-"""Timing of a loop: periods and computing times of its last steps."""
+"""Timing of a loop (periods and computing times of its last steps), and the priority of its thread."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
+import sys
+import threading
+from collections import deque
+from contextlib import suppress
 
 import numpy as np
 from jaxtyping import Float
+
+CONTROL, DRAWING = -10, 5
+"""Niceness of the control and drawing threads; other threads have 0."""
+
+
+def be_nice(niceness: int) -> None:
+    """Set the niceness of the calling thread on Linux, where threads have their own; below 0 needs root."""
+    if sys.platform == "linux":
+        with suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,28 +39,26 @@ class Timing:
 
 
 class Stopwatch:
-    """Ring buffer of the start times and durations of the last steps."""
+    """Start times and durations of the last steps."""
 
     def __init__(self, length: int = 2000) -> None:
         """Take the number of steps to keep."""
-        self._starts, self._durations, self._count = np.zeros(length), np.zeros(length), 0
+        self._steps, self._count = deque[tuple[float, float]](maxlen=length), 0
 
     def add(self, start: float, duration: float) -> None:
         """Record a step [s]."""
-        place = self._count % len(self._starts)
-        self._starts[place], self._durations[place] = start, duration
+        self._steps.append((start, duration))
         self._count += 1
 
     def clear(self) -> None:
         """Discard all steps, as after a pause."""
+        self._steps.clear()
         self._count = 0
 
     def timing(self) -> Timing:
         """Return percentiles of the recorded steps."""
-        count = min(self._count, len(self._starts))
-        first = self._count % len(self._starts) if self._count > len(self._starts) else 0
-        starts = np.roll(self._starts, -first)[:count]
-        return Timing(self._count, _percentiles(np.diff(starts)), _percentiles(self._durations[:count]))
+        starts, durations = np.array(self._steps.copy()).reshape(-1, 2).T
+        return Timing(self._count, _percentiles(np.diff(starts)), _percentiles(durations))
 
 
 def _percentiles(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
