@@ -170,6 +170,13 @@ def checked_configuration(robot: Robot, q: Any) -> Array:
     return q.astype(jnp.result_type(q, robot.q0))
 
 
+def warn_of_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme | None, dt: Any) -> None:
+    """Warn of gains in other units, of priorities that a scheme ignores, and of tasks that do nothing at q."""
+    warn_of_large_gains(tasks, dt)
+    _warn_of_ignored_priorities(scheme, tasks)
+    _warn_of_idle_tasks(robot, q, tasks, scheme)
+
+
 _accepted_gains: tuple[Any, ...] = ()
 """dt and the gains that were looked at last, and are not too large: the next call with the same ones is quicker."""
 
@@ -200,10 +207,10 @@ def warn_of_large_gains(tasks: Mapping[str, Task], dt: Any) -> None:
 
 
 _said_ignored: set[tuple[tuple[str, int], ...]] = set()
-"""Names and priorities of the sets of tasks that ``warn_of_ignored_priorities`` has warned of."""
+"""Names and priorities of the sets of tasks that ``_warn_of_ignored_priorities`` has warned of."""
 
 
-def warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task]) -> None:
+def _warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task]) -> None:
     """Warn, once for each set of tasks, if a ``WeightedQP`` is given and the priorities differ."""
     if not isinstance(scheme, WeightedQP) or len(priorities(tasks)) < 2:
         return
@@ -219,10 +226,10 @@ def warn_of_ignored_priorities(scheme: Scheme | None, tasks: Mapping[str, Task])
 
 
 _said_idle: set[tuple[Any, ...]] = set()
-"""Sets of tasks that ``warn_of_idle_tasks`` has looked at: whether priorities count, and each task's name and kind."""
+"""Sets of tasks that ``_warn_of_idle_tasks`` has looked at: whether priorities count, and each task's name and kind."""
 
 
-def warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme | None) -> None:
+def _warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme | None) -> None:
     """Warn, once for each set of tasks, of calming tasks beneath tasks that leave their joints no freedom at q.
 
     The rank of the tasks above decides, not the number of their rows.

@@ -27,7 +27,7 @@ from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._forward import kinematics_by
 from ..kinematics._kernels import dof_columns, tree_integers
-from ..limits import AccelerationLimit, ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
+from ..limits import ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
@@ -39,8 +39,8 @@ from ..tasks._rows import rows_of
 from ..tasks._task import GIVEN, POSTURE, CoreCard
 from ._solution import Solution
 
-_SIMPLE_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
-_LIMITS = (*_SIMPLE_LIMITS, AccelerationLimit)
+_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
+"""Limits whose box the core computes; JAX computes the box of others."""
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 Step = Callable[..., Solution]
 
@@ -85,7 +85,7 @@ def unknown_scheme(scheme: Scheme) -> str | None:
     return None
 
 
-def unknown_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
+def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> str | None:
     """Return the first part of a step that the core cannot compute alone, in words; None if there is none."""
     if unknown_scheme(scheme) is not None:
         return unknown_scheme(scheme)
@@ -389,7 +389,7 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    if not (q.dtype == jnp.float64 and all(type(limit) in _SIMPLE_LIMITS for limit in limits)):
+    if not (q.dtype == jnp.float64 and all(type(limit) in _LIMITS for limit in limits)):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv
@@ -406,10 +406,16 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
 def _unpacked(like: Solution, numbers: Float[Array, "lanes k"], integers: Array) -> Solution:
     """Return the solutions of all lanes, from what ``_by_core`` returns; ``like`` has the shapes of one."""
     leaves, tree = jax.tree.flatten(like)
-    at, found = {True: 0, False: 0}, []
+    parts = [(integers, numbers)[kind][:, place] for kind, place in leaf_places(leaves)]
+    found = [part.reshape(-1, *leaf.shape).astype(leaf.dtype) for part, leaf in zip(parts, leaves, strict=True)]
+    return jax.tree.unflatten(tree, found)
+
+
+def leaf_places(leaves: Sequence[Any]) -> list[tuple[bool, slice]]:
+    """Return for each leaf of one solution whether it is in the core's numbers, not its integers, and where."""
+    ends, found = [0, 0], []
     for leaf in leaves:
         kind = jnp.issubdtype(leaf.dtype, jnp.floating)
-        part = (numbers if kind else integers)[:, at[kind] : at[kind] + leaf.size]
-        found.append(part.reshape(-1, *leaf.shape).astype(leaf.dtype))
-        at[kind] += leaf.size
-    return jax.tree.unflatten(tree, found)
+        found.append((kind, slice(ends[kind], ends[kind] + leaf.size)))
+        ends[kind] += leaf.size
+    return found

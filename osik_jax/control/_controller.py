@@ -26,9 +26,7 @@ from ._checks import (
     checked_limits,
     checked_start,
     plain_configuration,
-    warn_of_idle_tasks,
-    warn_of_ignored_priorities,
-    warn_of_large_gains,
+    warn_of_tasks,
 )
 from ._plain_step import Checked, plain_step
 from ._rollout import remembering
@@ -156,9 +154,7 @@ class Controller:
         if self._chooses:
             chosen = scheme_for(self.tasks, self.robot.q0.dtype)
             self.scheme = self.scheme if type(chosen) is type(self.scheme) else chosen
-        warn_of_large_gains(self.tasks, self.dt)
-        warn_of_ignored_priorities(self.scheme, self.tasks)
-        warn_of_idle_tasks(self.robot, self.robot.q0, self.tasks, self.scheme)
+        warn_of_tasks(self.robot, self.robot.q0, self.tasks, self.scheme, self.dt)
         plain = getattr(self, "_plain", None)
         known = plain is not None and plain.is_of(self.tasks, self.scheme)
         given = self.robot, self.tasks, self.scheme, self.limits

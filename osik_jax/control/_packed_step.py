@@ -10,11 +10,11 @@ import numpy as np
 
 from ..batching._names import leaf_names
 from ..kinematics._manifold import layout as manifold
-from ..limits import AccelerationLimit, Limit, with_own_limits
+from ..limits import Limit, with_own_limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ..tasks import Task
-from ._compiled_step import Layout, unknown_part
+from ._compiled_step import Layout, missing_part
 from ._units import configuration_units, velocity_units
 
 VERSION = 2
@@ -46,14 +46,6 @@ class PackedStep(NamedTuple):
         """Return where the numbers of a leaf are."""
         first, count = self.places[leaf]
         return slice(first, first + count)
-
-
-def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit]) -> str | None:
-    """Return the first part of a step that the core does not have, in words; None if it has all."""
-    missing = unknown_part(robot, tasks, scheme, bounds)
-    if any(isinstance(limit, AccelerationLimit) for limit in bounds):  # the core takes it as a box, made in JAX
-        missing = missing or "the limit AccelerationLimit"
-    return missing
 
 
 def pack(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float) -> PackedStep:

@@ -27,8 +27,8 @@ from ..schemes._default import scheme_for
 from ..solvers.hqp import WorkingSet
 from ..tasks import Task
 from ._checks import LARGEST_GAIN, plain_configuration
-from ._compiled_step import is_compiled
-from ._packed_step import missing_part, pack
+from ._compiled_step import is_compiled, leaf_places, missing_part
+from ._packed_step import pack
 from ._solution import Solution
 
 _MOST = 64
@@ -383,36 +383,6 @@ def _places(packed: Any, numbered: Any) -> list[slice]:
     return [packed.place(leaf) for leaf in jax.tree.leaves(numbered)]
 
 
-def _unpacked(
-    structure: Any,
-    of_numbers: Sequence[Any],
-    of_labels: Sequence[tuple[slice, tuple[int, ...]]],
-    numbers: Any,
-    integers: Any,
-) -> Solution:
-    """Return the solution whose leaves are in these places of the results."""
-    velocity, *others = [numbers[place] for place in of_numbers]
-    labels = [integers[place].reshape(shape) for place, shape in of_labels]
-    leaves = [velocity, integers[0].astype(int), integers[1], integers[2], *others, *labels]
-    return jax.tree.unflatten(structure, leaves)
-
-
-def _leaf_places(
-    nv: int, rows: Mapping[str, int], labels: Sequence[tuple[int, ...]]
-) -> tuple[list[Any], list[tuple[slice, tuple[int, ...]]]]:
-    """Return where the leaves of a solution are in ``StepResult`` of ``core/step_rows.hpp``."""
-    of_numbers: list[Any] = [slice(nv), nv, nv + 1]
-    at = nv + 2
-    for count in [rows[name] for name in sorted(rows)] * 2:  # slacks, then errors
-        of_numbers.append(slice(at, at + count))
-        at += count
-    of_labels, at = [], 3
-    for shape in labels:
-        of_labels.append((slice(at, at + int(np.prod(shape))), shape))
-        at += int(np.prod(shape))
-    return of_numbers, of_labels
-
-
 @lru_cache(maxsize=256)
 def _makers(
     scheme: type[Scheme], nv: int, rows: tuple[tuple[str, int], ...], labels: tuple[tuple[int, ...], ...]
@@ -425,11 +395,27 @@ def _makers(
         rows: names of the tasks in their order, with the number of rows of each.
         labels: shapes of the warm start's arrays.
     """
-    warm_start = {HierarchicalQP: WorkingSet(0, 0), WeightedQP: 0}.get(scheme)  # pyright: ignore[reportArgumentType]
-    by_name = dict.fromkeys(dict(rows), 0)
-    # without its constructor, which takes as long as a step and wants arrays
-    any_solution, fields = object.__new__(Solution), (field.name for field in dataclasses.fields(Solution))
-    vars(any_solution).update(zip(fields, (0, 0, 0, 0, 0, 0, by_name, by_name, warm_start), strict=True))
-    structure = jax.tree.structure(any_solution)
-    unpacked = partial(_unpacked, structure, *_leaf_places(nv, dict(rows), labels))
+    number, integer = (partial(jax.ShapeDtypeStruct, dtype=kind) for kind in (np.float64, np.int32))
+    own: list[Any] = [integer(shape) for shape in labels]
+    by_name = {name: number((count,)) for name, count in rows}
+    # without its constructor, which wants arrays
+    like, fields = object.__new__(Solution), (field.name for field in dataclasses.fields(Solution))
+    warm_start = own[0] if scheme is WeightedQP else WorkingSet(*own) if scheme is HierarchicalQP else None
+    values = number((nv,)), *[integer(())] * 3, *[number(())] * 2, by_name, by_name, warm_start
+    vars(like).update(zip(fields, values, strict=True))
+    leaves, structure = jax.tree.flatten(like)
+    # numbers by their index: a slice and its shape take longer
+    places = [
+        (kind, place if leaf.shape else place.start)
+        for leaf, (kind, place) in zip(leaves, leaf_places(leaves), strict=True)
+    ]
+    matrices = [(k, leaf.shape) for k, leaf in enumerate(leaves) if leaf.ndim > 1]
+
+    def unpacked(numbers: Any, integers: Any) -> Solution:
+        found = [(integers, numbers)[kind][place] for kind, place in places]
+        found[1] = found[1].astype(int)  # the status
+        for k, shape in matrices:
+            found[k] = found[k].reshape(shape)
+        return jax.tree.unflatten(structure, found)
+
     return unpacked, jax.jit(unpacked)

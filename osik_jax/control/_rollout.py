@@ -28,9 +28,7 @@ from ._checks import (
     checked_configuration,
     checked_limits,
     checked_start,
-    warn_of_idle_tasks,
-    warn_of_ignored_priorities,
-    warn_of_large_gains,
+    warn_of_tasks,
 )
 from ._solution import Solution, Trajectory
 from ._step import Targets, Tasks, aim, in_type_of, step
@@ -98,9 +96,7 @@ def rollout(
     numbers, static = taken_apart((tasks if callable(tasks) else dict(tasks), feedback))
     q0 = checked_start(robot, q0)
     if not callable(tasks):
-        warn_of_large_gains(tasks, dt)
-        warn_of_ignored_priorities(scheme, tasks)
-        warn_of_idle_tasks(robot, q0, tasks, scheme)
+        warn_of_tasks(robot, q0, tasks, scheme, dt)
     path = _rollout(
         robot,
         q0,

@@ -36,9 +36,7 @@ from ._checks import (
     checked_limits,
     solved_with,
     warn_of_degrees,
-    warn_of_idle_tasks,
-    warn_of_ignored_priorities,
-    warn_of_large_gains,
+    warn_of_tasks,
 )
 from ._compiled_step import compiled, is_compiled
 from ._plain_step import PlainStep, keep_step, kept_step
@@ -102,9 +100,7 @@ def solve(
         check_setting("solve(robot, q, tasks)", robot, scheme, dt)
         limits = checked_limits(robot, limits)
         check_tasks(tasks, robot)
-        warn_of_large_gains(tasks, dt)
-        warn_of_ignored_priorities(scheme, tasks)
-        warn_of_idle_tasks(robot, checked_configuration(robot, q), tasks, scheme)
+        warn_of_tasks(robot, checked_configuration(robot, q), tasks, scheme, dt)
         plain = kept_step(robot, tasks, scheme, limits)
         if plain is None or not plain.fits(tasks):
             plain = keep_step(robot, q, tasks, scheme, limits, dt)

@@ -168,7 +168,7 @@ def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_sha
     assert_close(found, wanted, 1e-12 * float(jnp.abs(wanted).max()))
 
 
-@pytest.mark.variants(slow=["weighted", "null-space"])
+@pytest.mark.variants(slow=["weighted", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     robot = osik.load_robot("arm7")

@@ -149,8 +149,8 @@ def test_explain_counts_rows_and_names_those_to_leave_out(arm):
     assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
-@pytest.mark.variants(slow=["two"])
 @pytest.mark.parametrize(
     "slide, ways", [("", 1), ('<joint name="slide" type="slide" axis="1 0 0"/>', 2)], ids=["one", "two"]
 )
@@ -179,6 +179,7 @@ def test_explain_counts_the_motions_that_keep_closed_loops(slide, ways):
 
 
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
+@pytest.mark.variants(slow=["float32-1e+30"])
 @pytest.mark.parametrize("kind, far", [(jnp.float64, 1e200), (jnp.float32, 1e30)])
 def test_a_target_whose_square_is_not_finite_has_a_finite_answer(kind, far):
     """While tracing and from the host; the neighbour is found."""

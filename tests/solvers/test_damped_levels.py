@@ -116,5 +116,5 @@ def test_what_a_level_can_meet_is_not_damped():
 def test_a_damping_that_is_none_is_refused(levels):
     with pytest.raises(ValueError, match="3 levels"):
         solve_hqp([Level(A[0], b[0]) for A, b in levels], jnp.zeros(N), jnp.ones(N), damping=[0.1])
-    failed = solve_hqp([Level(levels[0][0][0], levels[0][1][0])], -jnp.ones(N), jnp.ones(N), damping=-1.0)
-    assert failed.status == Status.NUMERICAL_ERROR
+    bound = np.ones((COUNT, N))
+    assert (solved(levels, -bound, bound, (-1.0, *DAMPINGS[1:])).status == Status.NUMERICAL_ERROR).all()

@@ -53,9 +53,14 @@ def by_core(robot: osik.Robot, q: Any, *rest: Any) -> tuple[osik.Solution, np.nd
     """The core's answers for lanes of q, and which are certified."""
     lanes = in_plain_jax.eval_shape(robot, q, *plainly(*rest))
     like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), lanes)
+
+    @jax.jit  # one program: its operations by themselves would be hundreds
+    def program(*given: Any) -> osik.Solution:
+        packed = _compiled_step._Arrays(given)
+        return _compiled_step._unpacked(like, *_compiled_step._by_core(packed, *packed.arrays))
+
     first, *others = jax.tree.map(lambda a: jnp.asarray(a)[None], (robot, *rest))
-    packed = _compiled_step._Arrays((first, q, *others))
-    found = _compiled_step._unpacked(like, *_compiled_step._by_core(packed, *packed.arrays))
+    found = program(first, q, *others)
     return found, np.asarray(found.status) == 0
 
 
