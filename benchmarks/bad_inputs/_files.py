@@ -101,6 +101,8 @@ def files(add: Add) -> None:
     add("a home of the wrong length", lambda: two_joints(home=np.zeros(3)), V, "(2,)")
     add("a home in degrees", lambda: two_joints(home={"j1": 30.0}), osik.OsikWarning, "[-1, 1]")
     add("a home for a joint that does not exist", lambda: two_joints(home={"zz": 0.0}), K, "j1, j2")
+    add("a body replaced that is a frame", lambda: arm().replace(body_mass={"hand": 1.0}), K, "frame fixed to the body")
+    add("a field replaced that does not exist", lambda: arm().replace(length=1.0), K, "no field 'length'")
     add("a keyframe that does not exist", lambda: arm().with_home("stand"), K, "keyframe")
     add("XML entities without end, URDF", lambda: read(bomb("robot")), V, "broken XML at line 1", foreign=True)
     add(

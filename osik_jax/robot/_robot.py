@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from ._home_configuration import Home, home_configuration
 from ._links import Factors, scaled_leaves
 from ._model import RobotModel
 from ._plausible import warn_of_far_joints
+from ._replace import replaced_leaves
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
 
@@ -286,15 +287,35 @@ class Robot(RobotModel):
         wanted = float_dtype(dtype, "a robot's numbers are")
         return jax.tree.map(lambda leaf: leaf.astype(wanted), self)
 
+    def replace(self, **values: Any) -> Self:
+        """Return the robot with other numbers, which are given by the names of bodies, joints, frames and geoms.
+
+        ``robot.replace(body_position={"forearm_link": (-0.425, 0.0, 0.001)}, velocity_limit={"*": 1.0})``. Works inside
+        ``jit``, ``grad`` and ``vmap``, where values are not checked; nothing is compiled again.
+
+        Args:
+            values: by array, one of those above. Each is either the whole array, or a mapping from names (or globs) to
+                rows. Names are those of ``body_names`` for ``body_*``, of ``frame_names`` for ``frame_*``, and of
+                joints for the other arrays, locked joints and followers included where the array has them. A hinge or
+                slide has one number in the arrays over joints. ``q0`` takes what ``with_home`` takes.
+                Axes are brought to length 1, quaternions and rotations that were rounded are made exact.
+
+        Raises:
+            KeyError: no such array or name; the message lists those that exist.
+            TypeError: no numbers.
+            ValueError: a wrong shape; a name given twice; not finite, a negative mass, a lower limit above the upper
+                one, no rotation; a stack of robots.
+        """
+        changed = replaced_leaves(self, values)
+        return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
+
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
         """Return the robot with longer or heavier links; limits, ``q0`` and ``mj_model`` are unchanged.
 
         A link is made longer from its own origin: the joints of its children, its centre of mass, its frames and its
         geoms move away by the factor, and its geoms grow by it. All of the way to a child grows, also what is across
-        the link, such as an offset of the shoulder. To change one number, as calibrations do, set it:
-        ``equinox.tree_at(lambda r: r.body_position, robot, robot.body_position.at[k, 2].add(1e-3))``, with k the
-        body's index in ``body_names`` plus 1. Masses are scaled by their own factors only, inertias
-        by mass times length squared; drives stay. Factors may be traced:
+        the link, such as an offset of the shoulder; ``replace`` sets one number. Masses are scaled by their own
+        factors only, inertias by mass times length squared; drives stay. Factors may be traced:
         ``jax.vmap(lambda s: robot.scaled(length={"thigh": s}))(factors)`` is a batch of robots.
 
         Args:
@@ -330,10 +351,27 @@ class Robot(RobotModel):
             ValueError: a stack of robots, or numbers that MJCF has no place for: a joint limited on one side alone,
                 limits that differ between the dofs of a free or ball joint, the frame of a body moved without it.
         """
-        text = loading.to_mjcf(self)
-        if path is not None:
-            write_text(path, text)
-        return text
+        return _written(loading.to_mjcf(self), path)
+
+    def to_urdf(self, path: str | os.PathLike[str] | None = None) -> str:
+        """Return the robot as URDF with its present numbers: calibrated, scaled, edited, joints locked.
+
+        The root link is ``world``. Each body is a link, and each frame that is no body a link on a fixed joint.
+        Locked joints are gone. ``joint_reference`` (zero offsets) goes into the joints' origins, so the joints of the
+        file have the values of ``q``. A joint whose anchor is off its body's origin gets a link in between. Boxes,
+        spheres and cylinders are kept, capsules become those. Left out are meshes, ``q0``, ``dof_armature``, closed
+        loops and the robot's effort limits, written as 0. An infinite limit of a slide is written as 1e9.
+
+        Args:
+            path: file to write the text to, if any.
+
+        Returns:
+            The text.
+
+        Raises:
+            ValueError: a stack of robots, or a ball joint, which URDF does not have.
+        """
+        return _written(loading.to_urdf(self), path)
 
     def check_configuration(self, q: Num[ArrayLike, " nq"] | Sequence[float], name: str = "q") -> None:
         """Raise ValueError if q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
@@ -343,3 +381,10 @@ class Robot(RobotModel):
             name: what the message calls it.
         """
         check_configuration(self, q, name)
+
+
+def _written(text: str, path: str | os.PathLike[str] | None) -> str:
+    """Return the text, written to the file if one is given."""
+    if path is not None:
+        write_text(path, text)
+    return text

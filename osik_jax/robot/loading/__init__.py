@@ -15,3 +15,4 @@ from ._options import PositionLimits as PositionLimits
 from ._source import is_mjcf as is_mjcf
 from ._urdf import from_urdf as from_urdf
 from ._write import to_mjcf as to_mjcf
+from ._write_urdf import to_urdf as to_urdf

@@ -51,11 +51,7 @@ class _JointPlace(NamedTuple):
 
 def to_mjcf(robot: RobotModel) -> str:
     """Return the robot as MJCF; see ``Robot.to_mjcf``."""
-    if np.ndim(robot.body_position) != 2:
-        raise OsikValueError(
-            f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
-            "jax.tree.map(lambda leaf: leaf[0], robots)"
-        )
+    refuse_stack(robot)
     root = ElementTree.Element("mujoco", model=model_name(robot) or "robot")
     ElementTree.SubElement(root, "compiler", angle="radian", autolimits="true", balanceinertia="true")
     bodies = [ElementTree.SubElement(root, "worldbody")]
@@ -73,12 +69,22 @@ def to_mjcf(robot: RobotModel) -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
+def refuse_stack(robot: RobotModel) -> None:
+    """Raise ValueError for a stack of robots."""
+    if np.ndim(robot.body_position) != 2:
+        raise OsikValueError(
+            f"a stack of robots, body_position {np.shape(robot.body_position)}: write them one by one, "
+            "jax.tree.map(lambda leaf: leaf[0], robots)"
+        )
+
+
 def _text(values: ArrayLike) -> str:
     """Return numbers that read back as they are."""
     return " ".join(repr(float(value)) for value in np.ravel(np.asarray(values, float)))
 
 
-def _put(parent: ElementTree.Element, tag: str, **values: str | ArrayLike) -> ElementTree.Element:
+def put(parent: ElementTree.Element, tag: str, **values: str | ArrayLike) -> ElementTree.Element:
+    """Add an element; its attributes are texts or numbers."""
     texts = {key: value if isinstance(value, str) else _text(value) for key, value in values.items()}
     return ElementTree.SubElement(parent, tag, texts)
 
@@ -87,15 +93,15 @@ def _put(parent: ElementTree.Element, tag: str, **values: str | ArrayLike) -> El
 
 
 def _body(robot: RobotModel, body: int, parent: ElementTree.Element) -> ElementTree.Element:
-    pose, joints = _pose_and_joints(robot, body)
-    element = _put(parent, "body", name=robot.tree.body_names[body], pos=pose.position, quat=quaternion(pose.rotation))
+    pose, joints = placed_joints(robot, body)
+    element = put(parent, "body", name=robot.tree.body_names[body], pos=pose.position, quat=quaternion(pose.rotation))
     _add_inertial(robot, body, element, moving=bool(joints))
     for place in joints:
         _add_joint(robot, place, element)
     return element
 
 
-def _pose_and_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]]:
+def placed_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]]:
     """Return the body's pose in its parent, locked joints at their values, and the joints that remain.
 
     A locked joint moves the body's frame, so the anchors and axes of the joints before it are told from there.
@@ -167,7 +173,7 @@ def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *,
     excess = moments[2] - moments[0] - moments[1]
     if 0.0 < excess <= _ROUNDOFF * moments[2]:
         moments[0] += 2.0 * excess
-    _put(
+    put(
         element,
         "inertial",
         mass=max(mass, least),
@@ -186,10 +192,10 @@ def _add_joint(robot: RobotModel, place: _JointPlace, element: ElementTree.Eleme
     if kind != FREE:
         values |= dict(pos=place.anchor)
     start, end = tree.full_dof_address[joint : joint + 2]
-    armature = _one(robot.dof_armature[start:end], name, "armature")
+    armature = one_for_all(robot.dof_armature[start:end], name, "armature")
     if armature:
         values |= dict(armature=armature)
-    _put(element, "joint", name=name, type=_TYPES[kind], **values, **_range(robot, joint))
+    put(element, "joint", name=name, type=_TYPES[kind], **values, **_range(robot, joint))
 
 
 def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
@@ -197,14 +203,14 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
     tree, name = robot.tree, robot.tree.joint_names[joint]
     if joint not in tree.dof_address:
         return {}
-    dof = _dofs(robot, joint)
+    dof = dofs_of_joint(robot, joint)
     lower, upper = (np.asarray(leaf[dof], float) for leaf in (robot.position_lower, robot.position_upper))
     if np.isinf(lower).all() and np.isinf(upper).all():
         return {}
     if tree.joint_types[joint] == FREE:
         raise OsikValueError(f"joint {name!r} is free: MJCF has no place for its position limits")
     if tree.joint_types[joint] == BALL:
-        return dict(range=(0.0, _one(upper, name, "upper")))
+        return dict(range=(0.0, one_for_all(upper, name, "upper")))
     low, high = float(lower[0]), float(upper[0])
     if math.isinf(low) or math.isinf(high):
         raise OsikValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
@@ -212,18 +218,18 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
     return dict(range=(low, max(high, math.nextafter(low, math.inf))))
 
 
-def _dofs(robot: RobotModel, joint: int) -> slice:
+def dofs_of_joint(robot: RobotModel, joint: int) -> slice:
     """Return the entries of v that belong to an independent joint."""
     tree = robot.tree
     start = tree.dof_address[joint]
     return slice(start, start + tree.full_dof_address[joint + 1] - tree.full_dof_address[joint])
 
 
-def _one(values: ArrayLike, joint: str, what: str) -> float:
+def one_for_all(values: ArrayLike, joint: str, what: str) -> float:
     """Return the one value that all dofs of a joint share."""
     first, *others = np.asarray(values, float)
     if any(other != first for other in others):
-        raise OsikValueError(f"the dofs of joint {joint!r} differ in {what}: MJCF has one value a joint")
+        raise OsikValueError(f"the dofs of joint {joint!r} differ in {what}: the file has one value a joint")
     return float(first)
 
 
@@ -235,16 +241,23 @@ def _add_frames(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
     tree = robot.tree
     done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
     for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
-        pose = _pose(robot.frame_position[k], robot.frame_rotation[k])
+        pose = pose_of(robot.frame_position[k], robot.frame_rotation[k])
         if name not in done:
-            _put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
-        elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, done[name], strict=True)):
-            raise OsikValueError(
-                f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
-            )
+            put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
+        else:
+            check_same_place(name, pose, done[name])
 
 
-def _pose(position: ArrayLike, rotation: ArrayLike) -> Pose:
+def check_same_place(name: str, frame: Pose, own: Pose) -> None:
+    """Raise ValueError if the frame of a body or geom is not where that is."""
+    if not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(frame, own, strict=True)):
+        raise OsikValueError(
+            f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
+        )
+
+
+def pose_of(position: ArrayLike, rotation: ArrayLike) -> Pose:
+    """Return a pose of NumPy's arrays in double precision."""
     return Pose(np.asarray(position, float), np.asarray(rotation, float))
 
 
@@ -253,14 +266,14 @@ def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str
     model, tree = robot.mj_model, robot.tree
     done: dict[str, Pose] = {}
     for g in (g for g, kind in enumerate(tree.geom_types) if kind in _SHAPES):
-        pose = _pose(robot.geom_position[g], robot.geom_rotation[g])
+        pose = pose_of(robot.geom_position[g], robot.geom_rotation[g])
         values, name = _appearance(model, g), mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g)
         if name:
             name = f"geom:{name}" if f"geom:{name}" in tree.frame_names else name
             done[name] = pose
             values |= dict(name=name)
         places = dict(size=robot.geom_size[g], pos=pose.position, quat=quaternion(pose.rotation))
-        _put(bodies[tree.geom_bodies[g]], "geom", **values, **places)
+        put(bodies[tree.geom_bodies[g]], "geom", **values, **places)
     return done
 
 
@@ -288,9 +301,9 @@ def _add_rates(robot: RobotModel, element: ElementTree.Element) -> None:
     for joint in robot.tree.independent:
         name = robot.tree.joint_names[joint]
         for prefix, (values, what) in rates.items():
-            rate = _one(values[_dofs(robot, joint)], name, what)
+            rate = one_for_all(values[dofs_of_joint(robot, joint)], name, what)
             if math.isfinite(rate):
-                _put(element, "numeric", name=prefix + name, data=rate)
+                put(element, "numeric", name=prefix + name, data=rate)
 
 
 def _add_roots(tree: KinematicTree, element: ElementTree.Element) -> None:
@@ -307,7 +320,7 @@ def _add_followers(robot: RobotModel, element: ElementTree.Element) -> None:
         offset = float(robot.qpos_offset[tree.full_qpos_address[follower]])
         constant = offset - _reference(robot, follower) + multiplier * _reference(robot, leader)
         names = dict(joint1=tree.joint_names[follower], joint2=tree.joint_names[leader])
-        _put(element, "joint", **names, polycoef=(constant, multiplier, 0.0, 0.0, 0.0))
+        put(element, "joint", **names, polycoef=(constant, multiplier, 0.0, 0.0, 0.0))
 
 
 def _add_constraints(robot: RobotModel, bodies: list[ElementTree.Element], element: ElementTree.Element) -> None:
@@ -328,19 +341,19 @@ def _add_constraints(robot: RobotModel, bodies: list[ElementTree.Element], eleme
             places |= dict(zip(("site1", "site2"), _end_sites(robot, bodies, ends, names[e]), strict=True))
         if kind == "weld":
             places["torquescale"] = model.eq_data[e, 10]
-        _put(element, kind, name=names[e], active=str(bool(model.eq_active0[e])).lower(), **places)
+        put(element, kind, name=names[e], active=str(bool(model.eq_active0[e])).lower(), **places)
 
 
 def _end_sites(robot: RobotModel, bodies: list[ElementTree.Element], ends: Ends, name: str) -> list[str]:
     """Add sites at the ends of a constraint; return their names."""
     numbers = [robot.tree.frame(frame) for frame in ends.frames]
-    first, second = (_pose(robot.frame_position[k], robot.frame_rotation[k]) for k in numbers)
+    first, second = (pose_of(robot.frame_position[k], robot.frame_rotation[k]) for k in numbers)
     turns = first.rotation @ ends.relative @ second.rotation.T, np.eye(3)  # of a weld the two are to agree
     made = []
     for k, pose, anchor, turn in zip(numbers, (first, second), ends.anchors, turns, strict=True):
         made.append(free_name(f"{EQUALITY_END_PREFIX}{name}/{len(made) + 1}", robot.tree.frame_names))
         position = pose.position + pose.rotation @ anchor
-        _put(bodies[robot.tree.frame_bodies[k]], "site", name=made[-1], pos=position, quat=quaternion(turn))
+        put(bodies[robot.tree.frame_bodies[k]], "site", name=made[-1], pos=position, quat=quaternion(turn))
     return made
 
 
@@ -348,4 +361,4 @@ def _add_home(robot: RobotModel, element: ElementTree.Element) -> None:
     tree, full = robot.tree, np.asarray(robot.mujoco_qpos(robot.q0), float)
     kept = [full[start:end] for start, end in zip(tree.full_qpos_address, tree.full_qpos_address[1:], strict=False)]
     moving = [values for joint, values in enumerate(kept) if joint not in tree.locked]
-    _put(element, "key", name="home", qpos=np.concatenate(moving))
+    put(element, "key", name="home", qpos=np.concatenate(moving))

@@ -1,0 +1,137 @@
+"""Replacement of a robot's numbers, by the names of bodies, joints, frames and geoms."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array
+
+from .._errors import OsikKeyError, OsikValueError, unknown_name
+from ..numerics._arguments import as_array, check_bounds, check_finite, check_not_nan, check_not_negative
+from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
+from ..numerics._rotations import exact_quaternion, exact_rotation
+from ._home_configuration import home_configuration
+from ._model import RobotModel
+from ._tree import DOF_WIDTH, QPOS_WIDTH, KinematicTree
+
+Rows = dict[str, int | slice]
+"""Place of each name in an array: a row, or the entries of a joint."""
+
+_NOT_NEGATIVE = ("body_mass", "dof_armature")
+_MAY_BE_INFINITE = ("position_lower", "position_upper", "velocity_limit", "acceleration_limit")
+
+
+def replaced_leaves(robot: RobotModel, values: Mapping[str, Any]) -> dict[str, Array]:
+    """Return the new arrays of a robot by field; see ``Robot.replace``."""
+    if np.ndim(robot.body_position) != 2:
+        raise OsikValueError(
+            f"a stack of robots, body_position {np.shape(robot.body_position)}: use replace in jax.vmap"
+        )
+    fields = tuple(field.name for field in dataclasses.fields(robot) if not field.metadata.get("static"))
+    for field in values:
+        if field not in fields:
+            raise unknown_name("field", field, fields)
+    found = {field: _replaced(robot, field, value) for field, value in values.items()}
+    check_bounds(*(found.get(field, getattr(robot, field)) for field in _MAY_BE_INFINITE[:2]))
+    return found
+
+
+def _replaced(robot: RobotModel, field: str, value: Any) -> Array:
+    """Return one array of the robot with new numbers: all of them, or rows by name."""
+    if field == "q0":
+        return home_configuration(robot, value)
+    old = getattr(robot, field)
+    if not isinstance(value, Mapping):
+        return to_jax(_checked(field, value, old.shape, old.dtype, field))
+    new, rows, given = on_host(old), _rows_of(robot.tree, field), {}
+    for pattern, row_value in value.items():
+        _refuse_frame(robot.tree, field, pattern)
+        for name in find_names(tuple(rows), pattern, field.split("_")[0].replace("dof", "joint")):
+            if name in given:
+                raise OsikValueError(f"{field} gives {name!r} twice, by {given[name]!r} and by {pattern!r}")
+            given[name] = pattern
+            what = f"{field}[{pattern!r}]"
+            new = replaced_at(new, rows[name], _checked(field, row_value, old[rows[name]].shape, old.dtype, what))
+    return to_jax(new)
+
+
+def _refuse_frame(tree: KinematicTree, field: str, name: Any) -> None:
+    """Raise KeyError for a frame where the array has bodies."""
+    if field.startswith("body_") and name in tree.frame_names and name not in tree.body_names[1:]:
+        body = tree.body_names[tree.frame_bodies[tree.frame(name)]]
+        bodies = ", ".join(tree.body_names[1:])
+        raise OsikKeyError(
+            f"{name!r} is a frame fixed to the body {body!r}: set frame_position or frame_rotation; bodies: {bodies}"
+        )
+
+
+def _rows_of(tree: KinematicTree, field: str) -> Rows:
+    """Return the place of each name in a robot's array."""
+    names, joints = tree.joint_names, range(len(tree.joint_names))
+    if field.startswith("body_"):
+        return {name: row for row, name in enumerate(tree.body_names) if row}
+    if field.startswith("frame_"):
+        return {name: row for row, name in enumerate(tree.frame_names)}
+    if field.startswith("geom_"):
+        return {name: row for row, name in enumerate(tree.geom_names) if name}
+    if field in ("joint_position", "joint_axis"):
+        return {name: row for row, name in enumerate(names)}
+    if field in ("joint_reference", "qpos_offset"):
+        return {names[j]: _entries(tree.full_qpos_address[j], QPOS_WIDTH[tree.joint_types[j]]) for j in joints}
+    if field == "dof_armature":
+        return {names[j]: _entries(tree.full_dof_address[j], DOF_WIDTH[tree.joint_types[j]]) for j in joints}
+    return {names[j]: _entries(start, DOF_WIDTH[tree.joint_types[j]]) for j, start in tree.dof_address.items()}
+
+
+def _entries(start: int, width: int) -> int | slice:
+    """Return the entries of a joint: an index for a hinge or slide, a slice for a ball or free joint."""
+    return int(start) if width == 1 else slice(int(start), int(start) + width)
+
+
+def find_names(names: Sequence[str], pattern: Any, kind: str) -> list[str]:
+    """Return the name equal to ``pattern``, else the names that match it as a glob.
+
+    Raises:
+        KeyError: there are none; the message lists the names.
+    """
+    found = [name for name in names if name == pattern]
+    found = found or [name for name in names if fnmatch.fnmatchcase(name, str(pattern))]
+    if not found:
+        raise unknown_name(kind, pattern, tuple(names))
+    return found
+
+
+def _checked(field: str, value: Any, shape: tuple[int, ...], dtype: Any, what: str) -> Numbers:
+    """Return numbers for an array or a row of it; raise an error if they cannot be that."""
+    new = as_array(value, what, dtype)
+    if new.shape != shape:
+        raise OsikValueError(f"{what} has shape {new.shape}, expected {shape}. Batch with jax.vmap.")
+    check = (
+        check_not_negative if field in _NOT_NEGATIVE else check_not_nan if field in _MAY_BE_INFINITE else check_finite
+    )
+    check(new, what)
+    exact = _EXACT.get(field)
+    return on_host(exact(new, what) if exact else new)
+
+
+def _unit(axes: Numbers, what: str) -> Numbers:
+    """Return axes of length 1; raise ValueError if a concrete one is zero."""
+    axes = on_host(axes)
+    xp = module_of(axes)
+    squared = (axes**2).sum(-1, keepdims=True)
+    if xp is np and not squared.all():
+        raise OsikValueError(f"{what} is an axis of length 0; it is a direction, of any other length")
+    return axes / xp.sqrt(squared)
+
+
+_EXACT = {
+    "body_quaternion": exact_quaternion,
+    "frame_rotation": exact_rotation,
+    "geom_rotation": exact_rotation,
+    "joint_axis": _unit,
+}
+"""Functions that bring directions and rotations to unit length, or raise an error."""
