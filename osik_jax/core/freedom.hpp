@@ -1,0 +1,132 @@
+// Whether solutions of a search are free, which of them are the least wrong, and distances of many configurations.
+// Arguments and results as in collision/_core.py.
+#pragma once
+#include "collision.hpp"
+#include "xla.hpp"
+
+namespace osik {
+
+constexpr double TOUCH = 1e-6;  // solutions keep so much more, against rounding of their numbers [m]
+
+// The scene of a target: argument `k` has integers, `k + 1` numbers, each with a row for each scene or one for all.
+inline SceneRows<double> scene_of(const xla::Call& call, int k, int shapes, int target) {
+  constexpr int COLUMNS = 4;  // of integers, beside contacts
+  const int row = call.size(k, 0) > 1 ? target : 0, integers = call.size(k, 1);
+  return {integers / (COLUMNS + shapes), call.in<int>(k) + size_t(integers) * row,
+          call.in<double>(k + 1) + size_t(call.size(k + 1, 1)) * row};
+}
+
+class Freedom {
+  struct Rejected {
+    std::vector<double> x, q;
+    int seed;
+  };
+  static constexpr size_t MOST = 32;  // rejected solutions that are kept
+  enum Reason { NONE, HELD_SHAPES, AROUND_TARGET, EVERY_SOLUTION };
+
+  Collision<double> collision;
+  const ShapedRobot<double>& robot;
+  double clearance = 0;
+  int row = -1;  // of the scene that is taken
+  std::vector<double> q;
+  std::vector<Rejected> rejected;
+  Collision<double>::Nearest fixed;
+
+ public:
+  bool is_blocked = false;  // whether no solution of this target is free
+
+  explicit Freedom(const ShapedRobot<double>& robot) : collision(robot), robot(robot) {}
+
+  // Take a target's scene; false if shapes touch that no joint of the search moves.
+  bool begin(const xla::Call& call, int target, const double* home) {
+    const int own = call.size(7, 0) > 1 ? target : 0;
+    if (own != row) collision.set(scene_of(call, 7, robot.shapes, target)), row = own;
+    clearance = call.in<double>(9)[0], is_blocked = false, rejected.clear();
+    collision.place(home);
+    fixed = collision.nearer(clearance, false);
+    return fixed.i < 0;
+  }
+  // Whether a solution is free. tips: positions of the frames; score, tolerances: of ChainSearch.
+  bool accepts(const std::vector<double>& x, const int* entry, const double* home, int nq, int seed, const double* tips,
+               double score, const double* tolerances) {
+    q.assign(home, home + nq);
+    for (size_t j = 0; j < x.size(); ++j) q[entry[j]] = x[j];
+    collision.place(q.data());
+    const auto hit = collision.nearer(clearance + TOUCH, true);
+    if (hit.i < 0) return true;
+    if (rejected.size() < MOST) rejected.push_back({x, q, seed});
+    is_blocked = is_around_target(hit.i, hit.j, tips, score, tolerances);
+    return false;
+  }
+  // Replace x by the rejected solution with the largest clearance, if there is one.
+  void take_least_wrong(std::vector<double>& x, int& seed) {
+    double best = -std::numeric_limits<double>::infinity();
+    for (const Rejected& own : rejected) {
+      collision.place(own.q.data());
+      const double distance = collision.nearest().gap.distance;
+      if (distance > best) best = distance, x = own.x, seed = own.seed;
+    }
+  }
+  // Write clearance, pair and reason of an answer, and whether it is a free solution.
+  void judge(const xla::Call& call, int target, const double* answer, bool is_every, int& converged) {
+    collision.place(answer);
+    auto nearest = collision.nearest();
+    if (fixed.i >= 0) fixed.gap = collision.gap_of(fixed.i, fixed.j), nearest = fixed;
+    const int first = is_every ? 4 : 3;
+    call.out<double>(first)[target] = nearest.gap.distance;
+    int* to = call.out<int>(first + 1) + 3 * target;
+    to[0] = nearest.i, to[1] = nearest.j;
+    converged = converged && nearest.gap.distance >= clearance;
+    const Reason missed = fixed.i >= 0 ? HELD_SHAPES : is_blocked ? AROUND_TARGET : rejected.empty() ? NONE : EVERY_SOLUTION;
+    to[2] = converged ? NONE : missed;
+  }
+
+ private:
+  // Whether a shape that a frame's target places touches one that stays, by more than the tolerances of the target allow
+  // it to give way.
+  bool is_around_target(int i, int j, const double* tips, double score, const double* tolerances) const {
+    const int shape = collision.moves(i) ? i : j, other = shape == i ? j : i;
+    const int frame = robot.moves[collision.body(shape)] - 2;  // see collision/_core.py
+    if (frame < 0 || collision.moves(other)) return false;
+    const double arm = collision.reach(shape, Vec3<double>::of(tips + 3 * frame));
+    const double gives = (1 + score) * (tolerances[0] + tolerances[1] * arm);
+    return collision.gap_of(i, j).distance < clearance - gives;
+  }
+};
+
+// Nearest pairs at many configurations: arguments q [lanes, nq], the robot's integers and numbers, a scene; results
+// distance, points and normal [lanes, 10], and the pair [lanes, 2].
+inline void find_clearances(const xla::Call& call) {
+  const ShapedRobot<double> robot(call.in<int>(1), call.in<double>(2));
+  Collision<double> collision(robot);
+  const int lanes = call.size(0, 0);
+  for (int lane = 0; lane < lanes; ++lane) {
+    if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
+    collision.place(xla::lane_of(call, 0, lane));
+    const auto nearest = collision.nearest();
+    double* to = call.out<double>(0) + 10 * lane;
+    int* pair = call.out<int>(1) + 2 * lane;
+    to[0] = nearest.gap.distance, nearest.gap.on_a.put(to + 1), nearest.gap.on_b.put(to + 4), nearest.gap.normal.put(to + 7);
+    pair[0] = nearest.i, pair[1] = nearest.j;
+  }
+}
+
+// Gaps of pairs of shapes: arguments are integers [pairs, 2, 3] (kind, first vertex, count), numbers [pairs, 2, 15] (size,
+// position, rotation) and vertices; results distance, points and normal [pairs, 10], and whether the distance is at
+// least the last argument.
+inline void find_gaps(const xla::Call& call) {
+  for (int pair = 0; pair < call.size(0, 0); ++pair) {
+    Convex<double> shape[2];
+    for (int k = 0; k < 2; ++k) {
+      const int* integers = call.in<int>(0) + 6 * pair + 3 * k;
+      const double* numbers = call.in<double>(1) + 30 * pair + 15 * k;
+      shape[k] = {integers[0], integers[2], Vec3<double>::of(numbers), Vec3<double>::of(numbers + 3),
+                  Mat3<double>::of(numbers + 6), call.in<double>(2) + 3 * integers[1]};
+    }
+    const Gap<double> gap = gap_between(shape[0], shape[1]);
+    double* to = call.out<double>(0) + 10 * pair;
+    to[0] = gap.distance, gap.on_a.put(to + 1), gap.on_b.put(to + 4), gap.normal.put(to + 7);
+    call.out<int>(1)[pair] = is_apart(shape[0], shape[1], call.in<double>(3)[0]);
+  }
+}
+}  // namespace osik
