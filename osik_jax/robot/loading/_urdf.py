@@ -74,7 +74,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
     look = UnreadLook(partial(read_look, description, packages, source.path))
-    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look)
+    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look, path=source.path)
 
 
 def _inertia_notes(urdf: Urdf, model: mujoco.MjModel) -> Iterator[LoadNote]:
