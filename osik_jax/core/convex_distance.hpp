@@ -136,6 +136,7 @@ template <class Real> class Difference : Simplex<Real> {
  private:
   static constexpr int MOST_STEPS = 100, MOST_POINTS = 100, MOST_FACES = 2 * MOST_POINTS;
   static constexpr Real TOLERANCE = sizeof(Real) == 8 ? 1e-11 : 1e-6;  // of distances [m]
+  static constexpr Real ROUNDOFF = sizeof(Real) == 8 ? 1e-13 : 1e-6;   // of points [m]
   static constexpr Real THIN = sizeof(Real) == 8 ? 1e-10 : 1e-5;       // what is thinner is flat [m]
   const Convex<Real>&a, &b;
   const Mat3<Real> turn, back;
@@ -319,7 +320,8 @@ template <class Real> class Difference : Simplex<Real> {
     int border[MOST_FACES][2], edges = 0, kept = 0;
     for (int k = 0; k < known; ++k) {
       const Face f = faces[k];
-      if (!(inner(f.normal, points[next].w) > f.distance)) {
+      // a face in one plane with the point goes too: a face between the point and one of its edges could be a line
+      if (!(inner(f.normal, points[next].w) >= f.distance - ROUNDOFF)) {
         faces[kept++] = f;
         continue;
       }

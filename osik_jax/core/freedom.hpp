@@ -94,6 +94,9 @@ class Freedom {
   }
 };
 
+inline void put(const Gap<double>& gap, double* to) {
+  to[0] = gap.distance, gap.on_a.put(to + 1), gap.on_b.put(to + 4), gap.normal.put(to + 7);
+}
 // Nearest pairs at many configurations: arguments q [lanes, nq], the robot's integers and numbers, a scene; results
 // distance, points and normal [lanes, 10], and the pair [lanes, 2].
 inline void find_clearances(const xla::Call& call) {
@@ -106,14 +109,25 @@ inline void find_clearances(const xla::Call& call) {
     const auto nearest = collision.nearest();
     double* to = call.out<double>(0) + 10 * lane;
     int* pair = call.out<int>(1) + 2 * lane;
-    to[0] = nearest.gap.distance, nearest.gap.on_a.put(to + 1), nearest.gap.on_b.put(to + 4), nearest.gap.normal.put(to + 7);
+    put(nearest.gap, to);
     pair[0] = nearest.i, pair[1] = nearest.j;
   }
 }
 
+// Whether all pairs keep a distance, argument 5, at many configurations; other arguments as in find_clearances.
+inline void find_free_ones(const xla::Call& call) {
+  const ShapedRobot<double> robot(call.in<int>(1), call.in<double>(2));
+  Collision<double> collision(robot);
+  for (int lane = 0; lane < call.size(0, 0); ++lane) {
+    if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
+    collision.place(xla::lane_of(call, 0, lane));
+    const double least = *xla::lane_of(call, 5, lane);
+    call.out<int>(0)[lane] = collision.nearer(least, false).i < 0 && collision.nearer(least, true).i < 0;
+  }
+}
+
 // Gaps of pairs of shapes: arguments are integers [pairs, 2, 3] (kind, first vertex, count), numbers [pairs, 2, 15] (size,
-// position, rotation) and vertices; results distance, points and normal [pairs, 10], and whether the distance is at
-// least the last argument.
+// position, rotation) and vertices; results are distance, points and normal [pairs, 10].
 inline void find_gaps(const xla::Call& call) {
   for (int pair = 0; pair < call.size(0, 0); ++pair) {
     Convex<double> shape[2];
@@ -125,8 +139,7 @@ inline void find_gaps(const xla::Call& call) {
     }
     const Gap<double> gap = gap_between(shape[0], shape[1]);
     double* to = call.out<double>(0) + 10 * pair;
-    to[0] = gap.distance, gap.on_a.put(to + 1), gap.on_b.put(to + 4), gap.normal.put(to + 7);
-    call.out<int>(1)[pair] = is_apart(shape[0], shape[1], call.in<double>(3)[0]);
+    put(gap, to);
   }
 }
 }  // namespace osik
