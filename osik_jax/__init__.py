@@ -8,6 +8,7 @@ from .batching import batch_axes as batch_axes
 from .batching import batched as batched
 from .batching import stack as stack
 from .collision import CollisionShape as CollisionShape
+from .collision import Scene as Scene
 from .control import Clutch as Clutch
 from .control import Controller as Controller
 from .control import Solution as Solution

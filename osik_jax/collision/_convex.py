@@ -13,7 +13,8 @@ from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot.loading._meshes import unread_points
 from ..robot.loading._urdf_meshes import thickened
-from ._geometry import qhull, round_polyhedron
+from ._geometry import Kind, qhull, round_polyhedron
+from ._shape import CollisionShape
 from ._table import ShapeKind, ShapeTable
 
 NO_VERTICES = np.zeros((0, 3))
@@ -70,17 +71,46 @@ def geom_shape(robot: Robot, number: int) -> ConvexShape:
     """
     leaves = robot.geom_size, robot.geom_position, robot.geom_rotation
     size, position, rotation = (np.asarray(leaf[number], float) for leaf in leaves)
-    kind = robot.tree.geom_types[number]
-    simple = _KINDS.get(kind)
-    if simple is ShapeKind.HALF_SPACE:
-        return ConvexShape(simple, np.zeros(3), position, rotation)
-    if simple is not None:
-        return ConvexShape(simple, size, position, rotation)
+    model, kind = robot.mj_model, robot.tree.geom_types[number]
+    if kind != mujoco.mjtGeom.mjGEOM_MESH:
+        return _simple(kind, size, position, rotation)
+    unread = number >= model.ngeom
+    points = unread_points(robot.holder.meshes[number - model.ngeom]) if unread else _model_points(model, number)
+    return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, hull_vertices(points) * size)
+
+
+def model_shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> ConvexShape:
+    """Return a geom of a MuJoCo model in the world; a mesh is its convex hull.
+
+    Raises:
+        ValueError: the mesh has no hull.
+    """
+    position, rotation = data.geom_xpos[geom].copy(), data.geom_xmat[geom].reshape(3, 3).copy()
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+        return _simple(int(model.geom_type[geom]), model.geom_size[geom].copy(), position, rotation)
+    return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, hull_vertices(_model_points(model, geom)))
+
+
+def added_shape(shape: CollisionShape) -> ConvexShape:
+    """Return a user's shape in its frame; its numbers are concrete."""
+    size, position, rotation = (np.asarray(part, float) for part in (shape.size, shape.position, shape.rotation))
+    if shape.hull is not None:
+        radius = np.array([float(shape.hull.radius) * abs(size).max(), 0.0, 0.0])
+        return ConvexShape(ShapeKind.HULL, radius, position, rotation, np.asarray(shape.hull.vertices, float) * size)
+    kinds = {Kind.BOX: ShapeKind.BOX, Kind.CYLINDER: ShapeKind.CYLINDER, Kind.PLANE: ShapeKind.HALF_SPACE}
+    round_kind = ShapeKind.CAPSULE if size[1] > 0.0 else ShapeKind.SPHERE
+    return ConvexShape(kinds.get(shape.kind, round_kind), size, position, rotation)
+
+
+def _simple(
+    kind: int, size: Float[np.ndarray, "3"], position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> ConvexShape:
+    """Return a shape of one of MuJoCo's kinds that is no mesh."""
     if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
         return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, round_polyhedron(_HALVINGS) * size)
-    return ConvexShape(
-        ShapeKind.HULL, np.zeros(3), position, rotation, hull_vertices(_mesh_points(robot, number)) * size
-    )
+    if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+        size = np.zeros(3)  # MuJoCo's is that of its picture
+    return ConvexShape(_KINDS[kind], size, position, rotation)
 
 
 def hull_vertices(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
@@ -96,18 +126,15 @@ def hull_vertices(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "v 3"]:
     return hull.points[hull.vertices]
 
 
-def _mesh_points(robot: Robot, number: int) -> Float[np.ndarray, "n 3"]:
+def _model_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "n 3"]:
     """Return all vertices of a mesh geom [m]; those of the model's own hull may be fewer (``maxhullvert``)."""
-    model = robot.mj_model
-    if number >= model.ngeom:
-        return unread_points(robot.holder.meshes[number - model.ngeom])
-    mesh = model.geom_dataid[number]
+    mesh = model.geom_dataid[geom]
     start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     return np.asarray(model.mesh_vert[start : start + count], float)
 
 
 def bounding_ball(shape: ConvexShape) -> tuple[Float[np.ndarray, "3"], float]:
-    """Return centre (as ``position``) and radius [m] of a ball around a shape; the radius of a half space is infinite."""
+    """Return centre (as ``position``) and radius [m] of a ball around a shape; infinite for a half space."""
     radius, second, _ = shape.size
     if shape.kind is ShapeKind.HULL:
         middle = 0.5 * (shape.vertices.min(0) + shape.vertices.max(0))

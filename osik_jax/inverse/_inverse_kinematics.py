@@ -17,6 +17,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..collision._robot_shapes import Given
 from typing import Any as Scene
 from ..control._checks import check_setting, checked_limits, checked_start
+from ..kinematics._pose_forms import PoseLike
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
 from ..numerics._host import is_traced
@@ -26,7 +27,6 @@ from ..robot._configuration import check_configuration
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme
 from ..tasks import Task
-from ..tasks._targets import PoseLike
 from ._advice import advice
 from ._branches import Coordinates, all_solutions
 from ._chain_problem import ChainRoute, Settings
