@@ -11,13 +11,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._errors import OsikValueError
+from .._errors import OsikTypeError, OsikValueError
 from ..execution._computed import in_shared_lanes
 from ..kinematics import forward_kinematics
 from ..numerics._host import is_traced
 from ..robot import Robot
-from ._core import CoreRobot, CoreScene, are_free, check_length, core_robot, core_scene, gaps_at, require_core
+from ._core import (
+    CoreRobot,
+    CoreScene,
+    are_free,
+    check_length,
+    check_scene,
+    core_robot,
+    core_scene,
+    gaps_at,
+    require_core,
+)
 from ._robot_shapes import Given, robot_shapes
+from ._scene import Scene
 from ._table import RobotShapes
 
 
@@ -26,23 +37,27 @@ class Clearance(eqx.Module):
 
     Attributes:
         distance: signed distance of the nearest pair [m]; infinite if there is no pair. (...)
-        pair: numbers of its two shapes in ``names``. (..., 2)
-        names: of the robot's shapes, then of the scene's; empty inside ``jit`` (static).
+        pair: numbers of its two shapes: those of the robot come first, then the rows of the scene. (..., 2)
+        names: of the robot's shapes, and of the scene's (in a stack, of each scene's); empty inside ``jit`` (static).
     """
 
     distance: Float[Array, "*n"]
     pair: Int[Array, "*n 2"]
-    names: tuple[str, ...] = eqx.field(default=(), static=True)
+    names: tuple[Any, ...] = eqx.field(default=(), static=True)
 
-    def pair_names(self, *index: int) -> tuple[str, str]:
-        """Return the names of the nearest pair at a configuration, whose index is given where there are many."""
-        first, second = np.asarray(self.pair)[index]
-        return self.names[first], self.names[second]
+    def pair_names(self, index: int = 0) -> tuple[str, str]:
+        """Return the names of the nearest pair; ``index``: of the configuration, where there are many.
+
+        Raises:
+            TypeError: this was made inside ``jit``, where names are unknown.
+        """
+        if not self.names:
+            raise OsikTypeError("names are unknown inside jit: call osik_jax.clearance outside")
+        own, rows = self.names
+        return shape_names(own, rows, np.asarray(self.pair).reshape(-1, 2)[index], index)
 
 
-def clearance(
-    robot: Robot, q: Float[Array, "*n nq"], scene: Any, *, srdf: Given = None
-) -> Clearance:
+def clearance(robot: Robot, q: Float[Array, "*n nq"], scene: Scene, *, srdf: Given = None) -> Clearance:
     """Return the signed distance of the nearest pair of shapes, of the robot with itself and with a scene.
 
     The derivative of ``distance`` is that of the nearest points, with respect to q and to the scene's poses. A depth of
@@ -60,22 +75,22 @@ def clearance(
         ValueError: numbers of scenes and configurations that do not go together; q of another length.
     """
     shapes, q, lead = _prepared(robot, q, scene, srdf, "clearance")
-    distance, pair = (_jitted if not is_traced((q, scene)) else distances)(robot, shapes, q, scene)
-    names = () if is_traced((q, scene)) else (*shapes.names, *row_names(scene, 0))
+    distance, pair = distances(robot, shapes, q, scene)
+    names = () if is_traced((q, scene)) else (shapes.names, scene.names)
     return Clearance(distance.reshape(lead), pair.reshape(*lead, 2), names)
 
 
 def is_free(
     robot: Robot,
     q: Float[Array, "*n nq"],
-    scene: Any,
+    scene: Scene,
     clearance: Float[Array, ""] | float = 0.0,
     *,
     srdf: Given = None,
 ) -> Bool[Array, "*n"]:
-    """Return whether all pairs of shapes keep ``clearance`` [m] at each configuration. (...)
+    """Return whether all pairs of shapes keep ``clearance`` [m] at each configuration.
 
-    Arguments and errors as in ``osik_jax.clearance``.
+    Arguments and errors as in ``osik_jax.clearance``. The result has the leading axes of q.
     """
     shapes, q, lead = _prepared(robot, q, scene, srdf, "is_free")
     least = jnp.reshape(jnp.asarray(clearance, q.dtype), (1,))
@@ -85,62 +100,51 @@ def is_free(
 
 @jax.jit
 def _free(own: CoreRobot, given: tuple[Array, CoreScene, Array]) -> Bool[Array, " lanes"]:
-    q, scene, least = given
-    return _in_lanes(q, scene, partial(_are_free, own), least)
+    return _in_lanes(are_free, own, *given)
 
 
-def _are_free(own: CoreRobot, q: Array, scene: CoreScene, least: Array) -> Array:
-    return are_free(own, q, scene, least)
-
-
-def _in_lanes(q: Array, scene: CoreScene, call: Any, *more: Array) -> Any:
+def _in_lanes(call: Any, own: CoreRobot, q: Array, scene: CoreScene, *more: Array) -> Any:
     """Return what a method of the core says of each configuration, with a rule for ``vmap``."""
-    one = in_shared_lanes(lambda q, scene, *more: call(q, CoreScene(*scene), *more))
-    own = tuple(scene)
-    if len(scene.integers) == 1:
-        return jax.vmap(one, (0, None, *[None] * len(more)))(q, tuple(a[0] for a in own), *(a[0] for a in more))
-    return jax.vmap(one, (0, 0, *[None] * len(more)))(q, own, *(a[0] for a in more))
+    one = in_shared_lanes(call)
+    each, alone = 0 if len(scene.integers) > 1 else None, jax.tree.map(lambda a: a[0], (scene, more))
+    scene = scene if each == 0 else alone[0]
+    return jax.vmap(one, (None, 0, each, *[None] * len(more)))(own, q, scene, *alone[1])
 
 
-def _prepared(robot: Robot, q: Any, scene: Any, srdf: Given, what: str) -> tuple[RobotShapes, Array, tuple[int, ...]]:
+def _prepared(robot: Robot, q: Any, scene: Scene, srdf: Given, what: str) -> tuple[RobotShapes, Array, tuple[int, ...]]:
     """Return the robot's shapes, the configurations as (lanes, nq), and their leading axes."""
     require_core(what)
+    check_scene(scene)
     q = jnp.asarray(q, robot.q0.dtype)
     if q.ndim == 0 or q.shape[-1] != robot.nq:
         raise OsikValueError(f"q has shape {q.shape}; the last axis has the robot's {robot.nq} entries")
     shapes, lead, q = robot_shapes(robot, srdf), q.shape[:-1], q.reshape(-1, robot.nq)
-    scenes = scene.table.kind.shape[0] if np.ndim(scene.table.kind) == 2 else 1
-    if scenes > 1 and lead == ():
-        q, lead = jnp.broadcast_to(q, (scenes, robot.nq)), (scenes,)
+    if scene.is_stack and lead == ():
+        lead = scene.table.kind.shape[:1]
+        q = jnp.broadcast_to(q, (*lead, robot.nq))
     check_length(core_scene(scene, shapes), len(q), "configurations")
     return shapes, q, lead
 
 
-def distances(robot: Robot, shapes: RobotShapes, q: Float[Array, "lanes nq"], scene: Any) -> tuple[Array, Array]:
+def distances(robot: Robot, shapes: RobotShapes, q: Float[Array, "lanes nq"], scene: Scene) -> tuple[Array, Array]:
     """Return the distance of the nearest pair at each configuration, with its derivative, and the pair's numbers."""
-    return _distances(robot, core_robot(robot, shapes), shapes.bodies, q, core_scene(scene, shapes), scene)
+    return _distances(robot, core_robot(robot, shapes), jnp.asarray(shapes.bodies), q, core_scene(scene, shapes), scene)
 
 
-def _jitted(robot: Robot, shapes: RobotShapes, q: Array, scene: Any) -> tuple[Array, Array]:
-    given = core_robot(robot, shapes), shapes.bodies, q, core_scene(scene, shapes), (scene.table, scene.body)
-    return _program(robot, *given)
-
-
+@jax.jit
 def _distances(
-    robot: Robot, own: CoreRobot, bodies: Array, q: Array, arrays: CoreScene, scene: Any
+    robot: Robot, own: CoreRobot, bodies: Int[Array, " k"], q: Float[Array, "lanes nq"], arrays: CoreScene, scene: Scene
 ) -> tuple[Array, Array]:
-    table, carrying = (scene.table, scene.body) if hasattr(scene, "table") else scene
-    gaps = _in_lanes(*jax.lax.stop_gradient((q, arrays)), partial(gaps_at, own))
-    many = np.ndim(table.kind) == 2 and len(table.kind) > 1
-    rows = [jnp.asarray(a) if many or np.ndim(table.kind) == 1 else jnp.asarray(a)[0] for a in (table.position, table.rotation)]
-    rows.append(jnp.broadcast_to(jnp.asarray(carrying), np.shape(table.kind)) if many else jnp.reshape(jnp.asarray(carrying), -1))
-    lane = partial(_moved, robot, jnp.asarray(bodies))
-    moved = jax.vmap(lane, (0, 0, 0, 0, *[0 if many else None] * 3))(q, gaps.points, gaps.normal, gaps.pair, *rows)
+    gaps = _in_lanes(gaps_at, *jax.lax.stop_gradient((own, q, arrays)))
+    rows: Any = scene.table.position, scene.table.rotation, scene.body
+    if scene.is_stack and len(scene.body) == 1:
+        rows = tuple(a[0] for a in rows)
+    each = 0 if rows[2].ndim == 2 else None
+    lane = partial(_moved, robot, bodies)
+    moved = jax.vmap(lane, (0, 0, 0, 0, each, each, each))(q, gaps.points, gaps.normal, gaps.pair, *rows)
     known = jnp.isfinite(gaps.distance)
-    return jnp.where(known, gaps.distance + jnp.where(known, moved - jax.lax.stop_gradient(moved), 0.0), jnp.inf), gaps.pair
-
-
-_program = jax.jit(_distances)
+    slope = jnp.where(known, moved - jax.lax.stop_gradient(moved), 0.0)
+    return gaps.distance + slope, gaps.pair
 
 
 def _moved(
@@ -176,16 +180,17 @@ def _moved(
     return jnp.dot(normal, here[1] - here[0])
 
 
-def row_names(scene: Any, index: int) -> tuple[str, ...]:
-    """Return the names of a scene's rows; ``index``: which scene, where there are many."""
-    del index
-    return tuple(scene.names)
+def shape_names(own: tuple[str, ...], rows: tuple[Any, ...], pair: np.ndarray, index: int) -> tuple[str, str]:
+    """Return the names of a pair of shapes.
 
-
-def shape_names(shapes: RobotShapes, scene: Any, pair: np.ndarray, index: int) -> tuple[str, str]:
-    """Return the names of a pair of shapes; ``index``: which scene, where there are many."""
+    Args:
+        own: names of the robot's shapes.
+        rows: of the scene's shapes; in a stack, of each scene's.
+        pair: numbers of the two shapes. (2,)
+        index: which scene, in a stack.
+    """
     if pair[0] < 0:
         return "nothing", "nothing"
-    rows, count = row_names(scene, index), len(shapes.names)
-    first, second = (shapes.names[k] if k < count else rows[k - count] for k in pair)
+    rows = rows[index] if rows and isinstance(rows[0], tuple) else rows
+    first, second = (own[k] if k < len(own) else rows[k - len(own)] for k in pair)
     return first, second

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .._errors import OsikError, OsikValueError
+from .._errors import OsikError, OsikTypeError, OsikValueError
 from ..core import _library
 from ..execution._platform import cpu_is_default
 from ..kinematics._kernels import tree_integers
@@ -18,6 +18,7 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._tree import KinematicTree
+from ._scene import Scene
 from ._table import RobotShapes, ShapeKind, ShapeTable
 
 _PACK = 4
@@ -28,8 +29,8 @@ class CoreScene(NamedTuple):
     """A scene for the core, with an axis of scenes in front, of length 1 where all targets share one.
 
     Attributes:
-        integers: kind, first vertex, number of vertices and carrying body of each row, then whether it may touch each
-            shape of the robot. (scenes, k (4 + shapes))
+        integers: number of rows; kind, first vertex, number of vertices and carrying body of each; whether it may touch
+            each shape of the robot, and each other row. (scenes, 1 + k (4 + shapes + k))
         numbers: size, position and rotation of each row, then the vertices. (scenes, 15 k + 3 v)
     """
 
@@ -76,10 +77,29 @@ def core_robot(
     index, factor = tree.qpos_source
     sizes = [len(tree.body_parents), len(tree.joint_types), len(tree.dof_joint), len(index)]
     sizes += [len(shapes.names), len(shapes.pairs), len(vertices) // 3]
-    integers = [sizes, tree_integers(tree)[1:], moves, table.kind, shapes.bodies, np.maximum(first, 0), count, shapes.world, shapes.pairs]
+    integers = [
+        sizes,
+        tree_integers(tree)[1:],
+        moves,
+        table.kind,
+        shapes.bodies,
+        np.maximum(first, 0),
+        count,
+        shapes.world,
+        shapes.pairs,
+    ]
     centers, bounds = _bounds(table)
     numbers = [factor, robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
-    numbers += [robot.joint_position, robot.joint_axis, table.size, table.position, table.rotation, centers, bounds, vertices]
+    numbers += [
+        robot.joint_position,
+        robot.joint_axis,
+        table.size,
+        table.position,
+        table.rotation,
+        centers,
+        bounds,
+        vertices,
+    ]
     with jax.ensure_compile_time_eval():  # on the device once, also if a user's program is traced
         return CoreRobot(jnp.asarray(_flat(integers, np.int32)), jnp.asarray(_flat(numbers, np.float64)))
 
@@ -137,20 +157,26 @@ def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | No
     return moves
 
 
+def check_scene(scene: Any) -> None:
+    """Raise TypeError unless this is a ``Scene``."""
+    if not isinstance(scene, Scene):
+        raise OsikTypeError(f"scene is a {type(scene).__name__}; make an osik_jax.Scene of it: Scene({{name: shape}})")
+
+
 @remembered
-def core_scene(scene: Any, shapes: RobotShapes) -> CoreScene:
+def core_scene(scene: Scene, shapes: RobotShapes) -> CoreScene:
     """Return the arrays of a scene, by NumPy unless traced."""
-    table, numbers = scene.table, jnp if is_traced(scene) else np
-    table = ShapeTable(*(numbers.asarray(a) for a in table))
-    many = table.kind.ndim == 2
-    lead = table.kind.shape[:-1]
-    contacts = numbers.asarray(scene.contacts(shapes))
-    parts = [table.kind, table.first, table.count, numbers.asarray(scene.body), contacts]
-    parts = [numbers.broadcast_to(a, (*lead, *a.shape[a.ndim - (2 if a is contacts else 1) :])) for a in parts]
-    integers = numbers.concatenate([a.reshape(*lead, -1).astype(np.int32) for a in parts], -1)
-    floats = [table.size, table.position, table.rotation, table.vertices]
-    reals = numbers.concatenate([a.reshape(*lead, -1) for a in floats], -1)
-    return CoreScene(*(a if many else a[None] for a in (integers, reals)))
+    numbers = jnp if is_traced(scene) else np
+    table, lead = scene.table, scene.table.kind.shape[:-1]
+    rows = np.full((*lead, 1), scene.capacity, np.int32)
+    integers = rows, table.kind, table.first, table.count, scene.body, scene.contacts(shapes), scene.among
+    floats = table.size, table.position, table.rotation, table.vertices
+
+    def together(arrays: Sequence[Any], kind: Any) -> Any:
+        flat = [numbers.asarray(a).reshape(*(lead or (1,)), -1) for a in arrays]
+        return numbers.concatenate([a.astype(kind) for a in flat], -1)
+
+    return CoreScene(together(integers, np.int32), together(floats, table.size.dtype))
 
 
 def check_length(scene: CoreScene, targets: int, what: str) -> None:
@@ -180,7 +206,8 @@ class Gaps(NamedTuple):
 
 def gaps_at(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> Gaps:
     """Return the nearest pair at each configuration."""
-    shapes = [((len(q), 10), float), ((len(q), 2), int)]
+    lanes = max(len(q), len(scene.integers))
+    shapes = [((lanes, 10), float), ((lanes, 2), int)]
     numbers, pair = _library.call("clearances", shapes, q, robot.integers, robot.numbers, *scene)
     return Gaps(numbers[:, 0], numbers[:, 1:7].reshape(-1, 2, 3), numbers[:, 7:], pair)
 
@@ -190,7 +217,8 @@ def are_free(
 ) -> Bool[Array, " lanes"]:
     """Return whether all pairs keep a distance at each configuration."""
     given = q, robot.integers, robot.numbers, *scene, clearance
-    return _library.call("are_free", [((len(q),), int)], *given)[0] > 0
+    lanes = max(map(len, (q, scene.integers, clearance)))
+    return _library.call("are_free", [((lanes,), int)], *given)[0] > 0
 
 
 def gaps_between(first: ShapeTable, second: ShapeTable) -> Gaps:

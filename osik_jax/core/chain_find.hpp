@@ -24,6 +24,7 @@ class ChainFinder {
   using Errors = Search::Errors;
   using List = std::vector<double>;
   using In = const double*;
+  static constexpr int POLISH = 3;
   static constexpr double TURN = 6.283185307179586, NEVER = std::numeric_limits<double>::infinity();
   struct Lane {  // of a pack: a search that runs, -1 for none
     int seed, age;
@@ -78,6 +79,7 @@ class ChainFinder {
     const int all = most ? seeds : 0;
     Best best = is_near || is_every ? explored(goal, all, is_near, false, outcomes) : plain(goal, most);
     if (is_near) compare_with_plain(goal, most, best);
+    if (freedom && is_every && !(best.score <= 1)) best = plain(goal, most);
     if (freedom && !(best.score <= 1)) freedom->take_least_wrong(best.x, best.seed);
     answer(goal, best, q, call.out<double>(1) + (3 + 6 * frames) * target, labels);
     if (freedom) freedom->judge(call, target, q, is_every, labels[0]);
@@ -175,7 +177,7 @@ class ChainFinder {
   // Keep the end `here` of a search among the outcomes, and as the best if it is.
   void keep(In goal, int seed, double score, Best& best, double* outcomes) {
     List x(n);
-    if (freedom) polish(goal);
+    for (int k = 0; k < POLISH && freedom; ++k) polish(goal);  // what is judged is the answer
     unwind(x.data());
     score = score == score && (score > 1 || is_free(goal, x, seed)) ? score : NEVER;
     double distance = is_near ? 0 : seed;
@@ -243,7 +245,8 @@ class ChainFinder {
   // The configuration q, its errors, residuals, and the limits that stop joints.
   void answer(In goal, const Best& best, double* q, double* sizes, int* labels) {
     std::copy(best.x.begin(), best.x.end(), here.begin());
-    polish(goal), unwind(search.x);
+    if (!freedom) polish(goal);
+    unwind(search.x);
     for (int j = 0; j < n; ++j) q[entry[j]] = search.x[j] = is_single ? double(float(search.x[j])) : search.x[j];
     const Errors errors = compare(goal);
     search.differentiate();
@@ -273,14 +276,20 @@ inline void find_free(const xla::Call& call) {
   const int targets = call.size(0, 0), most = std::max(1, int(std::thread::hardware_concurrency()));
   const ShapedRobot<double> robot(call.in<int>(5), call.in<double>(6));
   std::atomic<int> next{0};
+  std::atomic<bool> has_failed{false};
   auto work = [&] {
-    Freedom freedom(robot);
-    ChainFinder finder(call, &freedom);
-    for (int target = next++; target < targets; target = next++) finder.solve(call, target);
+    try {
+      Freedom freedom(robot);
+      ChainFinder finder(call, &freedom);
+      for (int target = next++; target < targets; target = next++) finder.solve(call, target);
+    } catch (const std::exception&) {  // no memory
+      has_failed = true;
+    }
   };
   std::vector<std::thread> others;
   for (int k = 1; k < std::min(most, targets / LEAST); ++k) others.emplace_back(work);
   work();
   for (auto& other : others) other.join();
+  xla::Call::require(!has_failed, "the core has no memory for a search in a scene");
 }
 }  // namespace osik

@@ -40,27 +40,31 @@ template <class Real> struct ShapedRobot {
   }
 };
 
-// A scene, likewise: fields of ShapeTable, the body that carries each row (-1: none), allowed contacts.
+// A scene, likewise: fields of ShapeTable, the body that carries each row (-1: none), contacts that are allowed.
 template <class Real> struct SceneRows {
   int rows;
-  const int *kind, *first, *count, *body, *contacts;  // [rows] four times, [rows, shapes of the robot]
-  const Real *size, *place, *turn, *points;           // [rows, 3] twice, [rows, 9], [vertices, 3]
-  SceneRows(int rows, const int* integers, const Real* numbers) : rows(rows) {
+  const int *kind, *first, *count, *body;    // [rows] each
+  const int *contacts, *among;               // [rows, shapes of the robot], [rows, rows] flags
+  const Real *size, *place, *turn, *points;  // [rows, 3] twice, [rows, 9], [vertices, 3]
+  SceneRows(const int* integers, const Real* numbers, int shapes) {
     Reader<const int*> i{integers};
-    kind = i.take(rows), first = i.take(rows), count = i.take(rows), body = i.take(rows), contacts = i.at;
+    rows = *i.take(1), kind = i.take(rows), first = i.take(rows), count = i.take(rows), body = i.take(rows);
+    contacts = i.take(rows * shapes), among = i.take(rows * rows);
     Reader<const Real*> r{numbers};
     size = r.take(3 * rows), place = r.take(3 * rows), turn = r.take(9 * rows), points = r.at;
   }
 };
 
 template <class Real> class Collision {
-  using V = Vec3<Real>;
-  using M = Mat3<Real>;
-  using List = std::vector<Real>;
+ public:
   struct Pair {
     int i, j;
   };
-  static constexpr Pair NONE{-1, -1};
+
+ private:
+  using V = Vec3<Real>;
+  using M = Mat3<Real>;
+  using List = std::vector<Real>;
   static constexpr int HULL_PACK = 4;
 
   const ShapedRobot<Real>& robot;
@@ -98,13 +102,12 @@ template <class Real> class Collision {
       for (int k = 0; k < robot.shapes; ++k)
         if (robot.world[k] && !scene.contacts[r * robot.shapes + k]) add_pair(k, robot.shapes + r);
       for (int s = 0; s < scene.rows && scene.body[r] >= 0; ++s)
-        if (scene.body[s] < 0) add_pair(robot.shapes + r, robot.shapes + s);
+        if (scene.body[s] < 0 && !scene.among[r * scene.rows + s]) add_pair(robot.shapes + r, robot.shapes + s);
     }
     auto is_fixed = [&](Pair p) { return !(moves(p.i) || moves(p.j)); };
     fixed = int(std::stable_partition(pairs.begin(), pairs.end(), is_fixed) - pairs.begin());
   }
-  bool moves(int shape) const { return carrier[shape] >= 0 && robot.moves[carrier[shape]]; }
-  int body(int shape) const { return carrier[shape]; }
+  int moves(int shape) const { return carrier[shape] < 0 ? 0 : robot.moves[carrier[shape]]; }
 
   // Place the shapes at a configuration [nq].
   void place(const Real* q) {
@@ -130,15 +133,26 @@ template <class Real> class Collision {
     }
     return {};
   }
-  // The nearest pair.
+  // The nearest pair; one whose distance is NaN, if there is one.
   Nearest nearest() const {
     Nearest best;
     for (const Pair p : pairs) {
       if (lower_bound(p) >= best.gap.distance) continue;
       const Gap<Real> gap = gap_of(p.i, p.j);
-      if (gap.distance < best.gap.distance) best = {p.i, p.j, gap};
+      if (!(gap.distance >= best.gap.distance)) best = {p.i, p.j, gap};
+      if (gap.distance != gap.distance) break;
     }
     return best;
+  }
+  // Less than the distance of a pair; of half spaces, no bound.
+  Real lower_bound(Pair p) const {
+    if (local[p.i].kind == HALF_SPACE) return world[p.i].beyond(center[p.j], center[p.i], bound[p.i]) - bound[p.j];
+    return world[p.j].beyond(center[p.i], center[p.j], bound[p.j]) - bound[p.i];
+  }
+  template <class F> bool any_pair(F f) const {
+    for (const Pair p : pairs)
+      if (f(p.i, p.j)) return true;
+    return false;
   }
   Gap<Real> gap_of(int i, int j) const { return gap_between(world[i], world[j]); }
   // Distance from a point to the farthest point of a shape, or more.
@@ -179,11 +193,6 @@ template <class Real> class Collision {
     Real most = 0;
     for (int k = 0; k < s.count; ++k) most = std::max(most, inner(s.vertex(k) - middle, s.vertex(k) - middle));
     return sqrt(most) + s.size.x;
-  }
-  // Less than the distance of a pair; of half spaces, no bound.
-  Real lower_bound(Pair p) const {
-    if (local[p.i].kind == HALF_SPACE) return world[p.i].beyond(center[p.j], center[p.i], bound[p.i]) - bound[p.j];
-    return world[p.j].beyond(center[p.i], center[p.j], bound[p.j]) - bound[p.i];
   }
 };
 }  // namespace osik

@@ -114,11 +114,13 @@ template <class Real> class Difference : Simplex<Real> {
 
   // Whether the distance of the cores is at least `least` > 0.
   bool is_apart(Real least) {
+    if (!is_known_place()) return false;
     approach(least);
     return is_known ? is_far : !overlaps && size >= least;
   }
   // Signed distance of the cores, in world axes.
   Gap<Real> gap() {
+    if (!is_known_place()) return {offset.x * Real(0) / Real(0), offset, offset, offset};
     approach(Real(-1));
     V normal, on_a{0, 0, 0};
     Real distance = size;
@@ -147,6 +149,11 @@ template <class Real> class Difference : Simplex<Real> {
   Point support(V d) const {
     const V on_a = a.support(d), on_b = turn * b.support(Real(-1) * (back * d)) + offset;
     return {on_a - on_b, on_a};
+  }
+  // Whether the shapes' places are finite numbers.
+  bool is_known_place() const {
+    const Real sum = inner(offset, offset) + turn.a.x + turn.b.y + turn.c.z;
+    return sum - sum == 0;
   }
   static Real length(V p) { return sqrt(inner(p, p)); }
 

@@ -10,10 +10,8 @@ constexpr double TOUCH = 1e-6;  // solutions keep so much more, against rounding
 
 // The scene of a target: argument `k` has integers, `k + 1` numbers, each with a row for each scene or one for all.
 inline SceneRows<double> scene_of(const xla::Call& call, int k, int shapes, int target) {
-  constexpr int COLUMNS = 4;  // of integers, beside contacts
-  const int row = call.size(k, 0) > 1 ? target : 0, integers = call.size(k, 1);
-  return {integers / (COLUMNS + shapes), call.in<int>(k) + size_t(integers) * row,
-          call.in<double>(k + 1) + size_t(call.size(k + 1, 1)) * row};
+  const size_t row = call.size(k, 0) > 1 ? target : 0;
+  return {call.in<int>(k) + call.size(k, 1) * row, call.in<double>(k + 1) + call.size(k + 1, 1) * row, shapes};
 }
 
 class Freedom {
@@ -30,7 +28,7 @@ class Freedom {
   int row = -1;  // of the scene that is taken
   std::vector<double> q;
   std::vector<Rejected> rejected;
-  Collision<double>::Nearest fixed;
+  Collision<double>::Nearest fixed, around;  // pairs that touch whatever the search does
 
  public:
   bool is_blocked = false;  // whether no solution of this target is free
@@ -54,8 +52,8 @@ class Freedom {
     collision.place(q.data());
     const auto hit = collision.nearer(clearance + TOUCH, true);
     if (hit.i < 0) return true;
+    if (rejected.empty()) is_blocked = is_around_target(tips, score, tolerances);  // the same at every solution
     if (rejected.size() < MOST) rejected.push_back({x, q, seed});
-    is_blocked = is_around_target(hit.i, hit.j, tips, score, tolerances);
     return false;
   }
   // Replace x by the rejected solution with the largest clearance, if there is one.
@@ -71,26 +69,31 @@ class Freedom {
   void judge(const xla::Call& call, int target, const double* answer, bool is_every, int& converged) {
     collision.place(answer);
     auto nearest = collision.nearest();
-    if (fixed.i >= 0) fixed.gap = collision.gap_of(fixed.i, fixed.j), nearest = fixed;
+    const Reason missed = fixed.i >= 0 ? HELD_SHAPES : is_blocked ? AROUND_TARGET : rejected.empty() ? NONE : EVERY_SOLUTION;
+    if (missed == HELD_SHAPES) nearest = fixed;
+    if (missed == AROUND_TARGET) nearest = around;
+    if (missed == HELD_SHAPES || missed == AROUND_TARGET) nearest.gap = collision.gap_of(nearest.i, nearest.j);
     const int first = is_every ? 4 : 3;
     call.out<double>(first)[target] = nearest.gap.distance;
     int* to = call.out<int>(first + 1) + 3 * target;
     to[0] = nearest.i, to[1] = nearest.j;
     converged = converged && nearest.gap.distance >= clearance;
-    const Reason missed = fixed.i >= 0 ? HELD_SHAPES : is_blocked ? AROUND_TARGET : rejected.empty() ? NONE : EVERY_SOLUTION;
     to[2] = converged ? NONE : missed;
   }
 
  private:
   // Whether a shape that a frame's target places touches one that stays, by more than the tolerances of the target allow
   // it to give way.
-  bool is_around_target(int i, int j, const double* tips, double score, const double* tolerances) const {
-    const int shape = collision.moves(i) ? i : j, other = shape == i ? j : i;
-    const int frame = robot.moves[collision.body(shape)] - 2;  // see collision/_core.py
-    if (frame < 0 || collision.moves(other)) return false;
-    const double arm = collision.reach(shape, Vec3<double>::of(tips + 3 * frame));
-    const double gives = (1 + score) * (tolerances[0] + tolerances[1] * arm);
-    return collision.gap_of(i, j).distance < clearance - gives;
+  bool is_around_target(const double* tips, double score, const double* tolerances) {
+    return collision.any_pair([&](int i, int j) {
+      const int shape = collision.moves(i) ? i : j, other = shape == i ? j : i;
+      const int frame = collision.moves(shape) - 2;  // see collision/_core.py
+      if (frame < 0 || collision.moves(other)) return false;
+      const double arm = collision.reach(shape, Vec3<double>::of(tips + 3 * frame));
+      const double least = clearance - (1 + score) * (tolerances[0] + tolerances[1] * arm);
+      around.i = i, around.j = j;
+      return collision.lower_bound({i, j}) < least && collision.gap_of(i, j).distance < least;
+    });
   }
 };
 
@@ -102,7 +105,7 @@ inline void put(const Gap<double>& gap, double* to) {
 inline void find_clearances(const xla::Call& call) {
   const ShapedRobot<double> robot(call.in<int>(1), call.in<double>(2));
   Collision<double> collision(robot);
-  const int lanes = call.size(0, 0);
+  const int lanes = call.result_size(0, 0);
   for (int lane = 0; lane < lanes; ++lane) {
     if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
     collision.place(xla::lane_of(call, 0, lane));
@@ -118,7 +121,7 @@ inline void find_clearances(const xla::Call& call) {
 inline void find_free_ones(const xla::Call& call) {
   const ShapedRobot<double> robot(call.in<int>(1), call.in<double>(2));
   Collision<double> collision(robot);
-  for (int lane = 0; lane < call.size(0, 0); ++lane) {
+  for (int lane = 0; lane < call.result_size(0, 0); ++lane) {
     if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
     collision.place(xla::lane_of(call, 0, lane));
     const double least = *xla::lane_of(call, 5, lane);

@@ -11,15 +11,16 @@ import numpy as np
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision._clearance import distances, shape_names
-from ..collision._core import CoreRobot, check_length, core_robot, core_scene, require_core
+from ..collision._core import CoreRobot, check_length, check_scene, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given, robot_shapes
+from ..collision._scene import Scene
 from ..collision._table import RobotShapes
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
-from ._chain_problem import ChainRoute, Settings, dof_of_entries
+from ._chain_problem import ChainRoute, Settings, answer, dof_of_entries
 from ._chain_search import Goal
 from ._fixed import Explored, Searches, or_far, with_placeholders
 from ._run import split
@@ -34,22 +35,24 @@ class Obstacles(NamedTuple):
     """What an answer may not touch.
 
     Attributes:
+        route: the frames.
         shapes: of the robot.
         scene: the user's.
         around: both for the core.
     """
 
+    route: ChainRoute
     shapes: RobotShapes
-    scene: Any
+    scene: Scene
     around: Around
 
     @property
     def many(self) -> bool:
         """Return whether each target has a scene of its own."""
-        return np.ndim(self.scene.table.kind) == 2
+        return self.scene.is_stack
 
 
-def read_obstacles(robot: Robot, route: Any, scene: Any, clearance: Any, srdf: Given) -> Obstacles:
+def read_obstacles(robot: Robot, route: Any, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
     """Return the obstacles of a search.
 
     Raises:
@@ -57,13 +60,14 @@ def read_obstacles(robot: Robot, route: Any, scene: Any, clearance: Any, srdf: G
         TypeError, ValueError: tasks, or limits with rows, instead of poses; a clearance that is negative.
     """
     require_core("inverse_kinematics with a scene")
+    check_scene(scene)
     if not isinstance(route, ChainRoute):
         raise OsikTypeError(
             "scene= goes with poses of frames that hinges and slides carry, and with limits of joints; tasks, a scheme "
             "or a free base take a CollisionAvoidanceLimit"
         )
     shapes, own = _known(robot, srdf, route=route)
-    return Obstacles(shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
+    return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
 
 
 @remembered
@@ -92,17 +96,16 @@ def find_free(
     how: Searches,
     obstacles: Obstacles,
     *,
-    route: ChainRoute,
     single: bool,
 ) -> Explored:
     """Return free configurations; arguments as of ``whole``. Without numbers, ``settings`` and so on may be traced."""
-    scenes = len(obstacles.around.scene.integers)
+    route, scenes = obstacles.route, len(obstacles.around.scene.integers)
     if len(goals.position) == 1 and scenes > 1:
-        goals = Goal(*(np.repeat(a, scenes, 0) for a in goals))
+        goals = jax.tree.map(lambda a: a.repeat(scenes, 0), goals)
     count = len(goals.position)
     check_length(obstacles.around.scene, count, "targets")
     if is_traced((goals, settings, obstacles.around, robot)):
-        return Explored(_traced(robot, route, goals, settings, most, steps, how, obstacles), *split(None))
+        return Explored(_traced(robot, goals, settings, most, steps, how, obstacles), *split(None))
     counts = np.full(count, most)
     given = robot, route, goals, settings, counts, most, steps, how
     results = whole(*given, single=single, around=obstacles.around)
@@ -111,8 +114,8 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
-    pairs = np.asarray(results.pair)
-    names = [shape_names(obstacles.shapes, obstacles.scene, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
+    pairs, own, rows = np.asarray(results.pair), obstacles.shapes.names, obstacles.scene.names
+    names = [shape_names(own, rows, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
     kinds = {pair: k for k, pair in enumerate(dict.fromkeys(names))}
     number = np.array([kinds[pair] for pair in names], np.int32).reshape(pairs.shape[:-1])
     return with_fields(results.answer, nearest_pair=number, pairs=tuple(kinds), obstruction=results.reason)
@@ -120,7 +123,6 @@ def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
 
 def _traced(
     robot: Robot,
-    route: ChainRoute,
     goals: Goal,
     settings: Settings,
     most: int,
@@ -129,14 +131,14 @@ def _traced(
     obstacles: Obstacles,
 ) -> InverseKinematicsSolution:
     """Return the answers as differentiable functions of what is traced; pairs have no names there."""
-    goals, valid = with_placeholders(goals)
+    route, (goals, valid) = obstacles.route, with_placeholders(goals)
     search, entries = route.search(robot, settings, warm=how.warm, near=how.near), route.entries(robot)
     fixed, there, around = jax.lax.stop_gradient((search, goals, obstacles.around))
     dofs, joints = tuple(dof_of_entries(robot)[entries].tolist()), tuple(dof_names(robot))
     counts = jnp.full(len(valid), most, jnp.int32)
     results = by_core(fixed, there, counts, jnp.int32(steps), how, dofs, joints, around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
-    own = route.answer(robot, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
+    own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
     gap = distances(robot, obstacles.shapes, own.q, obstacles.scene)[0]
     is_free = own.converged & (gap >= around.clearance[0])
     return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)

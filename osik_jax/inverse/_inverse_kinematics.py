@@ -14,8 +14,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ..collision import Scene
 from ..collision._robot_shapes import Given
-from typing import Any as Scene
 from ..control._checks import check_setting, checked_limits, checked_start
 from ..kinematics._pose_forms import PoseLike
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
@@ -167,7 +167,7 @@ def inverse_kinematics(
     if scene is not None:
         obstacles = read_obstacles(robot, route, scene, clearance, srdf)
         many = problem.many or obstacles.many
-        results = find_free(*given, once * (1 + restarts), steps, how, obstacles, single=not (many or all), route=route)
+        results = find_free(*given, once * (1 + restarts), steps, how, obstacles, single=not (many or all))
         found = results.found
         if all:
             found = dataclasses.replace(found, **_as_arrays(_all_of(*given, results, route)))

@@ -105,12 +105,24 @@ class InverseKinematicsSolution(eqx.Module):
         reasons = [f"{self.joints[i]} is at its {sides[int(at_limit[i])]} limit" for i in np.flatnonzero(at_limit)]
         if beyond > 0.0:
             return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line", *reasons]
-        if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
-            one, other = self.pairs[int(pick(self.nearest_pair))]
-            gap = round(float(pick(self.clearance)), 6) + 0.0
-            reasons.append(f"{one} and {other} are {gap:+.3g} m from as near as they may be")
+        if self.clearance is not None and self.nearest_pair is not None:
+            pair, gap = self.pairs[int(pick(self.nearest_pair))], round(float(pick(self.clearance)), 6) + 0.0
+            if self.obstruction is not None and pick(self.obstruction) > 0:
+                return [_obstruction(int(pick(self.obstruction)), *pair, gap)]
+            if gap < _NEAR:
+                reasons.append(f"{pair[0]} and {pair[1]} are {gap:+.3g} m from as near as they may be")
         reasons += self.advice
         return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
+
+
+def _obstruction(reason: int, one: str, other: str, gap: float) -> str:
+    """Return why no configuration is free; ``reason``: of ``InverseKinematicsSolution.obstruction``."""
+    how = f"{one} and {other} overlap by {-gap:.3g} m" if gap < 0.0 else f"{one} and {other} are {gap:.3g} m apart"
+    return {
+        1: f"{how} where q0 puts them, and no joint of these frames moves them apart: change q0 or the scene",
+        2: f"{how} wherever the target is met: an obstacle stands around the target, so no configuration is free",
+        3: f"something is in the way in every solution found; in the best one {how}",
+    }[reason]
 
 
 def with_fields(solution: InverseKinematicsSolution, **fields: Any) -> InverseKinematicsSolution:
