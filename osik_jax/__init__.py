@@ -7,7 +7,11 @@ from ._version import installed_version as _installed_version
 from .batching import batch_axes as batch_axes
 from .batching import batched as batched
 from .batching import stack as stack
+from .collision import Clearance as Clearance
 from .collision import CollisionShape as CollisionShape
+from .collision import Scene as Scene
+from .collision import clearance as clearance
+from .collision import is_free as is_free
 from .control import Clutch as Clutch
 from .control import Controller as Controller
 from .control import Solution as Solution

@@ -91,7 +91,7 @@ def unit_core(kind: Kind) -> UnitCore:
     if kind is Kind.BOX:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(-1, 3)
         return UnitCore(corners, np.eye(3), np.eye(3))
-    return convex_hull(_prism() if kind is Kind.CYLINDER else _ball())
+    return convex_hull(_prism() if kind is Kind.CYLINDER else round_polyhedron(1))
 
 
 def convex_hull(points: np.ndarray) -> UnitCore:
@@ -105,7 +105,7 @@ def convex_hull(points: np.ndarray) -> UnitCore:
     Raises:
         ValueError: the points lie in a plane, or are not finite.
     """
-    hull = _qhull(points)
+    hull = qhull(points)
     outermost = hull.points[hull.vertices]
     radius = 0.0
     if len(outermost) > MOST_VERTICES:
@@ -136,7 +136,8 @@ def mesh_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
     return convex_hull(points)
 
 
-def _qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
+def qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
+    """Return the convex hull of points; ValueError if they lie in a plane or are not finite."""
     try:
         return scipy.spatial.ConvexHull(np.asarray(points, float))
     except (scipy.spatial.QhullError, ValueError) as error:
@@ -146,7 +147,7 @@ def _qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
 def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
     """Return the hull of ``MOST_VERTICES`` of these vertices, chosen so that the others are only slightly outside."""
     chosen = scipy.spatial.ConvexHull(points, qhull_options=f"TA{_FIRST_VERTICES}").vertices
-    hull = _qhull(points[chosen])
+    hull = qhull(points[chosen])
     while len(chosen) < MOST_VERTICES:
         outside = points @ hull.equations[:, :3].T + hull.equations[:, 3]
         furthest = np.argmax(outside, 0)  # of each face
@@ -157,7 +158,7 @@ def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
         if not new:
             break
         chosen = np.concatenate([chosen, new[:room]])
-        hull = _qhull(points[chosen])
+        hull = qhull(points[chosen])
     return hull
 
 
@@ -189,7 +190,7 @@ def _squares_to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray
 @cache
 def _spread_normals() -> np.ndarray:
     """Return 40 evenly spread directions: the face normals of the polyhedron that stands for an ellipsoid."""
-    return _different(scipy.spatial.ConvexHull(_ball()).equations[:, :3])
+    return _different(scipy.spatial.ConvexHull(round_polyhedron(1)).equations[:, :3])
 
 
 def padded(cores: Sequence[UnitCore]) -> UnitCore:
@@ -242,17 +243,16 @@ def _prism() -> np.ndarray:
     return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-1.0, 1.0)])
 
 
-def _ball() -> np.ndarray:
-    """Return a polyhedron of 42 corners around the unit ball: an icosahedron with its edges halved."""
+def round_polyhedron(halvings: int) -> np.ndarray:
+    """Return the corners of a polyhedron around the unit ball: an icosahedron with its edges halved some times."""
     golden = 0.5 * (1.0 + np.sqrt(5.0))
     corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
     points = np.array([np.roll(corner, k) for corner in corners for k in range(3)])
-    points /= np.linalg.norm(points[0])
-    first, second = np.triu_indices(len(points), 1)
-    # edges of the unit icosahedron are 1.05 long; all other distances of its corners are at least 1.7
-    near = np.linalg.norm(points[first] - points[second], axis=1) < 1.2
-    halves = (points[first] + points[second])[near]
-    points = np.concatenate([points, halves / np.linalg.norm(halves, axis=1, keepdims=True)])
+    for _ in range(halvings):
+        faces = scipy.spatial.ConvexHull(points).simplices
+        ends = np.unique(np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1), axis=0)
+        points = np.concatenate([points, points[ends].sum(1)])
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
     return points / -scipy.spatial.ConvexHull(points).equations[:, 3].max()
 
 

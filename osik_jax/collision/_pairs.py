@@ -102,15 +102,7 @@ def candidate_pairs(
     wanted = _default_pairs(scene) if pairs is None else _named_pairs(scene, pairs)
     excluded = _excluded(scene, exclude)
     named = exact_pairs(scene, pairs)
-    unwanted = excluded | (_model_excludes(robot, scene) - named)
-    rigid = _RigidParts(robot)
-    found = []
-    for i, j in sorted(wanted - unwanted):
-        a, b = rigid.part(scene[i]), rigid.part(scene[j])
-        neighbours = (i, j) not in named and (a == rigid.parent(b) or b == rigid.parent(a))
-        movable = a != b and max(a, b) > 0
-        if movable and not neighbours and {scene[i].kind, scene[j].kind} != {Kind.PLANE}:
-            found.append((i, j))
+    found = _movable(robot, scene, wanted - excluded - (_model_excludes(robot, scene) - named), named)
     for pattern in pairs or ():
         asked = _named_pairs(scene, [pattern]) - excluded
         if asked and asked.isdisjoint(found) and found:
@@ -119,17 +111,48 @@ def candidate_pairs(
                 "on both sides, or on two planes does not count, and by globs neither do neighbouring bodies nor what "
                 "the model's <exclude> names"
             )
-    odd = sorted({scene[k].name for pair in found for k in pair if scene[k].kind is None})
-    if odd:
-        raise OsikValueError(
-            f"no distance to these geoms can be computed (height field or SDF); exclude them: {', '.join(odd)}"
-        )
+    refuse_without_distance(scene[k] for pair in found for k in pair)
     if not found:
         solid = ", ".join(member.label for member in scene if member.solid) or "none"
         raise OsikValueError(
             "no pair of shapes is left to keep apart: those of the same or of neighbouring bodies, geoms that do not "
             f"collide (contype and conaffinity) and excluded ones do not count; what collides: {solid}"
         )
+    return found
+
+
+def own_pairs(robot: Robot, scene: Sequence[Member]) -> list[tuple[int, int]]:
+    """Return the pairs of a robot's geoms that ``candidate_pairs`` has by default; there may be none."""
+    return _movable(robot, scene, _default_pairs(scene) - _model_excludes(robot, scene), set())
+
+
+def moves(robot: Robot, scene: Sequence[Member]) -> list[bool]:
+    """Return whether each shape moves, and is not fixed to the world by fixed or locked joints."""
+    rigid = _RigidParts(robot)
+    return [rigid.part(member) > 0 for member in scene]
+
+
+def refuse_without_distance(scene: Iterable[Member]) -> None:
+    """Raise ValueError if no distance to one of these shapes can be computed."""
+    odd = sorted({member.name for member in scene if member.kind is None})
+    if odd:
+        raise OsikValueError(
+            f"no distance to these geoms can be computed (height field or SDF); exclude them: {', '.join(odd)}"
+        )
+
+
+def _movable(
+    robot: Robot, scene: Sequence[Member], wanted: set[tuple[int, int]], named: set[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Return those of the wanted pairs that move relative to each other and are not neighbours, unless named."""
+    rigid = _RigidParts(robot)
+    found = []
+    for i, j in sorted(wanted):
+        a, b = rigid.part(scene[i]), rigid.part(scene[j])
+        neighbours = (i, j) not in named and (a == rigid.parent(b) or b == rigid.parent(a))
+        movable = a != b and max(a, b) > 0
+        if movable and not neighbours and {scene[i].kind, scene[j].kind} != {Kind.PLANE}:
+            found.append((i, j))
     return found
 
 

@@ -1,174 +1,402 @@
-"""Distances of all pairs of shapes: grouped by kind, with one vectorised computation for each group."""
+"""Scenes: convex shapes in the world and in the robot's hands, as arrays."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Sequence
-from functools import cached_property
-from typing import NamedTuple
+import fnmatch
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
+from numpy.typing import ArrayLike
 
-from ..kinematics import Kinematics
-from ..kinematics._forward import independent_columns
-from ..kinematics._rigid import compose, cross, rotate
+from .._errors import OsikTypeError, OsikValueError, unknown_name
+from ..kinematics._home import kinematics_on_host
+from ..kinematics._pose_forms import Pose, PoseLike, as_pose
+from ..kinematics._rigid import compose, rotate
+from ..numerics._arguments import check_count
+from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
-from ..robot._tree import KinematicTree, cached_arrays
-from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
-from ._geometry import Kind, UnitCore, padded, unit_core, world_cores
+from ._convex import ConvexShape, added_shape, shape_table
+from ._pairs import members
+from ._shape import CollisionShape
+from ._table import RobotShapes, ShapeTable
 
-_ROUNDS = 4
-"""Searches for the depth of an overlap of shapes whose edges are not all known."""
-
-
-class Group(NamedTuple):
-    """Pairs of one vectorised computation; ``first`` and ``second`` are indices of the scene's shapes."""
-
-    first: tuple[int, ...]
-    second: tuple[int, ...]
+_Shape = CollisionShape | ConvexShape
 
 
-@dataclasses.dataclass(frozen=True)
-class Scene:
-    """Static structure: the shapes, and the pairs that are kept apart.
+class Labels:
+    """Names of a scene's rows; all are equal, so that a scene with other names compiles nothing.
+
+    A function of ``jax.jit`` sees the names of the scene that it was traced with, so nothing reads them in there.
 
     Attributes:
-        names: name of each shape.
-        kinds: kind of each shape.
-        bodies: index of the moving body that each shape is fixed to.
-        geoms: index of the geom of each shape of the robot; these shapes come first.
-        frames: index of the frame that each added shape is fixed to.
-        hulls: index of each shape among the convex hulls; 0 if it is not a hull.
-        groups: the pairs.
+        names: name of each shape; in a stack, those of each scene.
+        objects: name of the object that each shape is a part of; likewise.
     """
 
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
-    bodies: tuple[int, ...]
-    geoms: tuple[int, ...]
-    frames: tuple[int, ...]
-    hulls: tuple[int, ...]
-    groups: tuple[Group, ...]
+    def __init__(self, names: tuple[Any, ...], objects: tuple[Any, ...]) -> None:
+        self.names, self.objects = names, objects
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Labels)
 
     def __hash__(self) -> int:
-        return self._hash
-
-    @cached_property
-    def _hash(self) -> int:
-        """Return the hash, computed once because every call of a jitted function asks for it."""
-        return hash(tuple(getattr(self, field.name) for field in dataclasses.fields(self)))
-
-    @cached_arrays
-    def pairs(self) -> np.ndarray:
-        """Return the shapes of each pair, in the order of the distances. (pairs, 2), int."""
-        return np.concatenate([np.array([group.first, group.second]).T for group in self.groups])
-
-    @cached_arrays
-    def pair_bodies(self) -> np.ndarray:
-        """Return moving bodies of each pair. (pairs, 2), int."""
-        return np.asarray(self.bodies, int)[self.pairs]
-
-    @cached_property
-    def pair_names(self) -> tuple[tuple[str, str], ...]:
-        """Return the names of each pair's shapes."""
-        return tuple((self.names[i], self.names[j]) for i, j in self.pairs)
+        return 0
 
 
-_RANKS = {Kind.PLANE: 0, Kind.SEGMENT: 1, Kind.BOX: 2, Kind.CYLINDER: 2, Kind.ELLIPSOID: 3, Kind.HULL: 3}
-"""Kinds of one rank share a computation, padded to the largest of them; of a pair the lower rank comes first."""
+class Scene(eqx.Module):
+    """Convex shapes that a robot keeps away from, in the world and in its hands.
 
+    A scene is a pytree of arrays with room for ``capacity`` shapes. Another scene with the same room compiles nothing,
+    whatever its shapes and names are. ``Scene.stack`` gives the arrays a leading axis, for a scene for each target.
 
-def grouped(kinds: Sequence[Kind], pairs: Sequence[tuple[int, int]]) -> tuple[Group, ...]:
-    """Return the pairs grouped by their computation; there are few groups, because each is compiled separately."""
-    found: dict[tuple[int, int], list[tuple[int, int]]] = {}
-    for pair in pairs:
-        i, j = sorted(pair, key=lambda k: (_RANKS[kinds[k]], k))
-        low, high = _RANKS[kinds[i]], _RANKS[kinds[j]]
-        computation = (low, 0) if low == 0 else (0, high) if high == 3 else (low, high)
-        found.setdefault(computation, []).append((i, j))
-    return tuple(Group(*map(tuple, zip(*found[key], strict=True))) for key in sorted(found))
+    Inside ``jit`` its arrays are traced like any others, and its names are unknown there: what goes by name (``moved``,
+    ``attach``, ``allow``) is called outside.
 
+    Args:
+        shapes: name to ``CollisionShape`` in the world, or to several that are one object, such as the parts that
+            ``CollisionShape.mesh`` returns.
+        capacity: number of shapes that there is room for; None: the next power of two.
+        vertex_capacity: the same for the vertices of all hulls.
 
-class Placed(eqx.Module):
-    """Shapes in the world.
+    Raises:
+        TypeError: something else than shapes by name, or traced numbers.
+        ValueError: more shapes than the capacity, a shape in a robot's frame, or numbers that are not finite.
 
     Attributes:
-        position: [m]. (k, 3)
-        rotation: from each shape's axes to the world's. (k, 3, 3)
-        size: MuJoCo's [m]. (k, 3)
+        table: the shapes; those that a body holds are in the body's axes. Rows without a shape are ``ABSENT``.
+        body: moving body (``robot.tree.body_names``) that holds each shape; -1: none, it is in the world. (k,)
+        contact: whether each shape may touch what each of ``partners`` matches. (k, m)
+        among: whether each shape may touch each other one, if a body holds one of them. (k, k)
+        partners: names or globs of the robot's shapes and links that something may touch (static).
     """
 
-    position: Float[Array, "k 3"]
-    rotation: Float[Array, "k 3 3"]
-    size: Float[Array, "k 3"]
+    table: ShapeTable
+    body: Int[Array, "*n k"]
+    contact: Bool[Array, "*n k m"]
+    among: Bool[Array, "*n k k"]
+    partners: tuple[str, ...] = eqx.field(static=True)
+    labels: Labels = eqx.field(static=True, repr=False)
+
+    def __init__(
+        self,
+        shapes: Mapping[str, _Shape | Sequence[_Shape]] | None = None,
+        *,
+        capacity: int | None = None,
+        vertex_capacity: int | None = None,
+    ):
+        objects = {name: _convex_shapes(name, given) for name, given in _items(shapes)}
+        rows = [
+            (f"{name}:{k}" if len(one) > 1 else name, name) for name, one in objects.items() for k in range(len(one))
+        ]
+        table = shape_table([shape for parts in objects.values() for shape in parts])
+        room = _room("capacity", "shapes", capacity, len(rows))
+        vertices = _room("vertex_capacity", "vertices of hulls", vertex_capacity, len(table.vertices))
+        free = np.full(room, -1, np.int32), np.zeros((room, 0), bool), np.zeros((room, room), bool)
+        self.table, self.body, self.contact, self.among = tree_to_jax((_padded(table, room, vertices), *free))
+        self.partners = ()
+        self.labels = Labels(tuple(name for name, _ in rows), tuple(name for _, name in rows))
+
+    @classmethod
+    def from_file(
+        cls, path: str | os.PathLike[str], *, capacity: int | None = None, vertex_capacity: int | None = None
+    ) -> Self:
+        """Read a MuJoCo XML, a URDF, or a scene of MoveIt: ``.yaml``, or the text format ``.scene``.
+
+        XML: all shapes that collide, each link or body an object, with joints where they are at the start (0, or
+        ``qpos0``). MoveIt: the collision objects, and the pairs of an object and a link that may touch.
+
+        Args:
+            path: of the file; meshes are looked for beside it.
+            capacity: as in ``Scene``.
+            vertex_capacity: as in ``Scene``.
+
+        Raises:
+            FileNotFoundError: no such file.
+            ImportError: a ``.yaml`` file without PyYAML (the extra ``scenes``).
+            ValueError: a file of another kind, or broken, or more shapes than the capacity.
+
+        Warns:
+            OsikWarning: something of the file is not kept, such as attached objects.
+        """
+        from ._scene_files import read_scene  # readers that few programs need
+
+        objects, allowed = read_scene(path)
+        scene = cls(objects, capacity=capacity, vertex_capacity=vertex_capacity)
+        return scene.allow(*allowed) if allowed else scene
+
+    @classmethod
+    def stack(cls, scenes: Sequence[Self]) -> Self:
+        """Return scenes with a leading axis, with room for the largest of them; ``stack[i]`` is one of them.
+
+        Raises:
+            TypeError: a scene is traced.
+            ValueError: there is none, or one is a stack.
+        """
+        if not scenes:
+            raise OsikValueError("there is no scene to stack")
+        for scene in scenes:
+            scene._check_single("Scene.stack")
+        room = max(scene.capacity for scene in scenes)
+        vertices = max(len(scene.table.vertices) for scene in scenes)
+        partners = tuple(dict.fromkeys(name for scene in scenes for name in scene.partners))
+        alike = [scene._enlarged(room, vertices, partners) for scene in scenes]
+        made = tree_to_jax(jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *alike))
+        labels = Labels(tuple(s.labels.names for s in alike), tuple(s.labels.objects for s in alike))
+        return _with(made, labels=labels)
+
+    def __getitem__(self, number: int) -> Self:
+        """Return one scene of a stack."""
+        if not self.is_stack:
+            raise OsikTypeError("this is one scene and no stack of scenes: its shapes are in scene.table")
+        one = jax.tree.map(lambda leaf: leaf[number], self)
+        return _with(one, labels=Labels(self.labels.names[number], self.labels.objects[number]))
+
+    @property
+    def is_stack(self) -> bool:
+        """Return whether the arrays have a leading axis."""
+        return self.table.kind.ndim > 1
+
+    @property
+    def capacity(self) -> int:
+        """Return the number of shapes that there is room for."""
+        return self.table.kind.shape[-1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the shapes, in the order of the rows; in a stack, the names of each scene."""
+        return self.labels.names
+
+    def __repr__(self) -> str:
+        if self.is_stack:
+            return f"Scene.stack of {self.table.kind.shape[0]} scenes with room for {self.capacity} shapes"
+        return f"Scene of {len(self.names)} shapes, room for {self.capacity}: {', '.join(self.names)}"
+
+    def moved(self, name: str, pose: PoseLike) -> Self:
+        """Return the scene with an object somewhere else. Nothing is compiled anew; the pose may be traced.
+
+        Args:
+            name: of the object, or of one of its shapes.
+            pose: of the shape, or of the object's first shape; the others keep their places relative to it. In the
+                axes of the body that holds it, else in the world.
+
+        Raises:
+            KeyError: no such name; the message lists all.
+            TypeError: the scene is traced.
+            ValueError: not a pose.
+        """
+        rows = self._rows(name, "moved")
+        numbers = jnp if is_traced((self, pose)) else np
+        position, rotation = (numbers.asarray(part)[rows] for part in (self.table.position, self.table.rotation))
+        wanted = as_pose(pose, self.table.position.dtype, numbers=numbers, what=f"the pose of {name!r}")
+        turn = compose(wanted[1], rotation[0].T)
+        return self._placed(rows, (wanted[0] + rotate(turn, position - position[0]), compose(turn, rotation)))
+
+    def attach(
+        self, name: str, robot: Robot, frame: str, *, q: ArrayLike | Array | None = None, touch: Sequence[str] = ()
+    ) -> Self:
+        """Return the scene with an object held by a frame of the robot, so that it moves with the frame.
+
+        Args:
+            name: of the object, or of one of its shapes.
+            robot: the robot.
+            frame: of the robot, such as its hand.
+            q: configuration of the robot at which the object is where the scene has it. (nq,) None: the object's pose
+                is in the axes of the frame.
+            touch: names or globs of links that it may touch, such as fingers. What is on the frame's own body may
+                always be touched.
+
+        Raises:
+            KeyError: no such name or frame.
+            TypeError: the scene is traced.
+            ValueError: a body holds the object already; or not a configuration.
+        """
+        rows = self._rows(name, "attach")
+        if (np.asarray(self.body)[rows] >= 0).any():
+            raise OsikValueError(f"{name!r} is held already; detach it first")
+        body = robot.tree.frame_bodies[robot.tree.frame(frame)]
+        hold = _frame_in_body(robot, frame) if q is None else _inverse(_body_pose(robot, body, q))
+        held = _with(self._placed(rows, _after(hold, self._poses(rows))), body=replaced_at(self.body, rows, body))
+        own = {part.aliases[0] for part in members(robot, {}) if part.solid and part.body == body}
+        return held.allow(*((name, _quoted(link)) for link in sorted(own)), *((name, link) for link in touch))
+
+    def detach(self, name: str, robot: Robot, q: ArrayLike | Array) -> Self:
+        """Return the scene with a held object in the world, where it is with the robot at q (nq,).
+
+        What it may touch stays as it is.
+
+        Raises:
+            KeyError: no such name.
+            TypeError: the scene is traced.
+            ValueError: no body holds the object, or not a configuration.
+        """
+        rows = self._rows(name, "detach")
+        body = int(np.asarray(self.body)[rows[0]])
+        if body < 0:
+            raise OsikValueError(f"no body holds {name!r}, so it cannot be detached")
+        world = self._placed(rows, _after(_body_pose(robot, body, q), self._poses(rows)))
+        return _with(world, body=replaced_at(self.body, rows, -1))
+
+    def allow(self, *pairs: tuple[str, str]) -> Self:
+        """Return the scene with pairs that may touch.
+
+        Args:
+            pairs: name or glob of objects or shapes, and one of the robot's links or shapes, or of other objects:
+                ``scene.allow(("can1", "panda_*finger"), ("can1", "table"))``. What matches no object is looked for
+                among the robot's names when the scene is used.
+
+        Raises:
+            KeyError: the first name of a pair matches nothing.
+            TypeError: not pairs of names, or the scene is traced.
+        """
+        self._check_single("allow")
+        contact, among, partners = np.asarray(self.contact), np.array(self.among), list(self.partners)
+        for pair in pairs:
+            if not isinstance(pair, tuple | list) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
+                raise OsikTypeError(f"allow takes pairs of names, such as ('can', 'panda_*finger'); got {pair!r}")
+            rows, others = self._rows(pair[0], "allow"), self._matching(pair[1])
+            among[np.ix_(rows, others)] = among[np.ix_(others, rows)] = True
+            if pair[1] not in partners:
+                partners.append(pair[1])
+                contact = np.pad(contact, ((0, 0), (0, 1)))
+            contact[rows, partners.index(pair[1])] = True
+        return _with(self, contact=to_jax(contact), among=to_jax(among), partners=tuple(partners))
+
+    def contacts(self, shapes: RobotShapes) -> Bool[Numbers, "*n k r"]:
+        """Return whether each shape of the scene may touch each shape of a robot, as ``allow`` and ``attach`` say."""
+        own = [*zip(shapes.names, shapes.links, strict=True)]
+        found = [[any(_matches(name, partner) for name in names) for names in own] for partner in self.partners]
+        matches = np.array(found, bool).reshape(len(self.partners), len(own))
+        numbers = jnp if is_traced(self) else np
+        return (numbers.asarray(self.contact)[..., None] & matches).any(-2)
+
+    def _check_single(self, what: str) -> None:
+        if is_traced(self):
+            raise OsikTypeError(f"{what}: the names of a traced scene are unknown; call it outside of jit")
+        if self.is_stack:
+            raise OsikValueError(f"{what}: this is a stack of scenes; change its scenes before they are stacked")
+
+    def _matching(self, pattern: str) -> np.ndarray:
+        pairs = enumerate(zip(self.labels.names, self.labels.objects, strict=True))
+        return np.array([k for k, names in pairs if any(_matches(name, pattern) for name in names)], int)
+
+    def _rows(self, pattern: str, what: str) -> np.ndarray:
+        self._check_single(what)
+        rows = self._matching(pattern)
+        if not len(rows):
+            raise unknown_name("object or shape", pattern, tuple(dict.fromkeys((*self.labels.objects, *self.names))))
+        return rows
+
+    def _poses(self, rows: np.ndarray) -> Pose:
+        return np.asarray(self.table.position, float)[rows], np.asarray(self.table.rotation, float)[rows]
+
+    def _placed(self, rows: np.ndarray, poses: Pose) -> Self:
+        """Return the scene with other poses of some rows."""
+        old = self.table.position, self.table.rotation
+        position, rotation = tree_to_jax(
+            [replaced_at(whole, rows, some) for whole, some in zip(old, poses, strict=True)]
+        )
+        return _with(self, table=self.table._replace(position=position, rotation=rotation))
+
+    def _enlarged(self, room: int, vertices: int, partners: tuple[str, ...]) -> Self:
+        """Return the scene with more room, and with columns of ``contact`` for all of these partners."""
+        more = room - self.capacity
+        contact = np.zeros((room, len(partners)), bool)
+        contact[: self.capacity, [partners.index(name) for name in self.partners]] = np.asarray(self.contact)
+        return _with(
+            self,
+            table=_padded(jax.tree.map(np.asarray, self.table), room, vertices),
+            body=np.pad(np.asarray(self.body), (0, more), constant_values=-1),
+            contact=contact,
+            among=np.pad(np.asarray(self.among), (0, more)),
+            partners=partners,
+        )
 
 
-def place(scene: Scene, robot: Robot, kinematics: Kinematics, added: Placed) -> Placed:
-    """Return the scene's shapes in the world; ``added`` has the poses of the added shapes, each in its frame."""
-    own, frames = np.asarray(scene.geoms, int), np.asarray(scene.frames, int)
-    robots = Placed(robot.geom_position[own], robot.geom_rotation[own], robot.geom_size[own])
-    turn = robot.frame_rotation[frames]
-    others = Placed(
-        robot.frame_position[frames] + rotate(turn, added.position), compose(turn, added.rotation), added.size
-    )
-    local = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), robots, others)
-    bodies = np.asarray(scene.bodies, int)
-    turn = kinematics.body_rotation[bodies]
-    return Placed(
-        kinematics.body_position[bodies] + rotate(turn, local.position), compose(turn, local.rotation), local.size
-    )
+def _with(scene: Scene, **changes: Any) -> Any:
+    """Return the scene with other fields; ``dataclasses.replace`` would call ``__init__``."""
+    made = object.__new__(type(scene))
+    for name in ("table", "body", "contact", "among", "partners", "labels"):
+        object.__setattr__(made, name, changes.get(name, getattr(scene, name)))
+    return made
 
 
-def nearest(scene: Scene, placed: Placed, hulls: UnitCore | None) -> Nearest:
-    """Return distances, points and normals of all pairs, with a leading axis; the first shape of a pair is ``a``."""
-    parts = [_of_group(scene, group, placed, hulls) for group in scene.groups]
-    return jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+def _items(shapes: Any) -> list[tuple[str, Any]]:
+    if shapes is None:
+        return []
+    if not isinstance(shapes, Mapping) or not all(isinstance(name, str) for name in shapes):
+        raise OsikTypeError(f"shapes is {type(shapes).__name__}; a scene takes a dictionary, name to CollisionShape")
+    return list(shapes.items())
 
 
-def _of_group(scene: Scene, group: Group, placed: Placed, hulls: UnitCore | None) -> Nearest:
-    second = _cores(scene, group.second, placed, hulls)
-    if scene.kinds[group.first[0]] is Kind.PLANE:
-        planes = np.asarray(group.first, int)
-        return jax.vmap(from_plane)(placed.position[planes], placed.rotation[planes, :, 2], second)
-    first = _cores(scene, group.first, placed, hulls)
-    if scene.kinds[group.second[0]] is Kind.SEGMENT:
-        return jax.vmap(between_segments)(first, second)
-    complete = first.edges.shape[1] and second.edges.shape[1]
-    return jax.vmap(lambda a, b: between_polytopes(a, b, rounds=1 if complete else _ROUNDS))(first, second)
+def _convex_shapes(name: str, given: Any) -> list[ConvexShape]:
+    """Return an object's shapes, checked."""
+    parts = [given] if isinstance(given, CollisionShape | ConvexShape) else given
+    if not isinstance(parts, Sequence) or not all(isinstance(part, CollisionShape | ConvexShape) for part in parts):
+        raise OsikTypeError(f"{name!r} is {type(given).__name__}; a scene takes CollisionShapes, or sequences of them")
+    made = []
+    for part in parts:
+        if isinstance(part, CollisionShape):
+            if is_traced(part):
+                raise OsikTypeError(f"{name!r} is traced: make the scene outside of jit, and move the shape in there")
+            if part.frame is not None:
+                raise OsikValueError(f"{name!r} is in the frame {part.frame!r}; make it in the world, then attach it")
+            part = added_shape(part)
+        if not all(np.isfinite(numbers).all() for numbers in part[1:]):
+            raise OsikValueError(f"{name!r} has numbers that are not finite")
+        made.append(part)
+    return made
 
 
-def _cores(scene: Scene, ids: tuple[int, ...], placed: Placed, hulls: UnitCore | None) -> Core:
-    """Return the cores of some shapes, padded to one size and stacked."""
-    index, kinds = np.asarray(ids, int), [scene.kinds[k] for k in ids]
-    units = [unit_core(kind) for kind in dict.fromkeys(kinds) if kind is not Kind.HULL]
-    start = {kind: k for k, kind in enumerate(kind for kind in dict.fromkeys(kinds) if kind is not Kind.HULL)}
-    if hulls is not None and Kind.HULL in kinds:
-        units += [UnitCore(*(rows[k] for rows in hulls)) for k in range(len(hulls.vertices))]
-    table = padded(units)
-    rows = [start.get(scene.kinds[k], len(start) + scene.hulls[k]) for k in ids]
-    unit = UnitCore(*(column[np.array(rows)] for column in table))
-    return world_cores(kinds, unit, placed.size[index], placed.position[index], placed.rotation[index])
+def _room(argument: str, what: str, given: int | None, count: int) -> int:
+    """Return the capacity that is given, or the next power of two."""
+    if given is None:
+        return 1 << (count - 1).bit_length() if count else 0
+    check_count(argument, given, least=0)
+    if count > given:
+        raise OsikValueError(f"the scene has {count} {what}, and its {argument} is {given}; give more, or None")
+    return given
 
 
-def separation_jacobian(
-    tree: KinematicTree, kinematics: Kinematics, near: Nearest, bodies: Int[np.ndarray, "k 2"] | Int[Array, "k 2"]
-) -> Float[Array, "k nv"]:
-    """Return J with ``d distance / dt = J v`` for pairs whose shapes are fixed to bodies: ``normal' (J_b - J_a)``.
+def _padded(table: ShapeTable, room: int, vertices: int) -> ShapeTable:
+    """Return the table with absent rows and zeros behind its vertices."""
+    more = room - len(table.kind)
+    eyes = np.broadcast_to(np.eye(3), (more, 3, 3))
+    padded = {name: np.pad(rows, ((0, more), *[(0, 0)] * (rows.ndim - 1))) for name, rows in table._asdict().items()}
+    padded["rotation"] = np.concatenate([table.rotation, eyes])
+    padded["vertices"] = np.pad(table.vertices, ((0, vertices - len(table.vertices)), (0, 0)))
+    return ShapeTable(**padded)
 
-    A point's velocity along the normal is the dof's at the robot's root, and its turning times the arm from there.
-    """
-    root = kinematics.body_position[tree.reference_body]
-    at_root = kinematics.dof_linear + cross(kinematics.dof_anchor - root, kinematics.dof_angular)
-    straight = jnp.matmul(near.normal, at_root.T, precision="highest")
 
-    def along(points: Float[Array, "k 3"], moves: Bool[np.ndarray, "k n"] | Bool[Array, "k n"]) -> Float[Array, "k n"]:
-        turned = jnp.matmul(cross(points - root, near.normal), kinematics.dof_angular.T, precision="highest")
-        return jnp.where(moves, straight + turned, 0.0)
+def _matches(name: str, pattern: str) -> bool:
+    return name == pattern or fnmatch.fnmatchcase(name, pattern)
 
-    moves = tree.moves if isinstance(bodies, np.ndarray) else jnp.asarray(tree.moves)
-    rate = along(near.point_b, moves[bodies[:, 1]]) - along(near.point_a, moves[bodies[:, 0]])
-    return independent_columns(tree, rate)
+
+def _quoted(name: str) -> str:
+    """Return a glob that matches a name alone."""
+    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in name)
+
+
+def _frame_in_body(robot: Robot, frame: str) -> Pose:
+    number = robot.tree.frame(frame)
+    return np.asarray(robot.frame_position[number], float), np.asarray(robot.frame_rotation[number], float)
+
+
+def _body_pose(robot: Robot, body: int, q: Any) -> Pose:
+    robot.check_configuration(q)
+    placed = kinematics_on_host(robot, np.asarray(q))
+    return np.asarray(placed.body_position[body], float), np.asarray(placed.body_rotation[body], float)
+
+
+def _inverse(pose: Pose) -> Pose:
+    return -rotate(pose[1].T, pose[0]), pose[1].T
+
+
+def _after(first: Pose, second: Pose) -> Pose:
+    """Return poses in the outer frame from those (k, ...) in a frame whose pose is ``first``."""
+    return first[0] + rotate(first[1], second[0]), compose(first[1], second[1])

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any, Self
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikValueError
-from ..numerics._arguments import concrete
-from ..numerics._host import to_jax
-from ..numerics._rotations import exact_rotation
+from .._errors import OsikTypeError, OsikValueError
+from ..kinematics._rigid import rotation_matrix
+from ..numerics._arguments import as_floats, concrete
+from ..numerics._host import Numbers, is_traced, module_of, tree_to_jax
+from ..numerics._rotations import exact_quaternion, exact_rotation
+from ..robot.loading._meshes import joined, read_mesh
+from ..robot.loading._packages import Packages
 from ._geometry import Kind, UnitCore, convex_hull
 
 
@@ -37,6 +40,10 @@ class CollisionShape(eqx.Module):
     hull: UnitCore | None = None
 
     @classmethod
+    def _made(cls, kind: Kind, frame: str | None, *numbers: Numbers, hull: UnitCore | None = None) -> Self:
+        return cls(kind, frame, *tree_to_jax(numbers), hull=hull)
+
+    @classmethod
     def sphere(
         cls, radius: ArrayLike | Array, position: ArrayLike | Array = (0.0, 0.0, 0.0), *, frame: str | None = None
     ) -> Self:
@@ -50,7 +57,7 @@ class CollisionShape(eqx.Module):
         Raises:
             ValueError: a size that is not positive, or a wrong shape.
         """
-        return cls(Kind.SEGMENT, frame, _vector(position, "position"), _rotation(None), _sizes(radius))
+        return cls._made(Kind.SEGMENT, frame, _vector(position, "position"), np.eye(3), _sizes(radius))
 
     @classmethod
     def capsule(
@@ -61,11 +68,7 @@ class CollisionShape(eqx.Module):
         Raises:
             ValueError: as in ``sphere``; start and end are one point.
         """
-        start, end = _vector(start, "start"), _vector(end, "end")
-        length = jnp.linalg.norm(end - start)
-        _check_positive(length, "the length of a capsule")
-        rotation = _turned_to((end - start) / length)
-        return cls(Kind.SEGMENT, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length))
+        return cls._made(Kind.SEGMENT, frame, *_along(radius, start, end, "capsule"))
 
     @classmethod
     def box(
@@ -81,14 +84,14 @@ class CollisionShape(eqx.Module):
         Args:
             half_sizes: half its edges [m]. (3,)
             position: of its centre, in the frame [m]. (3,)
-            rotation: from its axes to the frame's. (3, 3)
+            rotation: from its axes to the frame's, a matrix (3, 3) or a quaternion w x y z (4,).
             frame: of the robot; None: the world.
 
         Raises:
             ValueError: as in ``sphere``; ``rotation`` is no rotation.
         """
         sizes = _sizes(*_vector(half_sizes, "half_sizes"))
-        return cls(Kind.BOX, frame, _vector(position, "position"), _rotation(rotation), sizes)
+        return cls._made(Kind.BOX, frame, _vector(position, "position"), _rotation(rotation), sizes)
 
     @classmethod
     def cylinder(
@@ -96,16 +99,12 @@ class CollisionShape(eqx.Module):
     ) -> Self:
         """Return a cylinder of ``radius`` [m] between two points of the frame [m].
 
-        It is taken as the prism of 16 sides around it.
+        A ``Scene`` takes it as it is, a ``CollisionAvoidanceLimit`` as the prism of 16 sides around it.
 
         Raises:
             ValueError: as in ``capsule``.
         """
-        start, end = _vector(start, "start"), _vector(end, "end")
-        length = jnp.linalg.norm(end - start)
-        _check_positive(length, "the length of a cylinder")
-        rotation = _turned_to((end - start) / length)
-        return cls(Kind.CYLINDER, frame, 0.5 * (start + end), rotation, _sizes(radius, 0.5 * length))
+        return cls._made(Kind.CYLINDER, frame, *_along(radius, start, end, "cylinder"))
 
     @classmethod
     def half_space(cls, point: ArrayLike | Array, normal: ArrayLike | Array, *, frame: str | None = None) -> Self:
@@ -120,9 +119,8 @@ class CollisionShape(eqx.Module):
             ValueError: a wrong shape, or a normal of length 0.
         """
         normal = _vector(normal, "normal")
-        length = jnp.linalg.norm(normal)
-        _check_positive(length, "the length of a normal")
-        return cls(Kind.PLANE, frame, _vector(point, "point"), _turned_to(normal / length), jnp.zeros(3))
+        rotation = _turned_to(normal / _length(normal, "a normal"))
+        return cls._made(Kind.PLANE, frame, _vector(point, "point"), rotation, np.zeros(3))
 
     @classmethod
     def convex(
@@ -138,30 +136,94 @@ class CollisionShape(eqx.Module):
         Args:
             points: [m]. (k, 3)
             position: of their origin, in the frame [m]. (3,)
-            rotation: from their axes to the frame's. (3, 3)
+            rotation: from their axes to the frame's, as in ``box``.
             frame: of the robot; None: the world.
 
         Raises:
             ValueError: as in ``box``; the points lie in a plane.
         """
         hull = convex_hull(np.asarray(points, float))
-        return cls(
-            Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), to_jax(np.ones(3), float), hull
-        )
+        return cls._made(Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), np.ones(3), hull=hull)
+
+    @classmethod
+    def mesh(
+        cls,
+        source: str | os.PathLike[str] | tuple[np.ndarray, np.ndarray],
+        position: ArrayLike | Array = (0.0, 0.0, 0.0),
+        rotation: ArrayLike | Array | None = None,
+        *,
+        scale: float = 1.0,
+        frame: str | None = None,
+    ) -> tuple[Self, ...]:
+        """Return the convex parts of a triangle mesh; a ``Scene`` takes them as one object.
+
+        A mesh that is not convex is split by CoACD (the extra ``meshes``). Without it, its hull is taken.
+
+        Args:
+            source: path of a file (.stl, .obj, .dae, .msh), or vertices (n, 3) [m] and faces (m, 3).
+            position: of the mesh's origin, in the frame [m]. (3,)
+            rotation: as in ``box``.
+            scale: factor of the vertices.
+            frame: of the robot; None: the world.
+
+        Raises:
+            FileNotFoundError: no such file.
+            TypeError: neither a path nor two arrays.
+            ValueError: the file cannot be read, the arrays are no mesh, or all points lie in a plane.
+
+        Warns:
+            OsikWarning: the mesh is not convex, and its hull is taken.
+        """
+        from ._mesh_parts import convex_parts  # which makes shapes for the core of what is here
+
+        vertices, faces = triangles(source)
+        parts = convex_parts(vertices * scale, faces)
+        return tuple(cls.convex(part, position, rotation, frame=frame) for part in parts)
 
 
-def _vector(value: Any, what: str) -> Float[Array, "3"]:
-    out = to_jax(value, float)
+def triangles(source: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [m] and faces of a mesh file, or of a pair of arrays.
+
+    Raises:
+        TypeError: neither a path nor a pair.
+        ValueError: the file cannot be read, or the arrays have the wrong shape.
+    """
+    if isinstance(source, str | os.PathLike):
+        return joined(read_mesh(Packages().path(source)))
+    if not isinstance(source, tuple | list) or len(source) != 2:
+        raise OsikTypeError(f"a mesh is a path, or vertices (n, 3) and faces (m, 3); got {type(source).__name__}")
+    vertices, faces = np.asarray(source[0], float), np.asarray(source[1], int)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise OsikValueError(f"the vertices of a mesh have shape {vertices.shape}, expected (n, 3)")
+    return vertices, faces
+
+
+def _along(radius: Any, start: Any, end: Any, what: str) -> tuple[Numbers, Numbers, Numbers]:
+    """Return position, rotation and size of a shape whose axis goes from one point to another."""
+    start, end = _vector(start, "start"), _vector(end, "end")
+    length = _length(end - start, f"a {what}")
+    return 0.5 * (start + end), _turned_to((end - start) / length), _sizes(radius, 0.5 * length)
+
+
+def _vector(value: Any, what: str) -> Float[Numbers, "3"]:
+    """Return three numbers; those that are not traced are the host's, for which nothing is compiled."""
+    out = as_floats(value) if is_traced(value) else np.asarray(value, float)
     if out.shape != (3,):
         raise OsikValueError(f"{what} has shape {out.shape}, expected (3,)")
     return out
 
 
-def _sizes(*sizes: Any) -> Float[Array, "3"]:
+def _sizes(*sizes: Any) -> Float[Numbers, "3"]:
     """Return MuJoCo's sizes: the given ones, which have to be positive, then zeros."""
     for size in sizes:
         _check_positive(size, "a size")
-    return to_jax([*sizes, 0.0, 0.0][:3], float)
+    return _vector([*sizes, 0.0, 0.0][:3], "sizes")
+
+
+def _length(vector: Float[Numbers, "3"], what: str) -> Float[Numbers, ""]:
+    length = module_of(vector).linalg.norm(vector)
+    _check_positive(length, f"the length of {what}")
+    return length
 
 
 def _check_positive(value: Any, what: str) -> None:
@@ -170,18 +232,21 @@ def _check_positive(value: Any, what: str) -> None:
         raise OsikValueError(f"{what} is {seen}; it has to be positive [m]")
 
 
-def _rotation(value: Any) -> Float[Array, "3 3"]:
+def _rotation(value: Any) -> Float[Numbers, "3 3"]:
     if value is None:
-        return to_jax(np.eye(3), float)
-    out = to_jax(value, float)
+        return np.eye(3)
+    out = as_floats(value) if is_traced(value) else np.asarray(value, float)
+    if out.shape == (4,):
+        return rotation_matrix(exact_quaternion(out, "rotation"))
     if out.shape != (3, 3):
-        raise OsikValueError(f"rotation has shape {out.shape}, expected (3, 3)")
+        raise OsikValueError(f"rotation has shape {out.shape}, expected a matrix (3, 3) or a quaternion w x y z (4,)")
     return exact_rotation(out, "rotation")
 
 
-def _turned_to(axis: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _turned_to(axis: Float[Numbers, "3"]) -> Float[Numbers, "3 3"]:
     """Return a rotation that takes z to a unit vector."""
-    steepest = jnp.eye(3, dtype=axis.dtype)[jnp.argmin(jnp.abs(axis))]
-    side = jnp.cross(steepest, axis)
-    side = side / jnp.linalg.norm(side)
-    return jnp.stack([side, jnp.cross(axis, side), axis], -1)
+    numbers = module_of(axis)
+    steepest = numbers.eye(3, dtype=axis.dtype)[numbers.argmin(abs(axis))]
+    side = numbers.cross(steepest, axis)
+    side = side / numbers.linalg.norm(side)
+    return numbers.stack([side, numbers.cross(axis, side), axis], -1)

@@ -58,6 +58,7 @@ class RobotShapes(NamedTuple):
         sphere_center: in the axes of the moving body [m]. (s, 3)
         sphere_radius: [m]. Together the spheres of a shape contain it. (s,)
         sphere_overshoot: how far each sphere sticks out of its shape at most [m]. (s,)
+        touching: names of the pairs that are not kept apart because they touch in every configuration.
     """
 
     names: tuple[str, ...]
@@ -70,3 +71,4 @@ class RobotShapes(NamedTuple):
     sphere_center: Float[np.ndarray, "s 3"]
     sphere_radius: Float[np.ndarray, " s"]
     sphere_overshoot: Float[np.ndarray, " s"]
+    touching: tuple[tuple[str, str], ...] = ()

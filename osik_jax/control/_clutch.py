@@ -11,11 +11,11 @@ import jaxlie
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._errors import OsikValueError
+from ..kinematics._pose_forms import Pose, PoseLike, as_pose, pose_array
 from ..numerics._arguments import concrete
 from ..numerics._replace import Replaceable
 from ..tasks._leaves import as_scalar
 from ..tasks._rotation import dot
-from ..tasks._targets import Pose, PoseLike, as_pose, pose_array
 
 _REST = 1e-5
 """Metres and radians in a step: 2 mm/s at 200 Hz."""

@@ -1,11 +1,14 @@
 // Whole searches for poses on a CPU, one target after another, by the steps of chain_search.hpp. They are defined by
 // run_pool (inverse/_pool.py), explored (inverse/_run.py) and answer (inverse/_chain_problem.py). Arguments and results
-// as in inverse/_chain_kernel.py: found.
+// as in inverse/_whole.py. With a scene, solutions that touch something are no solutions (freedom.hpp).
 #pragma once
+#include <atomic>
 #include <limits>
+#include <thread>
 #include <vector>
 
 #include "chain_search.hpp"
+#include "freedom.hpp"
 #include "lanes.hpp"
 #include "xla.hpp"
 
@@ -21,6 +24,7 @@ class ChainFinder {
   using Errors = Search::Errors;
   using List = std::vector<double>;
   using In = const double*;
+  static constexpr int POLISH = 3;
   static constexpr double TURN = 6.283185307179586, NEVER = std::numeric_limits<double>::infinity();
   struct Lane {  // of a pack: a search that runs, -1 for none
     int seed, age;
@@ -42,16 +46,17 @@ class ChainFinder {
   std::vector<Pack> pack_space, pack_here;
   Search search;
   ChainSearch<Kind<Pack>> pack;
+  Freedom* freedom;  // null: every solution is free
 
   static int workspace(int n, int frames, int joints) {
     return 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1);
   }
 
  public:
-  ChainFinder(const xla::Call& call)
+  ChainFinder(const xla::Call& call, Freedom* freedom = nullptr)
       : n(call.in<int>(4)[0]), frames(call.size(0, 1)), space(workspace(n, frames, call.in<int>(3)[1])), here(n),
         gram(n * n), pack_space(space.size()), pack_here(n), search(call.in<int>(3) + 1, n, frames, space.data()),
-        pack(call.in<int>(3) + 1, n, frames, pack_space.data()) {
+        pack(call.in<int>(3) + 1, n, frames, pack_space.data()), freedom(freedom) {
     Reader<const int*> options{call.in<int>(4) + 1};
     longest = *options.take(1), check = *options.take(1), trial = *options.take(1), last = *options.take(1), seeds = *options.take(1);
     nq = *options.take(1), nv = *options.take(1);
@@ -67,11 +72,17 @@ class ChainFinder {
   void solve(const xla::Call& call, int target) {
     const In goal = call.in<double>(0) + 12 * frames * target;
     double* outcomes = is_every ? call.out<double>(3) + size_t(seeds) * (n + 2) * target : nullptr;
-    const int most = call.in<int>(1)[target];
-    Best best = is_near || is_every ? explored(goal, outcomes) : found(goal, most);
+    double* q = call.out<double>(0) + nq * target;
+    int* labels = call.out<int>(2) + (3 + nv) * target;
+    std::copy(home, home + nq, q);
+    const int most = freedom && !freedom->begin(call, target, q) ? 0 : call.in<int>(1)[target];
+    const int all = most ? seeds : 0;
+    Best best = is_near || is_every ? explored(goal, all, is_near, false, outcomes) : plain(goal, most);
     if (is_near) compare_with_plain(goal, most, best);
-    answer(goal, best, call.out<double>(0) + nq * target, call.out<double>(1) + (3 + 6 * frames) * target,
-           call.out<int>(2) + (3 + nv) * target);
+    if (freedom && is_every && !(best.score <= 1)) best = plain(goal, most);
+    if (freedom && !(best.score <= 1)) freedom->take_least_wrong(best.x, best.seed);
+    answer(goal, best, q, call.out<double>(1) + (3 + 6 * frames) * target, labels);
+    if (freedom) freedom->judge(call, target, q, is_every, labels[0]);
   }
 
  private:
@@ -85,7 +96,9 @@ class ChainFinder {
       put(j, std::min(std::max(to, search.lower[j]), search.upper[j]));
     }
   }
-  // One search after another until one is found.
+  // Searches until one has a solution.
+  Best plain(In goal, int most) { return freedom ? explored(goal, most, false, true, nullptr) : found(goal, most); }
+  // One search after another.
   Best found(In goal, int most) {
     Best best{List(search.start, search.start + n), NEVER, 0, 0, 0};
     for (int seed = 0; seed < most && !(best.score <= search.enough); ++seed) {
@@ -102,28 +115,31 @@ class ChainFinder {
     }
     return best;
   }
-  // Every search, some at a time; the nearest of those that are found, or the first, or the least wrong.
-  Best explored(In goal, double* outcomes) {
+  // `count` searches, some at a time; the nearest of those that are found, or the first, or the least wrong. `near`: they
+  // go towards the start. `brief`: they end with the first that is found.
+  Best explored(In goal, int count, bool near, bool brief, double* outcomes) {
     Best best{List(search.start, search.start + n), NEVER, NEVER, 0, 0};
     Lane lanes[Pack::COUNT];
     int next = 0, running = 0;
     auto start = [&](int k) {
-      lanes[k] = {next < seeds ? next++ : -1, 0, false, NEVER};
+      lanes[k] = {next < count ? next++ : -1, 0, false, NEVER};
       if (lanes[k].seed < 0) return;
       ++running;
-      begin(lanes[k].seed, is_near, [&](int j, double to) { pack.x[j].v[k] = to; });
-      pack.pull.v[k] = is_near, pack.enough.v[k] = search.enough;
+      begin(lanes[k].seed, near, [&](int j, double to) { pack.x[j].v[k] = to; });
+      pack.pull.v[k] = near, pack.enough.v[k] = search.enough;
     };
+    for (int k = 1; outcomes && freedom && k <= seeds; ++k) outcomes[(n + 2) * k - 2] = NEVER, outcomes[(n + 2) * k - 1] = 0;
     for (int j = 0; j < n; ++j) pack.x[j] = search.start[j];
     for (int k = 0; k < Pack::COUNT; ++k) start(k);
-    while (running) {
+    auto is_over = [&] { return (brief && best.score <= 1) || (freedom && freedom->is_blocked); };
+    while (running && !is_over()) {
       const auto errors = pack.advance(check, goal, pack_here.data());
       for (int k = 0; k < Pack::COUNT; ++k) {
-        if (lanes[k].seed < 0) continue;
+        if (lanes[k].seed < 0 || is_over()) continue;
         best.steps += check;
         const double score = errors.score.v[k];
         if (!ends(k, lanes[k], score, errors.cost.v[k])) continue;
-        if (!lanes[k].is_last && (is_near || is_every)) {
+        if (!lanes[k].is_last && !brief) {
           lanes[k] = {lanes[k].seed, 0, true, NEVER};
           pack.pull.v[k] = 0, pack.enough.v[k] = is_every ? 0 : search.enough;
           continue;
@@ -147,22 +163,23 @@ class ChainFinder {
   // A pull towards the start can keep a search from any solution. So what the plain call finds is a candidate too, as it
   // is and moved towards the start.
   void compare_with_plain(In goal, int most, Best& best) {
-    const Best plain = found(goal, most);
-    best.steps += plain.steps;
-    if (!(plain.score <= 1)) return;
-    here = plain.x, keep(goal, plain.seed, std::min(plain.score, settled), best, nullptr);
+    const Best other = plain(goal, most);
+    best.steps += other.steps;
+    if (!(other.score <= 1)) return;
+    here = other.x, keep(goal, other.seed, std::min(other.score, settled), best, nullptr);
     unwind(search.x);
     search.near = true, search.pull = 1;
     search.advance(longest, goal, here.data());
     search.near = false, search.pull = 0;
-    keep(goal, plain.seed, search.advance(last, goal, here.data()).score, best, nullptr);
+    keep(goal, other.seed, search.advance(last, goal, here.data()).score, best, nullptr);
     best.steps += longest + last;
   }
   // Keep the end `here` of a search among the outcomes, and as the best if it is.
   void keep(In goal, int seed, double score, Best& best, double* outcomes) {
     List x(n);
+    for (int k = 0; k < POLISH && freedom; ++k) polish(goal);  // what is judged is the answer
     unwind(x.data());
-    score = score == score ? score : NEVER;
+    score = score == score && (score > 1 || is_free(goal, x, seed)) ? score : NEVER;
     double distance = is_near ? 0 : seed;
     for (int j = 0; j < n && is_near; ++j) distance += (x[j] - search.start[j]) * (x[j] - search.start[j]);
     if (outcomes) {
@@ -170,6 +187,13 @@ class ChainFinder {
       to[0] = score, to[1] = score <= 1 && is_isolated(goal, x.data());
     }
     if (is_better(score, distance, best)) best.x = x, best.score = score, best.distance = distance, best.seed = seed;
+  }
+  // Whether a solution touches nothing.
+  bool is_free(In goal, const List& x, int seed) {
+    if (!freedom) return true;
+    std::copy(x.begin(), x.end(), search.x);
+    const double score = compare(goal).score, tolerances[2] = {search.numbers[1], search.numbers[2]};
+    return freedom->accepts(x, entry, home, nq, seed, search.tips, score, tolerances);
   }
   // By class first: settled, found, or neither; within the first two by distance.
   bool is_better(double score, double distance, const Best& best) const {
@@ -221,8 +245,8 @@ class ChainFinder {
   // The configuration q, its errors, residuals, and the limits that stop joints.
   void answer(In goal, const Best& best, double* q, double* sizes, int* labels) {
     std::copy(best.x.begin(), best.x.end(), here.begin());
-    polish(goal), unwind(search.x);
-    std::copy(home, home + nq, q);
+    if (!freedom) polish(goal);
+    unwind(search.x);
     for (int j = 0; j < n; ++j) q[entry[j]] = search.x[j] = is_single ? double(float(search.x[j])) : search.x[j];
     const Errors errors = compare(goal);
     search.differentiate();
@@ -244,5 +268,28 @@ class ChainFinder {
 inline void find_chain(const xla::Call& call) {
   ChainFinder finder(call);
   for (int target = 0; target < call.size(0, 0); ++target) finder.solve(call, target);
+}
+
+// The same in scenes, by all processor cores where there are many targets.
+inline void find_free(const xla::Call& call) {
+  constexpr int LEAST = 8;  // targets of a thread
+  const int targets = call.size(0, 0), most = std::max(1, int(std::thread::hardware_concurrency()));
+  const ShapedRobot<double> robot(call.in<int>(5), call.in<double>(6));
+  std::atomic<int> next{0};
+  std::atomic<bool> has_failed{false};
+  auto work = [&] {
+    try {
+      Freedom freedom(robot);
+      ChainFinder finder(call, &freedom);
+      for (int target = next++; target < targets; target = next++) finder.solve(call, target);
+    } catch (const std::exception&) {  // no memory
+      has_failed = true;
+    }
+  };
+  std::vector<std::thread> others;
+  for (int k = 1; k < std::min(most, targets / LEAST); ++k) others.emplace_back(work);
+  work();
+  for (auto& other : others) other.join();
+  xla::Call::require(!has_failed, "the core has no memory for a search in a scene");
 }
 }  // namespace osik

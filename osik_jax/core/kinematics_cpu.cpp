@@ -27,6 +27,10 @@ template <void (*method)(const Robots&)> void of_lanes(const xla::Call& call) { 
 }  // namespace
 
 extern "C" {
+void* osik_free_find(xla::CallFrame* frame) { return xla::handle<find_free>(frame); }
+void* osik_are_free(xla::CallFrame* frame) { return xla::handle<find_free_ones>(frame); }
+void* osik_clearances(xla::CallFrame* frame) { return xla::handle<find_clearances>(frame); }
+void* osik_shape_gaps(xla::CallFrame* frame) { return xla::handle<find_gaps>(frame); }
 void* osik_chain_find(xla::CallFrame* frame) { return xla::handle<find_chain>(frame); }
 void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Robots>>>(frame); }
 void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Robots>>>(frame); }

@@ -107,6 +107,7 @@ class ChainRoute(NamedTuple):
 
     def answer(self, robot: Robot, search: ChainSearch, goal: Goal, x: Array, seed: Array, steps: Array) -> Any:
         """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
+        x = search.unwound(jax.lax.stop_gradient(search).polished(x, jax.lax.stop_gradient(goal)))
         return answer(robot, self, search, goal, x, seed, steps)
 
 
@@ -232,7 +233,6 @@ def answer(
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
     """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
-    x = search.unwound(jax.lax.stop_gradient(search).polished(x, jax.lax.stop_gradient(goal)))
     x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
     fixed_search, fixed_goal = jax.lax.stop_gradient((search, goal))
     residual, active, errors = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))

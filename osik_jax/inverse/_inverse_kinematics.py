@@ -15,7 +15,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ..collision import Scene
+from ..collision._robot_shapes import Given
 from ..control._checks import check_setting, checked_limits, checked_start
+from ..kinematics._pose_forms import PoseLike
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
 from ..numerics._host import is_traced
@@ -25,11 +28,12 @@ from ..robot._configuration import check_configuration
 from ..robot._plausible import warn_of_far_joints
 from ..schemes import Scheme
 from ..tasks import Task
-from ..tasks._targets import PoseLike
 from ._advice import advice
 from ._branches import Coordinates, all_solutions
 from ._chain_problem import ChainRoute, Settings
 from ._fixed import Explored, Searches
+from ._free import SEEDS as FREE_SEEDS
+from ._free import find_free, read_obstacles
 from ._host import in_chunks
 from ._problem import read_problem
 from ._run import explored, explored_by_core, found_at_once, isolated_at_answers, searched, searched_on
@@ -61,6 +65,9 @@ def inverse_kinematics(
     steps: int = _STEPS,
     restarts: int = _RESTARTS,
     closest: bool = True,
+    scene: Scene | None = None,
+    clearance: Float[Array, ""] | float = 0.0,
+    srdf: Given = None,
 ) -> InverseKinematicsSolution:
     """Return configurations that bring frames to poses, or meet tasks; else the best ones, with the reason.
 
@@ -115,6 +122,13 @@ def inverse_kinematics(
         restarts: how often as many searches again are started for targets that are not found.
         closest: whether targets that are not found get the configuration with the least error (static). False is
             quicker where many targets are out of reach and only ``converged`` is wanted.
+        scene: obstacles. Only a configuration in which nothing touches is a solution then: no shape of the robot
+            comes nearer than ``clearance`` to the scene or to another shape of the robot. A scene with a leading axis
+            has one for each target. For poses of frames that hinges and slides carry, on a CPU, with the compiled core.
+            Default: none, and shapes of the robot may touch.
+        clearance: smallest distance of all pairs of shapes [m].
+        srdf: pairs that may touch, besides those of neighbouring bodies: path or text of an SRDF; ``True``: the file
+            beside the robot's URDF.
 
     Returns:
         One answer, or with a leading axis as many as there are targets. ``converged`` is true only where the errors,
@@ -141,7 +155,7 @@ def inverse_kinematics(
         [checked_tolerance(position_tolerance, dtype), checked_tolerance(orientation_tolerance, dtype)]
     )
     route = problem.route
-    once = _SEEDS if seeds is None else seeds
+    once = (_SEEDS if scene is None else FREE_SEEDS) if seeds is None else seeds
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
     settings = Settings(home, lower, upper, key, tolerance, seeds, problem.parts)
@@ -151,6 +165,14 @@ def inverse_kinematics(
     if all and traced:
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
     how, given = Searches(seeds, warm=q0 is not None, near=nearest, every=all), (robot, problem.goals, settings)
+    if scene is not None:
+        obstacles = read_obstacles(robot, route, scene, clearance, srdf)
+        many = problem.many or obstacles.many
+        results = find_free(*given, once * (1 + restarts), steps, how, obstacles, single=not (many or all))
+        found = results.found
+        if all:
+            found = dataclasses.replace(found, **_as_arrays(_all_of(*given, results, route)))
+        return found if many or not (all or is_traced(found)) else jax.tree.map(lambda a: a[0], found)
     most, by_core = once * (1 + restarts), not traced and whole_is_possible(route)
     # inside jit, operations on numbers would be traced too
     with nullcontext() if traced else jax.ensure_compile_time_eval():

@@ -14,11 +14,11 @@ from jaxtyping import Array
 
 from .._errors import OsikValueError
 from ..execution._platform import on_host
+from ..kinematics._pose_forms import as_pose, pose_array, pose_parts
 from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import concrete
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
-from ..tasks._targets import as_pose, pose_array, pose_parts
 from ._chain_search import Goal
 
 _POSITION = (True,) * 3 + (False,) * 3

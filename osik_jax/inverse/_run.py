@@ -88,10 +88,10 @@ def found_at_once(
 
     The answer has no axis of targets; the ends of the searches have.
     """
-    found, score, ends = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
+    found, score, ends, *_ = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
     if not found.converged or ((how.near or how.every) and not score <= ENOUGH):
         return None
-    return Explored(found, *_split(None if ends is None else np.asarray(ends)[None]))
+    return Explored(found, *split(None if ends is None else np.asarray(ends)[None]))
 
 
 def explored_by_core(
@@ -108,17 +108,17 @@ def explored_by_core(
     """Return what ``explored`` does. Only targets that go on to the least error are computed by it."""
     count = np.full(len(goals.position), most)
     results = whole(robot, route, goals, settings, count, most, steps, how, single=False)
-    found, score, ends = jax.tree.map(np.asarray, results)
+    found, score, ends, *_ = jax.tree.map(np.asarray, results)
     further = ~(score <= ENOUGH)
     if go_on and further.any():
         run = partial(explored, robot, settings=settings, how=how._replace(every=False), steps=steps, route=route)
         by_jax = only(further, lambda goals: run(goals, go_on=True, fall_back=False).found, goals)
         kept = found.converged & how.near & (_distances(found, settings) < _distances(by_jax, settings))
         found = _with(found, further & ~kept, by_jax)
-    return Explored(found, *_split(ends))
+    return Explored(found, *split(ends))
 
 
-def _split(ends: Any) -> tuple[Outcomes | None, Any]:
+def split(ends: Any) -> tuple[Outcomes | None, Any]:
     """Return the ends of all searches by ``whole``, and whether they are isolated solutions."""
     if ends is None:
         return None, None

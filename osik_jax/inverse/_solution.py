@@ -40,9 +40,12 @@ class InverseKinematicsSolution(eqx.Module):
             off the targets. The others are samples of a continuum; False from ``branches`` on. (..., seeds)
         base_moved: with tasks, or poses of frames that a free base carries: how far the base is from where it is in
             ``q0``, its origin [m] and its axes [rad], the largest of several. None for a robot without one. (..., 2)
-        clearance: with a ``CollisionAvoidanceLimit``, the distance of the nearest pair less ``minimum_distance`` [m].
-            (...)
+        clearance: with a scene, the signed distance of the nearest pair [m]; with a ``CollisionAvoidanceLimit``, that
+            less ``minimum_distance``. (...)
         nearest_pair: number of that pair in ``pairs``. (...)
+        obstruction: with a scene, why no free configuration is found: 0 if one is, or no solution at all; 1 if shapes
+            touch that no joint of the frames moves; 2 if an obstacle stands where the target puts the frame's body, so
+            that there is none; 3 if something touches in all solutions found. (...)
         joints: names of the joints, for each entry of v (static).
         pairs: names of the shapes that are kept apart (static).
         advice: what to ask for instead, where frames have more rows than joints carry them (static).
@@ -64,6 +67,7 @@ class InverseKinematicsSolution(eqx.Module):
     base_moved: Float[Array, "*n 2"] | None = None
     clearance: Float[Array, "*n"] | None = None
     nearest_pair: Int[Array, "*n"] | None = None
+    obstruction: Int[Array, "*n"] | None = None
     joints: tuple[str, ...] = eqx.field(default=(), static=True)
     pairs: tuple[tuple[str, str], ...] = eqx.field(default=(), static=True)
     advice: tuple[str, ...] = eqx.field(default=(), static=True)
@@ -101,12 +105,32 @@ class InverseKinematicsSolution(eqx.Module):
         reasons = [f"{self.joints[i]} is at its {sides[int(at_limit[i])]} limit" for i in np.flatnonzero(at_limit)]
         if beyond > 0.0:
             return [f"out of reach: at least {beyond:.3g} m too far away, even with all links in one line", *reasons]
-        if self.clearance is not None and self.nearest_pair is not None and pick(self.clearance) < _NEAR:
-            one, other = self.pairs[int(pick(self.nearest_pair))]
-            gap = round(float(pick(self.clearance)), 6) + 0.0
-            reasons.append(f"{one} and {other} are {gap:+.3g} m from as near as they may be")
+        if self.clearance is not None and self.nearest_pair is not None:
+            pair, gap = self.pairs[int(pick(self.nearest_pair))], round(float(pick(self.clearance)), 6) + 0.0
+            if self.obstruction is not None and pick(self.obstruction) > 0:
+                return [_obstruction(int(pick(self.obstruction)), *pair, gap)]
+            if gap < _NEAR:
+                reasons.append(f"{pair[0]} and {pair[1]} are {gap:+.3g} m from as near as they may be")
         reasons += self.advice
         return reasons or ["no limit stops a joint: the links are stretched, folded or turned as far as they go"]
+
+
+def _obstruction(reason: int, one: str, other: str, gap: float) -> str:
+    """Return why no configuration is free; ``reason``: of ``InverseKinematicsSolution.obstruction``."""
+    how = f"{one} and {other} overlap by {-gap:.3g} m" if gap < 0.0 else f"{one} and {other} are {gap:.3g} m apart"
+    return {
+        1: f"{how} where q0 puts them, and no joint of these frames moves them apart: change q0 or the scene",
+        2: f"{how} wherever the target is met: an obstacle stands around the target, so no configuration is free",
+        3: f"something is in the way in every solution found; in the best one {how}",
+    }[reason]
+
+
+def with_fields(solution: InverseKinematicsSolution, **fields: Any) -> InverseKinematicsSolution:
+    """Return a copy with other fields; ``dataclasses.replace`` takes as long as a search."""
+    new = object.__new__(type(solution))
+    for name, value in {**vars(solution), **fields}.items():
+        object.__setattr__(new, name, value)
+    return new
 
 
 def _miss(residual: np.ndarray) -> str:

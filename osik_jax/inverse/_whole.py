@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..collision._core import CoreRobot, CoreScene
 from ..core import _library
 from ..execution._platform import cpu_is_default
 from ..numerics._remembered import remembered
@@ -39,11 +40,29 @@ class Whole(NamedTuple):
         answer: the answers, as of ``ChainRoute.answer``.
         score: of the answers. (targets,)
         ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
+        pair: with a scene, numbers of the nearest pair's shapes. (targets, 2)
+        reason: with a scene, why there is no free solution, as in ``core/freedom.hpp``. (targets,)
     """
 
     answer: InverseKinematicsSolution
     score: Float[Array, "*targets"]
     ends: Float[Array, "*targets seeds n_and_2"] | None
+    pair: Int[Array, "*targets 2"] | None = None
+    reason: Int[Array, "*targets"] | None = None
+
+
+class Around(NamedTuple):
+    """What a robot may not touch.
+
+    Attributes:
+        robot: its shapes.
+        scene: the obstacles.
+        clearance: distance that all pairs keep [m]. (1,)
+    """
+
+    robot: CoreRobot
+    scene: CoreScene
+    clearance: Float[Array, "1"] | np.ndarray
 
 
 class _Known(NamedTuple):
@@ -70,6 +89,7 @@ def whole(
     how: Searches,
     *,
     single: bool,
+    around: Around | None = None,
 ) -> Whole:
     """Return the results of whole searches.
 
@@ -83,6 +103,7 @@ def whole(
         steps: of one search at most.
         how: static settings. All searches run where ``near`` or ``every`` is set.
         single: whether there is one target, and results have no axis of targets (static).
+        around: what the robot may not touch.
     """
     known = _known(robot, settings.lower, settings.upper, frames=route.frames)
     program = known.programs.get((route, how, single))
@@ -92,7 +113,7 @@ def whole(
         known.programs[route, how, single] = program
     shift = _shift(settings.key, len(route.entries(robot)))
     counts = np.append(most, (hopeless, steps)).astype(np.int32)
-    return program(known.leaves, *goals, settings.home, shift, settings.tolerance, counts)
+    return program(known.leaves, *goals, settings.home, shift, settings.tolerance, counts, around)
 
 
 @remembered
@@ -126,21 +147,22 @@ def _program(
         shift: Array,
         tolerance: Array,
         counts: Array,
+        around: Around | None,
     ) -> Whole:
         own, (goals, valid) = jax.tree.unflatten(structure, leaves), with_placeholders(Goal(position, rotation))
         search = search_of(own, route, home, shift, tolerance, how.seeds, warm=how.warm, near=how.near)
         beyond = route.beyond(search, goals)
         most, (hopeless, steps) = counts[:-2], counts[-2:]
         most = jnp.where(beyond > 0.0, jnp.minimum(most, hopeless), most)
-        results = _by_core(search, goals, most, steps, how, dofs, joints)
-        whole = _named(route.frames, joints, beyond, *results)
+        results = by_core(search, goals, most, steps, how, dofs, joints, around)
+        whole = named(route.frames, joints, beyond, how.every, *results)
         whole = whole._replace(answer=or_far(whole.answer, valid))
         return jax.tree.map(lambda a: a[0], whole) if single else whole
 
     return jax.jit(program)
 
 
-def _by_core(
+def by_core(
     search: ChainSearch,
     goal: Goal,
     most: Int[Array, " targets"],
@@ -148,12 +170,14 @@ def _by_core(
     how: Searches,
     dofs: tuple[int, ...],
     joints: tuple[str, ...],
+    around: Around | None,
 ) -> list[Array]:
     """Return the results of ``core/chain_find.hpp``.
 
     These are configurations (targets, nq). Then position and orientation error, score, and
     residuals (targets, 3 + 6 frames). Then whether it has converged, the number of the search, steps, and at_limit
-    (targets, 3 + nv). With ``every``, also end points, score and whether isolated (targets, seeds, n + 2).
+    (targets, 3 + nv). With ``every``, also end points, score and whether isolated (targets, seeds, n + 2). With
+    ``around``, also clearance (targets, 1), and the nearest pair and the reason (targets, 3).
     """
     kind, nv = search.first.dtype, len(joints)
     targets, frames, n, nq = len(most), len(search.rows), len(search.first), len(search.home)
@@ -166,22 +190,31 @@ def _by_core(
     options += [search.chain.layout.dofs, dofs]
     shapes: list[Any] = [((targets, nq), float), ((targets, 3 + 6 * frames), float), ((targets, 3 + nv), int)]
     shapes += [((targets, how.seeds, n + 2), float)] * how.every
+    method, more = "chain_find", ()
+    if around is not None:
+        shapes += [((targets, 1), float), ((targets, 3), int)]
+        method, more = "free_find", (*around.robot, *around.scene, around.clearance)
     return _library.call(
-        *("chain_find", shapes, goals, most, jnp.concatenate([jnp.ravel(a) for a in numbers])),
+        *(method, shapes, goals, most, jnp.concatenate([jnp.ravel(a) for a in numbers])),
         *(integers_of(search, 0), jnp.concatenate([jnp.array(a, jnp.int32) for a in options])),
+        *more,
+        vmap="sequential",
     )
 
 
-def _named(
+def named(
     frames: tuple[str, ...],
     joints: tuple[str, ...],
     beyond: Array,
+    every: bool,
     q: Array,
     sizes: Array,
     labels: Array,
-    *every: Array,
+    *more: Array,
 ) -> Whole:
-    """Return the results of ``_by_core`` by their names."""
+    """Return the results of ``by_core`` by their names."""
+    ends, around = (more[0] if every else None), more[every:]
+    clearance, pair, reason = (around[0][:, 0], around[1][:, :2], around[1][:, 2]) if around else (None, None, None)
     residual = sizes[:, 3:].reshape(-1, len(frames), 6)
     answer = InverseKinematicsSolution(
         q=q,
@@ -193,6 +226,7 @@ def _named(
         residual={name: residual[:, at] for at, name in enumerate(frames)},
         at_limit=labels[:, 3:],
         beyond_reach=beyond,
+        clearance=clearance,
         joints=joints,
     )
-    return Whole(answer, sizes[:, 2], every[0] if every else None)
+    return Whole(answer, sizes[:, 2], ends, pair, reason)

@@ -16,8 +16,8 @@ from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, padded
 from ..collision._hulls import Hulls, read_hulls
+from ..collision._pair_layout import PairLayout, Placed, grouped, nearest, place, separation_jacobian
 from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
-from ..collision._scene import Placed, Scene, grouped, nearest, place, separation_jacobian
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
 from ..kinematics._home import home_kinematics
@@ -86,7 +86,7 @@ class CollisionAvoidanceLimit(Limit):
     recovery_speed: Float[Array, ""]
     shapes: Placed
     hulls: UnitCore | None
-    scene: Scene = eqx.field(static=True, repr=False)
+    scene: PairLayout = eqx.field(static=True, repr=False)
     max_pairs: int = eqx.field(static=True)
     left_out: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
@@ -272,7 +272,7 @@ def _shown(found: Sequence[Member], near: Mapping[tuple[int, int], float]) -> st
     return ", ".join(f"{found[i].label}-{found[j].label} ({d:.3g} m)" for (i, j), d in near.items())
 
 
-def _home_distances(robot: Robot, scene: Scene, added: Placed, hulls: UnitCore | None) -> Float[Array, " pairs"]:
+def _home_distances(robot: Robot, scene: PairLayout, added: Placed, hulls: UnitCore | None) -> Float[Array, " pairs"]:
     @jax.jit
     def distances(robot: Robot, kinematics: Kinematics, added: Placed, hulls: UnitCore | None) -> Array:
         return nearest(scene, place(scene, robot, kinematics, added), hulls).distance
@@ -286,7 +286,7 @@ def _assembled(
     shapes: Mapping[str, CollisionShape],
     hulls: Hulls,
     pairs: Sequence[tuple[int, int]],
-) -> tuple[Scene, Placed, UnitCore | None]:
+) -> tuple[PairLayout, Placed, UnitCore | None]:
     """Return the scene of some pairs of members, its added shapes and its hulls."""
     taking_part = _taking_part(pairs)
     number = {k: n for n, k in enumerate(taking_part)}
@@ -294,7 +294,7 @@ def _assembled(
     added = [found[k].name for k in taking_part[len(geoms) :]]
     kinds = [Kind(found[k].kind) for k in taking_part]
     hulled = [k for k, kind in zip(taking_part, kinds, strict=True) if kind is Kind.HULL]
-    scene = Scene(
+    scene = PairLayout(
         names=tuple(found[k].name for k in taking_part),
         kinds=tuple(kinds),
         bodies=tuple(found[k].body for k in taking_part),

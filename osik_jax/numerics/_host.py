@@ -59,6 +59,15 @@ def to_jax(value: Any, dtype: Any = None) -> Array:
         return jnp.asarray(value, dtype)
 
 
+def tree_to_jax(tree: Any) -> Any:
+    """Return a pytree of arrays as arrays of JAX, floats in its present precision; one transfer if none is traced."""
+    now = float_now()
+    types = jax.tree.map(lambda leaf: now if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.dtype, tree)
+    if is_traced(tree):
+        return jax.tree.map(jnp.asarray, tree, types)
+    return jax.device_put(jax.tree.map(to_host, tree, types))
+
+
 def repeated(array: Array, shape: tuple[int, ...]) -> Array:
     """Return ``jnp.broadcast_to(array, shape)`` without compiling."""
     if array.shape == shape:

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
 
 import jax
@@ -65,12 +66,14 @@ class ModelHolder:
         report: what the file asks for and the robot does not keep.
         meshes: collision meshes whose files are not read; they are the last of the tree's geoms.
         look: visual shapes of a URDF, read when they are drawn; None: those of the model.
+        path: URDF file, whose SRDF is looked for beside it; None: the robot was made from a text or an MJCF.
     """
 
     model: mujoco.MjModel | None
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
     meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
     look: UnreadLook | None = dataclasses.field(default=None, repr=False)
+    path: Path | None = dataclasses.field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:
         if self is other:

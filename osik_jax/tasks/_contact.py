@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikTypeError
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
+from ..kinematics._pose_forms import Pose, PoseLike, as_pose
 from ..kinematics._rigid import cross
 from ..numerics._host import on_host
 from ..robot import Robot
@@ -23,7 +24,6 @@ from ._plane import PlaneTask, as_normal, as_offset, plane_axes
 from ._pointing import across, unit
 from ._pose import option
 from ._rotation import dot
-from ._targets import Pose, PoseLike, as_pose
 from ._task import DEFAULT_GAIN, TaskRows, check_priority
 
 

@@ -16,12 +16,12 @@ from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics
 from ..kinematics._forward import moving_frames
 from ..kinematics._kernels import Call, dof_columns
+from ..kinematics._pose_forms import PoseLike
 from ..robot import Robot
 from ._core_rows import Fields, equality_rows, fields_by_core
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
 from ._pose import RADIAN, PoseTask, goal_arguments, pose_fields
-from ._targets import PoseLike
 from ._task import DEFAULT_GAIN, CoreCard, TaskRows
 
 

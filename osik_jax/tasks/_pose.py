@@ -16,6 +16,7 @@ from .._errors import OsikValueError, unknown_name
 from ..execution._backends import Backend
 from ..execution._computed import by_kernel, side_by_side
 from ..kinematics._kernels import Call
+from ..kinematics._pose_forms import Pose, PoseLike, as_pose
 from ..robot import Robot
 from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import pose_curvature
@@ -23,7 +24,6 @@ from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
-from ._targets import Pose, PoseLike, as_pose
 from ._task import POSE, CoreCard, TaskRows, check_priority
 from ._twist import pose_log, seen_from
 

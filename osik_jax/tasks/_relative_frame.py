@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
+from ..kinematics._pose_forms import Pose, PoseLike
 from ..robot import Robot
 from ._gain import AdaptiveGain
 from ._leaves import home_kinematics
 from ._pose import RADIAN, PoseTask
 from ._rotation import cross_matrix, dot
-from ._targets import Pose, PoseLike
 from ._task import DEFAULT_GAIN, CoreCard, TaskRows
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array
 from ..._errors import OsikValueError, unknown_name
 from ...control import solve
 from ...kinematics import Kinematics, forward_kinematics, integrate
+from ...kinematics._pose_forms import Pose
 from ...limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit, limit_box, with_own_limits
 from ...limits._own import keeps_own
 from ...numerics._guarded import clipped
@@ -25,7 +26,6 @@ from ...saving import load_controller
 from ...schemes import Scheme, WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, Task
 from ...tasks._background import background_weight
-from ...tasks._targets import Pose
 from ._settings import Settings
 
 _GAIN = 5.0

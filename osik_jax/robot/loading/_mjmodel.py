@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import mujoco
@@ -81,6 +82,7 @@ def from_mjmodel(
     notes: Iterable[LoadNote] = (),
     meshes: Sequence[NamedMesh] = (),
     look: UnreadLook | None = None,
+    path: Path | None = None,
 ) -> RobotModel:
     """Return names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
@@ -91,6 +93,7 @@ def from_mjmodel(
         notes: what the file that the model was made from asks for and the model does not have.
         meshes: collision meshes that the model does not hold; they become the last of the robot's geoms.
         look: visual shapes of a URDF.
+        path: of a URDF file.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
@@ -150,7 +153,7 @@ def from_mjmodel(
         acceleration_limit=_rate_limits(tree, followers, accelerations),
         q0=q0,
     )
-    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look)
+    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look, path)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
 
 
@@ -284,12 +287,15 @@ def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
 def _geom_names(model: mujoco.MjModel, body_names: Sequence[str], meshes: Sequence[NamedMesh]) -> tuple[str, ...]:
     """Return the names of the geoms, then of the collision meshes that the model does not hold.
 
-    One without a name is called by its link and its number among the link's shapes: ``forearm_link:0``.
+    One without a name is called by its link and its number among the link's shapes, of which those that collide come
+    first: ``forearm_link:0``.
     """
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) for g in range(model.ngeom)]
     given += [placed.name for placed in meshes]
     links = [*(body_names[b] for b in model.geom_bodyid), *(placed.mesh.link for placed in meshes)]
-    numbers = [links[:k].count(link) for k, link in enumerate(links)]
+    collides = [*((model.geom_contype | model.geom_conaffinity) != 0), *[True] * len(meshes)]
+    order = sorted(range(len(links)), key=lambda k: not collides[k])
+    numbers = [[links[m] for m in order[: order.index(k)]].count(link) for k, link in enumerate(links)]
     out: list[str] = []
     for name, link, index in zip(given, links, numbers, strict=True):
         taken = out if name else [*given, *out]

@@ -57,7 +57,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
         read = read_urdf(root)
         description, unread = _with_base(read, options.floating_base, source.label), ()
         if options.collision_meshes:
-            model, notes = _compiled_with_meshes(description, packages, source.path)
+            model, notes = compiled_with_meshes(description, packages, source.path)
         else:
             model, notes = urdf_spec(description).compile(), []
             unread = tuple(_unread_meshes(description, packages, source.path))
@@ -74,7 +74,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
     look = UnreadLook(partial(read_look, description, packages, source.path))
-    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look)
+    return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look, path=source.path)
 
 
 def _inertia_notes(urdf: Urdf, model: mujoco.MjModel) -> Iterator[LoadNote]:
@@ -235,7 +235,7 @@ def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: b
     return spec.compile(), notes
 
 
-def _compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
+def compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
     """Compile the model with its meshes as they are; if one of them cannot be taken, try each mesh alone."""
     try:
         return _compiled(urdf, packages, beside, checked=False)

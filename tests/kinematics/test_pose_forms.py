@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from task_checks import anywhere, kinematics_at, rows_of_each
 
 import osik_jax as osik
-from osik_jax.tasks._targets import as_pose
+from osik_jax.kinematics._pose_forms import as_pose
 
 POSITION = np.array([0.3, -0.1, 0.5])
 TURN = Rotation.from_rotvec([0.4, -0.8, 0.3])

@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics._rigid import rotation_matrix
+from ..numerics._arguments import check_finite, concrete
 from ..numerics._host import Numbers, is_traced, to_host, to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
-from ._leaves import check_finite, concrete
+from ._rigid import rotation_matrix
 
 Pose = tuple[Float[Numbers, "3"], Float[Numbers, "3 3"]]
 """Position [m] and rotation matrix (frame axes to world axes)."""
@@ -25,14 +25,20 @@ if the other is not used.
 """
 
 _LAST_ROW = 1e-4
-_POSITION = "the target's position"
 _ACCEPTED = (
     "a pose is (position (3,), rotation matrix (3, 3)), (position (3,), quaternion w x y z (4,)), a (4, 4) matrix or a "
     "jaxlie.SE3"
 )
 
 
-def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = jnp) -> Pose:
+def as_pose(
+    value: Any,
+    dtype: Any,
+    *,
+    rest: tuple[Any, Any] = (None, None),
+    numbers: Any = jnp,
+    what: str = "the target",
+) -> Pose:
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
@@ -43,6 +49,7 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
         dtype: of the result.
         rest: position and rotation where the value has only the other part; None: the value has to have that part.
         numbers: module of the result's arrays, ``jax.numpy`` or ``numpy``; of traced values always ``jax.numpy``.
+        what: name of the owner of the pose, for messages.
 
     Raises:
         TypeError: no numbers.
@@ -56,17 +63,17 @@ def as_pose(value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), num
             parts = array[:3, 3], array[:3, :3]
             _check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
-            check_finite(array, _POSITION)
+            check_finite(array, f"{what}'s position")
             return _made(numbers, array, rest[1])
         elif array.shape in ((3, 3), (4,)) and rest[0] is not None:
-            return _made(numbers, rest[0], _rotation(array))
+            return _made(numbers, rest[0], _rotation(array, what))
         else:
             raise _unfit(f"an array of shape {array.shape}", rest)
     position, rotation = parts
     if position.shape != (3,) or rotation.shape not in ((3, 3), (4,)):
         raise _unfit(f"a pair of shapes {position.shape} and {rotation.shape}", rest)
-    check_finite(position, _POSITION)
-    return _made(numbers, position, _rotation(rotation))
+    check_finite(position, f"{what}'s position")
+    return _made(numbers, position, _rotation(rotation, what))
 
 
 def _made(numbers: Any, position: Any, rotation: Any) -> Pose:
@@ -109,11 +116,11 @@ def _unfit(what: str, rest: tuple[Any, Any]) -> ValueError:
     return OsikValueError(f"got {what}; {_ACCEPTED}{alone}. Batch with jax.vmap.")
 
 
-def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"]) -> Float[Numbers, "3 3"]:
+def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"], what: str) -> Float[Numbers, "3 3"]:
     """Return the normalised rotation matrix of a matrix or quaternion rounded to a few digits."""
     if given.shape == (4,):
-        return rotation_matrix(exact_quaternion(given, "the target's quaternion"))
-    return exact_rotation(given, "the target's rotation")
+        return rotation_matrix(exact_quaternion(given, f"{what}'s quaternion"))
+    return exact_rotation(given, f"{what}'s rotation")
 
 
 def _check_last_row(matrix: Float[Array, "4 4"]) -> None:

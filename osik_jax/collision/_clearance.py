@@ -1,0 +1,196 @@
+"""Whether configurations are free, and the distances of their nearest pairs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._errors import OsikTypeError, OsikValueError
+from ..execution._computed import in_shared_lanes
+from ..kinematics import forward_kinematics
+from ..numerics._host import is_traced
+from ..robot import Robot
+from ._core import (
+    CoreRobot,
+    CoreScene,
+    are_free,
+    check_length,
+    check_scene,
+    core_robot,
+    core_scene,
+    gaps_at,
+    require_core,
+)
+from ._robot_shapes import Given, robot_shapes
+from ._scene import Scene
+from ._table import RobotShapes
+
+
+class Clearance(eqx.Module):
+    """The nearest pairs of shapes at many configurations.
+
+    Attributes:
+        distance: signed distance of the nearest pair [m]; infinite if there is no pair. (...)
+        pair: numbers of its two shapes: those of the robot come first, then the rows of the scene. (..., 2)
+        names: of the robot's shapes, and of the scene's (in a stack, of each scene's); empty inside ``jit`` (static).
+    """
+
+    distance: Float[Array, "*n"]
+    pair: Int[Array, "*n 2"]
+    names: tuple[Any, ...] = eqx.field(default=(), static=True)
+
+    def pair_names(self, index: int = 0) -> tuple[str, str]:
+        """Return the names of the nearest pair; ``index``: of the configuration, where there are many.
+
+        Raises:
+            TypeError: this was made inside ``jit``, where names are unknown.
+        """
+        if not self.names:
+            raise OsikTypeError("names are unknown inside jit: call osik_jax.clearance outside")
+        own, rows = self.names
+        return shape_names(own, rows, np.asarray(self.pair).reshape(-1, 2)[index], index)
+
+
+def clearance(robot: Robot, q: Float[Array, "*n nq"], scene: Scene, *, srdf: Given = None) -> Clearance:
+    """Return the signed distance of the nearest pair of shapes, of the robot with itself and with a scene.
+
+    The derivative of ``distance`` is that of the nearest points, with respect to q and to the scene's poses. A depth of
+    shapes that overlap is the length of a translation that separates them. Distances are exact for the convex shapes;
+    a mesh counts as its convex hull.
+
+    Args:
+        robot: the robot; its numbers are known, not traced.
+        q: configurations. (..., nq)
+        scene: a ``Scene``, or as many as there are configurations.
+        srdf: pairs that may touch, as for ``inverse_kinematics``.
+
+    Raises:
+        OsikError: no compiled core, or no CPU.
+        ValueError: numbers of scenes and configurations that do not go together; q of another length.
+    """
+    shapes, q, lead = _prepared(robot, q, scene, srdf, "clearance")
+    distance, pair = distances(robot, shapes, q, scene)
+    names = () if is_traced((q, scene)) else (shapes.names, scene.names)
+    return Clearance(distance.reshape(lead), pair.reshape(*lead, 2), names)
+
+
+def is_free(
+    robot: Robot,
+    q: Float[Array, "*n nq"],
+    scene: Scene,
+    clearance: Float[Array, ""] | float = 0.0,
+    *,
+    srdf: Given = None,
+) -> Bool[Array, "*n"]:
+    """Return whether all pairs of shapes keep ``clearance`` [m] at each configuration.
+
+    Arguments and errors as in ``osik_jax.clearance``. The result has the leading axes of q.
+    """
+    shapes, q, lead = _prepared(robot, q, scene, srdf, "is_free")
+    least = jnp.reshape(jnp.asarray(clearance, q.dtype), (1,))
+    own, arrays = core_robot(robot, shapes), core_scene(scene, shapes)
+    return _free(own, jax.lax.stop_gradient((q, arrays, least))).reshape(lead)
+
+
+@jax.jit
+def _free(own: CoreRobot, given: tuple[Array, CoreScene, Array]) -> Bool[Array, " lanes"]:
+    return _in_lanes(are_free, own, *given)
+
+
+def _in_lanes(call: Any, own: CoreRobot, q: Array, scene: CoreScene, *more: Array) -> Any:
+    """Return what a method of the core says of each configuration, with a rule for ``vmap``."""
+    one = in_shared_lanes(call)
+    each, alone = 0 if len(scene.integers) > 1 else None, jax.tree.map(lambda a: a[0], (scene, more))
+    scene = scene if each == 0 else alone[0]
+    return jax.vmap(one, (None, 0, each, *[None] * len(more)))(own, q, scene, *alone[1])
+
+
+def _prepared(robot: Robot, q: Any, scene: Scene, srdf: Given, what: str) -> tuple[RobotShapes, Array, tuple[int, ...]]:
+    """Return the robot's shapes, the configurations as (lanes, nq), and their leading axes."""
+    require_core(what)
+    check_scene(scene)
+    q = jnp.asarray(q, robot.q0.dtype)
+    if q.ndim == 0 or q.shape[-1] != robot.nq:
+        raise OsikValueError(f"q has shape {q.shape}; the last axis has the robot's {robot.nq} entries")
+    shapes, lead, q = robot_shapes(robot, srdf), q.shape[:-1], q.reshape(-1, robot.nq)
+    if scene.is_stack and lead == ():
+        lead = scene.table.kind.shape[:1]
+        q = jnp.broadcast_to(q, (*lead, robot.nq))
+    check_length(core_scene(scene, shapes), len(q), "configurations")
+    return shapes, q, lead
+
+
+def distances(robot: Robot, shapes: RobotShapes, q: Float[Array, "lanes nq"], scene: Scene) -> tuple[Array, Array]:
+    """Return the distance of the nearest pair at each configuration, with its derivative, and the pair's numbers."""
+    return _distances(robot, core_robot(robot, shapes), jnp.asarray(shapes.bodies), q, core_scene(scene, shapes), scene)
+
+
+@jax.jit
+def _distances(
+    robot: Robot, own: CoreRobot, bodies: Int[Array, " k"], q: Float[Array, "lanes nq"], arrays: CoreScene, scene: Scene
+) -> tuple[Array, Array]:
+    gaps = _in_lanes(gaps_at, *jax.lax.stop_gradient((own, q, arrays)))
+    rows: Any = scene.table.position, scene.table.rotation, scene.body
+    if scene.is_stack and len(scene.body) == 1:
+        rows = tuple(a[0] for a in rows)
+    each = 0 if rows[2].ndim == 2 else None
+    lane = partial(_moved, robot, bodies)
+    moved = jax.vmap(lane, (0, 0, 0, 0, each, each, each))(q, gaps.points, gaps.normal, gaps.pair, *rows)
+    known = jnp.isfinite(gaps.distance)
+    slope = jnp.where(known, moved - jax.lax.stop_gradient(moved), 0.0)
+    return gaps.distance + slope, gaps.pair
+
+
+def _moved(
+    robot: Robot,
+    bodies: Int[Array, " shapes"],
+    q: Float[Array, " nq"],
+    points: Float[Array, "2 3"],
+    normal: Float[Array, "3"],
+    pair: Int[Array, "2"],
+    position: Float[Array, "rows 3"],
+    rotation: Float[Array, "rows 3 3"],
+    carrying: Int[Array, " rows"],
+) -> Float[Array, ""]:
+    """Return ``normal' (b - a)`` of the nearest points a and b, which go along with their shapes.
+
+    Its derivative is that of the distance: to first order nearest points slide along the surfaces.
+    """
+    kinematics = forward_kinematics(robot, q)
+    count = len(bodies)
+    row = jnp.clip(pair - count, 0, max(len(position) - 1, 0))
+    is_row = pair >= count
+    carrier = jnp.where(is_row, carrying[row], bodies[jnp.clip(pair, 0, count - 1)]) if len(position) else bodies[pair]
+    turn, at = kinematics.body_rotation[carrier], kinematics.body_position[carrier]
+    if len(position):
+        fixed = carrier < 0
+        turn = jnp.where(fixed[:, None, None], jnp.eye(3, dtype=q.dtype), turn)
+        at = jnp.where(fixed[:, None], 0.0, at)
+        inner = jnp.where(is_row[:, None, None], rotation[row], jnp.eye(3, dtype=q.dtype))
+        turn, at = turn @ inner, at + jnp.einsum("kij,kj->ki", turn, jnp.where(is_row[:, None], position[row], 0.0))
+    stopped = jax.lax.stop_gradient((turn, at))
+    local = jnp.einsum("kji,kj->ki", stopped[0], points - stopped[1])
+    here = at + jnp.einsum("kij,kj->ki", turn, local)
+    return jnp.dot(normal, here[1] - here[0])
+
+
+def shape_names(own: tuple[str, ...], rows: tuple[Any, ...], pair: np.ndarray, index: int) -> tuple[str, str]:
+    """Return the names of a pair of shapes.
+
+    Args:
+        own: names of the robot's shapes.
+        rows: of the scene's shapes; in a stack, of each scene's.
+        pair: numbers of the two shapes. (2,)
+        index: which scene, in a stack.
+    """
+    if pair[0] < 0:
+        return "nothing", "nothing"
+    rows = rows[index] if rows and isinstance(rows[0], tuple) else rows
+    first, second = (own[k] if k < len(own) else rows[k - len(own)] for k in pair)
+    return first, second

@@ -1,0 +1,236 @@
+"""Arrays of a robot's shapes and of a scene in the order in which ``core/collision.hpp`` reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._errors import OsikError, OsikTypeError, OsikValueError
+from ..core import _library
+from ..execution._platform import cpu_is_default
+from ..kinematics._kernels import tree_integers
+from ..numerics._host import is_traced
+from ..numerics._remembered import remembered
+from ..robot import Robot
+from ..robot._tree import KinematicTree
+from ._scene import Scene
+from ._table import RobotShapes, ShapeKind, ShapeTable
+
+_PACK = 4
+"""Hulls have a multiple of so many vertices in the core: the last one is repeated."""
+
+
+class CoreScene(NamedTuple):
+    """A scene for the core, with an axis of scenes in front, of length 1 where all targets share one.
+
+    Attributes:
+        integers: number of rows; kind, first vertex, number of vertices and carrying body of each; whether it may touch
+            each shape of the robot, and each other row. (scenes, 1 + k (4 + shapes + k))
+        numbers: size, position and rotation of each row, then the vertices. (scenes, 15 k + 3 v)
+    """
+
+    integers: Int[Array, "scenes n"] | np.ndarray
+    numbers: Float[Array, "scenes m"] | np.ndarray
+
+
+class CoreRobot(NamedTuple):
+    """A robot and its shapes for the core.
+
+    Attributes:
+        integers: (n,)
+        numbers: (m,)
+    """
+
+    integers: Int[Array, " n"] | np.ndarray
+    numbers: Float[Array, " m"] | np.ndarray
+
+
+def require_core(what: str) -> None:
+    """Raise an error where the compiled core is missing, or JAX's default device is not a CPU."""
+    if not cpu_is_default():
+        raise OsikError(f"{what} runs on a CPU: call it under jax.default_device(jax.devices('cpu')[0])")
+    if not _library.installed():
+        raise OsikError(f"{what} needs the compiled core: {_library.core().reason}")
+
+
+@remembered
+def core_robot(
+    robot: Robot, shapes: RobotShapes, *, entries: tuple[int, ...] | None = None, posed: tuple[str | None, ...] = ()
+) -> CoreRobot:
+    """Return the arrays of a robot whose numbers are known.
+
+    Args:
+        robot: the robot.
+        shapes: its shapes.
+        entries: entries of q that a search moves; default: all.
+        posed: frames of a search; None for one whose pose is free in some rows.
+    """
+    tree, table = robot.tree, shapes.table
+    first, vertices = _packed_vertices(table)
+    count = np.where(first >= 0, -(-np.asarray(table.count) // _PACK) * _PACK, 0)
+    moves = _moves(tree, range(tree.nq) if entries is None else entries, posed)
+    index, factor = tree.qpos_source
+    sizes = [len(tree.body_parents), len(tree.joint_types), len(tree.dof_joint), len(index)]
+    sizes += [len(shapes.names), len(shapes.pairs), len(vertices) // 3]
+    integers = [
+        sizes,
+        tree_integers(tree)[1:],
+        moves,
+        table.kind,
+        shapes.bodies,
+        np.maximum(first, 0),
+        count,
+        shapes.world,
+        shapes.pairs,
+    ]
+    centers, bounds = _bounds(table)
+    numbers = [factor, robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
+    numbers += [
+        robot.joint_position,
+        robot.joint_axis,
+        table.size,
+        table.position,
+        table.rotation,
+        centers,
+        bounds,
+        vertices,
+    ]
+    with jax.ensure_compile_time_eval():  # on the device once, also if a user's program is traced
+        return CoreRobot(jnp.asarray(_flat(integers, np.int32)), jnp.asarray(_flat(numbers, np.float64)))
+
+
+def _flat(parts: Sequence[Any], kind: Any) -> np.ndarray:
+    return np.concatenate([np.asarray(part).ravel() for part in parts]).astype(kind)
+
+
+def _packed_vertices(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first vertex of each hull (-1: no hull), and all vertices: x of a hull, then y, then z."""
+    first, parts, end = np.full(len(table.kind), -1), [np.zeros(0)], 0
+    for k in np.flatnonzero(np.asarray(table.kind) == ShapeKind.HULL):
+        start, count = int(table.first[k]), int(table.count[k])
+        own = np.asarray(table.vertices[start : start + count])
+        own = np.concatenate([own, own[-1:].repeat(-count % _PACK, 0)])
+        first[k], end = end, end + len(own)
+        parts.append(own.T.ravel())
+    return first, np.concatenate(parts)
+
+
+def _bounds(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
+    """Return a ball around each shape in its body: centre (k, 3) and radius (k,)."""
+    centers, radii = np.array(table.position, float), np.linalg.norm(table.size, axis=1)
+    for k, kind in enumerate(table.kind):
+        radius, half = table.size[k, 0], table.size[k, 1]
+        if kind == ShapeKind.HULL:
+            own = np.asarray(table.vertices[table.first[k] : table.first[k] + table.count[k]])
+            middle = 0.5 * (own.min(0) + own.max(0))
+            centers[k] += np.asarray(table.rotation[k]) @ middle
+            radii[k] = np.linalg.norm(own - middle, axis=1).max() + radius
+        elif kind in (ShapeKind.SPHERE, ShapeKind.CAPSULE):
+            radii[k] = radius + half
+        elif kind == ShapeKind.HALF_SPACE:
+            radii[k] = np.inf
+    return centers, radii
+
+
+def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]) -> np.ndarray:
+    """Return for each body 0 if no search moves it, 2 + f if it goes along with posed frame f, else 1."""
+    (index, factor), starts = tree.qpos_source, tree.full_qpos_address
+    own = np.zeros(len(tree.body_parents), bool)
+    for joint, body in enumerate(tree.joint_bodies):
+        own[body] |= bool(factor[starts[joint]]) and int(index[starts[joint]]) in entries
+    moves = np.zeros(len(own), int)
+    for body in range(1, len(own)):
+        moves[body] = own[body] or moves[tree.body_parents[body]] > 0
+    for f, name in enumerate(posed):
+        if name is None:
+            continue
+        carried = {tree.frame_bodies[tree.frame(name)]}
+        for body in range(1, len(own)):
+            if not own[body] and tree.body_parents[body] in carried:
+                carried.add(body)
+        moves[[body for body in carried if moves[body]]] = 2 + f
+    return moves
+
+
+def check_scene(scene: Any) -> None:
+    """Raise TypeError unless this is a ``Scene``."""
+    if not isinstance(scene, Scene):
+        raise OsikTypeError(f"scene is a {type(scene).__name__}; make an osik_jax.Scene of it: Scene({{name: shape}})")
+
+
+@remembered
+def core_scene(scene: Scene, shapes: RobotShapes) -> CoreScene:
+    """Return the arrays of a scene, by NumPy unless traced."""
+    numbers = jnp if is_traced(scene) else np
+    table, lead = scene.table, scene.table.kind.shape[:-1]
+    rows = np.full((*lead, 1), scene.capacity, np.int32)
+    integers = rows, table.kind, table.first, table.count, scene.body, scene.contacts(shapes), scene.among
+    floats = table.size, table.position, table.rotation, table.vertices
+
+    def together(arrays: Sequence[Any], kind: Any) -> Any:
+        flat = [numbers.asarray(a).reshape(*(lead or (1,)), -1) for a in arrays]
+        return numbers.concatenate([a.astype(kind) for a in flat], -1)
+
+    return CoreScene(together(integers, np.int32), together(floats, table.size.dtype))
+
+
+def check_length(scene: CoreScene, targets: int, what: str) -> None:
+    """Raise an error unless there is one scene, or one for each target."""
+    if len(scene.integers) not in (1, targets):
+        raise OsikValueError(
+            f"there are {len(scene.integers)} scenes and {targets} {what}; give one scene, or one for each of them"
+        )
+
+
+class Gaps(NamedTuple):
+    """Nearest pairs of shapes.
+
+    Attributes:
+        distance: signed distance [m]. (lanes,)
+        points: nearest points of the two surfaces, world axes [m]. (lanes, 2, 3)
+        normal: unit vector from the first to the second. (lanes, 3)
+        pair: numbers of the two shapes; those of the robot come first, then the scene's; -1: there is no pair.
+            (lanes, 2)
+    """
+
+    distance: Float[Array, " lanes"]
+    points: Float[Array, "lanes 2 3"]
+    normal: Float[Array, "lanes 3"]
+    pair: Int[Array, "lanes 2"]
+
+
+def gaps_at(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> Gaps:
+    """Return the nearest pair at each configuration."""
+    lanes = max(len(q), len(scene.integers))
+    shapes = [((lanes, 10), float), ((lanes, 2), int)]
+    numbers, pair = _library.call("clearances", shapes, q, robot.integers, robot.numbers, *scene)
+    return Gaps(numbers[:, 0], numbers[:, 1:7].reshape(-1, 2, 3), numbers[:, 7:], pair)
+
+
+def are_free(
+    robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene, clearance: Float[Array, " 1"]
+) -> Bool[Array, " lanes"]:
+    """Return whether all pairs keep a distance at each configuration."""
+    given = q, robot.integers, robot.numbers, *scene, clearance
+    lanes = max(map(len, (q, scene.integers, clearance)))
+    return _library.call("are_free", [((lanes,), int)], *given)[0] > 0
+
+
+def gaps_between(first: ShapeTable, second: ShapeTable) -> Gaps:
+    """Return the gap of each row of one table to the same row of the other; the pair's numbers are the rows."""
+    tables, starts, vertices = (first, second), [], [np.zeros(0)]
+    for table in tables:
+        start, own = _packed_vertices(table)
+        starts.append(np.where(start >= 0, start + sum(map(len, vertices)) // 3, 0))
+        vertices.append(own)
+    counts = [-(-np.asarray(t.count) // _PACK) * _PACK for t in tables]
+    integers = np.stack([np.stack([t.kind, s, c], 1) for t, s, c in zip(tables, starts, counts, strict=True)], 1)
+    numbers = np.stack([np.concatenate([t.size, t.position, np.reshape(t.rotation, (-1, 9))], 1) for t in tables], 1)
+    out = _library.call("shape_gaps", [((len(integers), 10), float)], *(integers, numbers, np.concatenate(vertices)))[0]
+    pair = jnp.arange(len(integers))[:, None].repeat(2, 1)
+    return Gaps(out[:, 0], out[:, 1:7].reshape(-1, 2, 3), out[:, 7:], pair)

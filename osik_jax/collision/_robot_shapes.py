@@ -1,0 +1,137 @@
+"""Collision shapes of a robot: exact convex shapes, covering spheres, and the pairs that are kept apart."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from .._errors import OsikTypeError, OsikValueError, warn
+from ..numerics._host import is_traced
+from ..numerics._remembered import remembered
+from ..robot import Robot
+from ..robot._plausible import first_of
+from ..robot.loading._source import read_source
+from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
+from ._convex import ConvexShape, bounding_ball, geom_shape, shape_table
+from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
+from ._table import RobotShapes, ShapeKind
+from ._touching import SAMPLES, always_touching
+
+Given = str | os.PathLike[str] | Srdf | Literal[True] | None
+"""An SRDF: its path, text or content; ``True``: the file beside the URDF; ``None``: no SRDF."""
+
+
+def robot_shapes(robot: Robot, srdf: Given = None, spheres: Any = None) -> RobotShapes:
+    """Return the collision shapes of a robot, the spheres that cover them, and the pairs that are kept apart.
+
+    Shapes are the robot's geoms that collide (``contype`` and ``conaffinity``): all collision shapes of a URDF. Meshes
+    are their convex hulls. Kept apart are all pairs but those of one body, of bodies with one joint between them
+    (locked joints do not count), those of the model's ``<exclude>``, those that the SRDF allows, and those that touch
+    at each of 1001 configurations, of which a warning tells. Pairs that never touch are kept: no sample can prove it.
+
+    The result is kept for the last robots and arguments.
+
+    Args:
+        robot: the robot.
+        srdf: see ``Given``. Its authors allow what they hold for impossible, so no SRDF is read unless one is named.
+        spheres: the user's own spheres instead of those that are made here.
+
+    Raises:
+        FileNotFoundError: no such file; a mesh is not found.
+        TypeError: the robot is traced.
+        ValueError: nothing of the robot collides, a mesh cannot be read, or a geom has no distance.
+
+    Warns:
+        OsikWarning: pairs touch in every configuration, or the SRDF names links that the robot lacks.
+    """
+    if is_traced(robot):
+        raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
+    if srdf is True:
+        srdf = srdf_beside(robot.holder.path)
+    if srdf is None or isinstance(srdf, Srdf):
+        return _made(robot, srdf, spheres)
+    source = read_source(srdf, "SRDF")
+    return _made(robot, None, spheres, srdf=source.content)
+
+
+@remembered
+def _made(robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | bytes | None = None) -> RobotShapes:
+    if srdf is not None:
+        rules = read_srdf(srdf if isinstance(srdf, str) else srdf.decode("utf-8", "replace"))
+    found = members(robot, {})
+    solid = [k for k, member in enumerate(found) if member.solid]
+    parts = [found[k] for k in solid]
+    _check(found, parts)
+    shapes = [_shape(robot, k, found[k]) for k in solid]
+    number = {k: n for n, k in enumerate(solid)}
+    possible = [(number[i], number[j]) for i, j in own_pairs(robot, found)]
+    kept = _without_allowed(robot, parts, possible, rules)
+    touching = always_touching(robot, [part.body for part in parts], shapes, kept)
+    if touching:
+        _warn_of_touching([f"{parts[i].name}-{parts[j].name}" for i, j in touching])
+    kept = [pair for pair in kept if pair not in set(touching)]
+    own, centers, radii, overshoots = _balls(shapes)
+    return RobotShapes(
+        names=tuple(part.name for part in parts),
+        links=tuple(part.aliases[0] for part in parts),
+        bodies=np.array([part.body for part in parts], np.int32),
+        table=shape_table(shapes),
+        pairs=np.array(kept, np.int32).reshape(-1, 2),
+        world=np.array(moves(robot, parts), bool),
+        sphere_shape=own,
+        sphere_center=centers,
+        sphere_radius=radii,
+        sphere_overshoot=overshoots,
+        touching=tuple((parts[i].name, parts[j].name) for i, j in touching),
+    )
+
+
+def _check(found: Sequence[Member], solid: Sequence[Member]) -> None:
+    refuse_without_distance(solid)
+    if not solid:
+        names = first_of([member.name for member in found]) if found else "none"
+        raise OsikValueError(
+            "the robot has no collision shape: a URDF needs <collision> elements, an MJCF geoms whose contype and "
+            f"conaffinity are not 0. Its geoms: {names}"
+        )
+
+
+def _shape(robot: Robot, number: int, member: Member) -> ConvexShape:
+    try:
+        return geom_shape(robot, number)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"the collision mesh of {member.label}: {error}") from None
+    except ValueError as error:
+        raise OsikValueError(f"the collision mesh of {member.label}: {error}") from None
+
+
+def _without_allowed(
+    robot: Robot, parts: Sequence[Member], pairs: Sequence[tuple[int, int]], rules: Srdf | None
+) -> list[tuple[int, int]]:
+    """Return the pairs whose links the SRDF does not allow to touch; a note tells of its unknown links."""
+    if rules is None:
+        return list(pairs)
+    unknown = sorted(rules.links - {*robot.frame_names})
+    if unknown:
+        warn(f"the SRDF names {len(unknown)} links that the robot lacks; they are passed over: {first_of(unknown)}")
+    return [(i, j) for i, j in pairs if not rules.allows(parts[i].aliases[0], parts[j].aliases[0])]
+
+
+def _warn_of_touching(pairs: list[str]) -> None:
+    warn(
+        f"these pairs touch in each of {SAMPLES + 1} configurations, so nothing keeps them apart: "
+        f"{first_of(pairs, 8)}. If they are meant to touch, an SRDF or <exclude> says so; otherwise their shapes are "
+        "too large"
+    )
+
+
+def _balls(shapes: Sequence[ConvexShape]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a ball around each shape: number of the shape, centre, radius, and how far it sticks out at most [m]."""
+    numbers = [k for k, shape in enumerate(shapes) if shape.kind is not ShapeKind.HALF_SPACE]
+    balls = [bounding_ball(shapes[k]) for k in numbers]
+    radii = np.array([radius for _, radius in balls])
+    centers = np.array([center for center, _ in balls]).reshape(-1, 3)
+    return np.array(numbers, np.int32), centers, radii, radii

@@ -1,0 +1,144 @@
+"""Searches for configurations in which nothing touches, by the core (``core/chain_find.hpp``, ``core/freedom.hpp``)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._errors import OsikTypeError, OsikValueError
+from ..collision._clearance import distances, shape_names
+from ..collision._core import CoreRobot, check_length, check_scene, core_robot, core_scene, require_core
+from ..collision._robot_shapes import Given, robot_shapes
+from ..collision._scene import Scene
+from ..collision._table import RobotShapes
+from ..numerics._arguments import concrete
+from ..numerics._host import is_traced
+from ..numerics._remembered import remembered
+from ..robot import Robot
+from ..robot._joint_selection import dof_names
+from ._chain_problem import ChainRoute, Settings, answer, dof_of_entries
+from ._chain_search import Goal
+from ._fixed import Explored, Searches, or_far, with_placeholders
+from ._run import split
+from ._solution import InverseKinematicsSolution, with_fields
+from ._whole import Around, Whole, by_core, named, whole
+
+SEEDS = 256
+"""Searches for a target, to begin with: free solutions can be one in a hundred."""
+
+
+class Obstacles(NamedTuple):
+    """What an answer may not touch.
+
+    Attributes:
+        route: the frames.
+        shapes: of the robot.
+        scene: the user's.
+        around: both for the core.
+    """
+
+    route: ChainRoute
+    shapes: RobotShapes
+    scene: Scene
+    around: Around
+
+    @property
+    def many(self) -> bool:
+        """Return whether each target has a scene of its own."""
+        return self.scene.is_stack
+
+
+def read_obstacles(robot: Robot, route: Any, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
+    """Return the obstacles of a search.
+
+    Raises:
+        OsikError: there is no core for this device.
+        TypeError, ValueError: tasks, or limits with rows, instead of poses; a clearance that is negative.
+    """
+    require_core("inverse_kinematics with a scene")
+    check_scene(scene)
+    if not isinstance(route, ChainRoute):
+        raise OsikTypeError(
+            "scene= goes with poses of frames that hinges and slides carry, and with limits of joints; tasks, a scheme "
+            "or a free base take a CollisionAvoidanceLimit"
+        )
+    shapes, own = _known(robot, srdf, route=route)
+    return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
+
+
+@remembered
+def _known(robot: Robot, srdf: Given, *, route: ChainRoute) -> tuple[RobotShapes, CoreRobot]:
+    """Return the robot's shapes, and what the core takes of it for a search."""
+    shapes = robot_shapes(robot, srdf)
+    posed = tuple(name if all(rows) else None for name, rows in zip(route.frames, route.rows, strict=True))
+    return shapes, core_robot(robot, shapes, entries=tuple(route.entries(robot).tolist()), posed=posed)
+
+
+def checked_clearance(value: Any) -> Any:
+    """Return a clearance as an array (1,); raise ValueError unless it is one number, 0 or more."""
+    out = (jnp if is_traced(value) else np).asarray(value, float)
+    seen = concrete(out)
+    if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen >= 0.0)):
+        raise OsikValueError(f"clearance is {value!r}; it is one number, 0 or more, in metres")
+    return out.reshape(1)
+
+
+def find_free(
+    robot: Robot,
+    goals: Goal,
+    settings: Settings,
+    most: int,
+    steps: int,
+    how: Searches,
+    obstacles: Obstacles,
+    *,
+    single: bool,
+) -> Explored:
+    """Return free configurations; arguments as of ``whole``. Without numbers, ``settings`` and so on may be traced."""
+    route, scenes = obstacles.route, len(obstacles.around.scene.integers)
+    if len(goals.position) == 1 and scenes > 1:
+        goals = jax.tree.map(lambda a: a.repeat(scenes, 0), goals)
+    count = len(goals.position)
+    check_length(obstacles.around.scene, count, "targets")
+    if is_traced((goals, settings, obstacles.around, robot)):
+        return Explored(_traced(robot, goals, settings, most, steps, how, obstacles), *split(None))
+    counts = np.full(count, most)
+    given = robot, route, goals, settings, counts, most, steps, how
+    results = whole(*given, single=single, around=obstacles.around)
+    return Explored(_named(results, obstacles), *split(None if results.ends is None else np.asarray(results.ends)))
+
+
+def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
+    """Return the answers with the names of their nearest pairs."""
+    pairs, own, rows = np.asarray(results.pair), obstacles.shapes.names, obstacles.scene.names
+    names = [shape_names(own, rows, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
+    kinds = {pair: k for k, pair in enumerate(dict.fromkeys(names))}
+    number = np.array([kinds[pair] for pair in names], np.int32).reshape(pairs.shape[:-1])
+    return with_fields(results.answer, nearest_pair=number, pairs=tuple(kinds), obstruction=results.reason)
+
+
+def _traced(
+    robot: Robot,
+    goals: Goal,
+    settings: Settings,
+    most: int,
+    steps: int,
+    how: Searches,
+    obstacles: Obstacles,
+) -> InverseKinematicsSolution:
+    """Return the answers as differentiable functions of what is traced; pairs have no names there."""
+    route, (goals, valid) = obstacles.route, with_placeholders(goals)
+    search, entries = route.search(robot, settings, warm=how.warm, near=how.near), route.entries(robot)
+    fixed, there, around = jax.lax.stop_gradient((search, goals, obstacles.around))
+    dofs, joints = tuple(dof_of_entries(robot)[entries].tolist()), tuple(dof_names(robot))
+    counts = jnp.full(len(valid), most, jnp.int32)
+    results = by_core(fixed, there, counts, jnp.int32(steps), how, dofs, joints, around)
+    found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
+    own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
+    gap = distances(robot, obstacles.shapes, own.q, obstacles.scene)[0]
+    is_free = own.converged & (gap >= around.clearance[0])
+    return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)
