@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
-from ..robot._mujoco import mujoco_frame_pose
+from ..robot._mujoco import mujoco_frame_pose, robot_com
 from ..robot._tree import FREE
 from ._world import World
 
@@ -134,7 +134,7 @@ class Simulation:
 
     def com(self) -> Float[np.ndarray, "3"]:
         """Return the centre of mass [m] of the robot. (3,)."""
-        return self.world.own_masses @ self.data.xipos / self.world.own_masses.sum()
+        return robot_com(self.world.robot, self.data)
 
     def contact_points(self) -> Float[np.ndarray, "k 3"]:
         """Return the contact points of all feet in the world [m], in the order of the feet. (k, 3)."""

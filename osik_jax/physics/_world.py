@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import mujoco
@@ -17,7 +16,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._forward import body_masses
 from ..robot import Robot
 from ..robot._feet import with_corners
-from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose, own_masses
+from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose
 from ..robot._tree import BALL, FREE
 from ..robot.loading._mjmodel import element_names
 from ._servo import Servo as Servo
@@ -51,11 +50,6 @@ class World:
     servos: Mapping[str, Servo]
     feet: Mapping[str, Float[np.ndarray, "k 3"]]
     floor: float
-
-    @cached_property
-    def own_masses(self) -> Float[np.ndarray, " bodies"]:
-        """Return the mass of each body [kg], 0 where it is fixed to the world or not the robot's."""
-        return own_masses(self.robot)
 
     def contact_geoms(self, foot: str) -> list[int]:
         """Return the spheres of a foot, by their number in the model."""

@@ -14,23 +14,20 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError
-from ..collision import CollisionShape
 from ..kinematics._forward import independent_columns
 from ..kinematics._home import home_kinematics
-from ..limits import CollisionAvoidanceLimit
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
 from ._facing import facing_at_home
 from ._goals import Goals
 from ._person import Person, axes_from, directions, palm_axes
+from ._places import pairs_at_home
 from ._profile import Limb, Profile, world_points
 from ._roles import LEGS, SIDES
 from ._rotations import moved_poses
 from ._terms import ORIGIN, Bounds, reach_length
 
-JOINTS_APART = 3
-_CAPSULE = "capsule "
 _TOUCH, _NEARS = 1e5, 0.03
 """Weight of what is held [1/m^2], relative to that of limbs, and the time in which it grows tenfold before [s]: a hand
 that begins to move in the frame before would have to accelerate beyond its limits.
@@ -53,35 +50,13 @@ _LEANS, _FINGER_AT_END = 0.3, 0.25
 """
 
 
-def shapes_apart(robot: Robot, profile: Profile) -> CollisionAvoidanceLimit | None:
-    """Return the collision limit between the profile's capsules, or None if no pair is left.
-
-    A pair counts if at least three joints lie between the two capsules and they do not overlap at home.
-    """
-    shapes = {
-        f"{_CAPSULE}{i}": CollisionShape.capsule(c.radius, c.start, c.end, frame=c.frame)
-        for i, c in enumerate(profile.capsules)
-    }
-    bodies = [robot.tree.frame_bodies[robot.tree.frame(c.frame)] for c in profile.capsules]
-    pairs = [
-        (f"{_CAPSULE}{i}", f"{_CAPSULE}{j}")
-        for i, j in itertools.combinations(range(len(bodies)), 2)
-        if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
-    ]
-    if not pairs:
-        return None
-    return CollisionAvoidanceLimit(robot, pairs=pairs, shapes=shapes, minimum_distance=0.0, q0_distance=0.0)
-
-
 def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
-    """Return the pairs of ``shapes_apart`` as indices of the profile's capsules.
+    """Return the pairs of capsules that a plan keeps apart (``pairs_at_home``), as indices of the profile's capsules.
 
     A pair is left out if it is implied by another: one capsule is inside a wider capsule that is kept from the same
     shape.
     """
-    apart = shapes_apart(robot, profile)
-    named = [] if apart is None else apart.scene.pair_names
-    pairs = [(int(a.removeprefix(_CAPSULE)), int(b.removeprefix(_CAPSULE))) for a, b in named]
+    pairs = pairs_at_home(robot, profile)
     around = [{i, *(j for j, c in enumerate(profile.capsules) if c.hides(own))}
               for i, own in enumerate(profile.capsules)]  # fmt: skip
     kept = {frozenset(pair) for pair in pairs}
@@ -90,21 +65,6 @@ def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
         return any(frozenset(wider) in kept for wider in itertools.product(around[a], around[b]) if wider != (a, b))
 
     return [pair for pair in pairs if not follows(*pair)]
-
-
-def joints_between(robot: Robot, a: int, b: int) -> int:
-    """Return the number of joints on the tree path between two bodies."""
-    parents = robot.tree.body_parents
-
-    def chain(body: int) -> list[int]:
-        out = [body]
-        while out[-1] != parents[out[-1]]:
-            out.append(parents[out[-1]])
-        return out
-
-    first, second = chain(a), chain(b)
-    common = next(body for body in first if body in second)
-    return first.index(common) + second.index(common)
 
 
 @dataclasses.dataclass(frozen=True)

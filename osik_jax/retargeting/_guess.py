@@ -17,11 +17,11 @@ from ..robot import Robot
 from ..robot._feet import find_feet
 from ..robot._mujoco import own_masses
 from ..robot._tree import BALL, FREE, HINGE
-from ._body import JOINTS_APART, joints_between
 from ._facing import by_name, facing_x
 from ._hand import guess_hand
 from ._limbs import ORIGIN, Chain, Limb, base_body, find_arm, find_chains, find_leg
 from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
+from ._places import JOINTS_APART, joints_between
 from ._profile import Capsule, Foot, Place, Point, Profile, world_points
 from ._roles import CHAINS, FINGERS, LEGS, LIMBS, NEEDED, SIDES
 

@@ -58,8 +58,7 @@ class Clip(NamedTuple):
 
 def as_lane(clip: Clip, length: int) -> _Lane:
     """Return a clip as one lane of a batch, padded to ``length`` frames."""
-    frames = len(clip.start)
-    goals, start = (clip.goals, clip.start) if frames >= length else padded(clip.goals, clip.start, length - frames)
+    goals, start = padded(clip.goals, clip.start, length - len(clip.start))
     return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
 
 

@@ -1,7 +1,9 @@
-"""World positions of a profile's points along a robot's motion, by MuJoCo's C code."""
+"""World positions of a profile's points along a robot's motion, and distances of its capsules, by MuJoCo's C code."""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -9,8 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..robot import Robot
-from ..robot._mujoco import mujoco_frame_pose
+from ..robot._mujoco import model_qpos, mujoco_frame_pose
 from ._profile import Profile
+
+JOINTS_APART = 3
+"""Least number of joints between two capsules that are kept apart."""
+_FAR = 0.1
+"""Distance up to which MuJoCo computes distances of capsules [m]; only overlaps count."""
 
 
 class Places(NamedTuple):
@@ -69,3 +76,55 @@ def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"])
         center=center,
         capsules=points[:, keys + corners :].reshape(len(points), -1, 2, 3),
     )
+
+
+class CapsuleDistances:
+    """Distances of a profile's capsules, which are free bodies of a MuJoCo model of their own."""
+
+    def __init__(self, profile: Profile) -> None:
+        """Build the model."""
+        spec = mujoco.MjSpec()
+        for c in profile.capsules:
+            half = 0.5 * float(np.linalg.norm(np.subtract(c.end, c.start)))
+            body = spec.worldbody.add_body(mocap=True)
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[c.radius, half, 0.0])
+        self._model = spec.compile()
+        self._data = mujoco.MjData(self._model)
+
+    def of(self, ends: Float[np.ndarray, "k 2 3"], pairs: Sequence[tuple[int, int]]) -> list[float]:
+        """Return the distance of each pair [m], negative where they overlap; ``ends`` are those of the axes [m]."""
+        self._data.mocap_pos[:] = ends.mean(1)
+        for k, along in enumerate(ends[:, 1] - ends[:, 0]):
+            mujoco.mju_quatZ2Vec(self._data.mocap_quat[k], along)
+        mujoco.mj_kinematics(self._model, self._data)
+        return [mujoco.mj_geomDistance(self._model, self._data, *pair, _FAR, None) for pair in pairs]
+
+
+def pairs_at_home(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
+    """Return the pairs of capsules with at least three joints between them that do not overlap at home."""
+    if not profile.capsules:
+        return []
+    bodies = [robot.tree.frame_bodies[robot.tree.frame(c.frame)] for c in profile.capsules]
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(bodies)), 2)
+        if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
+    ]
+    home = find_places(robot, profile, model_qpos(robot, robot.q0)).capsules[0]
+    distances = CapsuleDistances(profile).of(home, pairs)
+    return [pair for pair, distance in zip(pairs, distances, strict=True) if distance >= 0.0]
+
+
+def joints_between(robot: Robot, a: int, b: int) -> int:
+    """Return the number of joints on the tree path between two bodies."""
+    parents = robot.tree.body_parents
+
+    def chain(body: int) -> list[int]:
+        out = [body]
+        while out[-1] != parents[out[-1]]:
+            out.append(parents[out[-1]])
+        return out
+
+    first, second = chain(a), chain(b)
+    common = next(body for body in first if body in second)
+    return first.index(common) + second.index(common)

@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import functools
-import itertools
 import operator
 from typing import Any
 
-import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from ..robot._mujoco import model_qpos
 from ..tasks._polygon import hull
-from ._body import JOINTS_APART, joints_between
 from ._contact import stretches
 from ._facing import facing_at_home
 from ._hand import is_other_hand
 from ._notes import notes
-from ._places import Places, find_places
-from ._profile import Profile
+from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
 from ._roles import CHAINS, SIDES
 
@@ -169,50 +165,10 @@ def _balance(
 
 def _penetration(result: Retargeted, ends: Float[np.ndarray, "F k 2 3"]) -> float | None:
     """Return the deepest overlap [mm] of the capsule pairs with three or more joints between them and a gap at home."""
-    profile = result.profile
-    if not profile.capsules:
+    if not result.profile.capsules:
         return None
-    model = _capsule_model(profile)
-    data = mujoco.MjData(model)
-    pairs = _pairs(result, model, data)
-    deepest = 0.0
-    for placed in ends:
-        _place(model, data, placed)
-        for pair in pairs:
-            # beyond 0.1 m MuJoCo stops computing; only overlaps count here
-            deepest = max(deepest, -mujoco.mj_geomDistance(model, data, *pair, 0.1, None))
-    return 1e3 * deepest
-
-
-def _pairs(result: Retargeted, model: mujoco.MjModel, data: mujoco.MjData) -> list[tuple[int, int]]:
-    tree, capsules = result.robot.tree, result.profile.capsules
-    bodies = [tree.frame_bodies[tree.frame(c.frame)] for c in capsules]
-    robot = result.robot
-    _place(model, data, find_places(robot, result.profile, model_qpos(robot, robot.q0)).capsules[0])
-    return [
-        (i, j)
-        for i, j in itertools.combinations(range(len(bodies)), 2)
-        if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
-        and mujoco.mj_geomDistance(model, data, i, j, 0.1, None) >= 0.0
-    ]
-
-
-def _capsule_model(profile: Profile) -> mujoco.MjModel:
-    """Return a MuJoCo model with the profile's capsules as free mocap bodies."""
-    spec = mujoco.MjSpec()
-    for c in profile.capsules:
-        half = 0.5 * float(np.linalg.norm(np.subtract(c.end, c.start)))
-        body = spec.worldbody.add_body(mocap=True)
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[c.radius, half, 0.0])
-    return spec.compile()
-
-
-def _place(model: mujoco.MjModel, data: mujoco.MjData, ends: Float[np.ndarray, "k 2 3"]) -> None:
-    """Move each capsule between its two given ends."""
-    data.mocap_pos[:] = ends.mean(1)
-    for k, along in enumerate(ends[:, 1] - ends[:, 0]):
-        mujoco.mju_quatZ2Vec(data.mocap_quat[k], along)
-    mujoco.mj_kinematics(model, data)
+    pairs, distances = pairs_at_home(result.robot, result.profile), CapsuleDistances(result.profile)
+    return 1e3 * max(0.0, *(-distance for placed in ends for distance in distances.of(placed, pairs)), 0.0)
 
 
 def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:

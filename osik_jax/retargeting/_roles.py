@@ -3,28 +3,19 @@
 import itertools
 from collections.abc import Collection
 
-LIMBS = (
-    ("left_hip", "left_knee"),
-    ("left_knee", "left_ankle"),
-    ("right_hip", "right_knee"),
-    ("right_knee", "right_ankle"),
-    ("left_shoulder", "left_elbow"),
-    ("left_elbow", "left_wrist"),
-    ("right_shoulder", "right_elbow"),
-    ("right_elbow", "right_wrist"),
-)
-"""Segments whose directions are tracked if the robot has them, from the first role to the second."""
-LEGS = LIMBS[:4]
-REACHES = (
-    ("left_hip", "left_ankle"),
-    ("left_shoulder", "left_wrist"),
-    ("right_hip", "right_ankle"),
-    ("right_shoulder", "right_wrist"),
-)
-"""Limbs of a four-legged robot, each from its first joint to its foot."""
 SIDES = ("left", "right")
 CHAINS = {"leg": ("hip", "knee", "ankle"), "arm": ("shoulder", "elbow", "wrist")}
 """The joints of each limb of a side, in order."""
+LIMBS = tuple(
+    (f"{side}_{first}", f"{side}_{second}")
+    for roles in CHAINS.values()
+    for side in SIDES
+    for first, second in itertools.pairwise(roles)
+)
+"""Segments whose directions are tracked if the robot has them, from the first role to the second."""
+LEGS = LIMBS[:4]
+REACHES = tuple((f"{side}_{roles[0]}", f"{side}_{roles[-1]}") for side in SIDES for roles in CHAINS.values())
+"""Limbs of a four-legged robot, each from its first joint to its foot."""
 NEEDED = tuple(dict.fromkeys(role for limb in LIMBS for role in limb))
 """Roles that every clip must have."""
 OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_heel", "right_toe")

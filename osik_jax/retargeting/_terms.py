@@ -231,17 +231,9 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
     """Return all cost terms of one frame, and its contact points."""
     robot = body.robot
     kinematics = forward_kinematics(robot, q)
-    names = tuple(dict.fromkeys(body.frames))
-    index = np.array([names.index(name) for name in body.frames])
-    positions, rotations = kinematics.frame_poses(robot, names)
-    bodies = np.array([robot.tree.frame_bodies[robot.tree.frame(name)] for name in body.frames])
     k, first = len(body.keys), len(body.keys) + 4 + body.corners
-    place = _Places(
-        positions[index] + rotate(rotations[index], body.offsets),
-        rotations[index[k : k + 4]],
-        robot.tree.moves[bodies],
-        _Motion.of(robot, kinematics),
-    )
+    points, rotations, moves = _placed(body, kinematics)
+    place = _Places(points, rotations[k : k + 4], moves, _Motion.of(robot, kinematics))
     turns = (goals.pelvis, weights.pelvis), (goals.torso, weights.torso), *((foot, weights.foot) for foot in goals.feet)
     soft = [_limbs(place, body, goals, weights)]
     soft += [_root(place, body.roots, goals, weights)] if body.roots else []
@@ -276,15 +268,23 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
 def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Float[Array, "8 3 nv"]]:
     """Return the lowest points of the soles' corners in the world [m], and their derivatives."""
     robot, first = body.robot, len(body.keys) + 4
-    frames, offsets = body.frames[first : first + 8], body.offsets[first : first + 8]
+    points, _, moves = _placed(body, kinematics, slice(first, first + 8))
+    points = points.at[:, 2].add(-body.rises)
+    axes = jnp.tile(jnp.eye(3, dtype=points.dtype), (8, 1))
+    rates = _Motion.of(robot, kinematics).rates(np.repeat(moves, 3, 0), axes, jnp.repeat(points, 3, 0))
+    return points, independent_columns(robot.tree, rates).reshape(8, 3, -1)
+
+
+def _placed(
+    body: Body, kinematics: Kinematics, part: slice = slice(None)
+) -> tuple[Float[Array, "k 3"], Float[Array, "k 3 3"], np.ndarray]:
+    """Return places in the world [m], the rotations of their frames, and the dofs that move their bodies."""
+    frames, tree = body.frames[part], body.robot.tree
     names = tuple(dict.fromkeys(frames))
     index = np.array([names.index(name) for name in frames])
-    positions, rotations = kinematics.frame_poses(robot, names)
-    points = (positions[index] + rotate(rotations[index], offsets)).at[:, 2].add(-body.rises)
-    moves = robot.tree.moves[np.repeat([robot.tree.frame_bodies[robot.tree.frame(name)] for name in frames], 3)]
-    axes = jnp.tile(jnp.eye(3, dtype=points.dtype), (8, 1))
-    rates = _Motion.of(robot, kinematics).rates(moves, axes, jnp.repeat(points, 3, 0))
-    return points, independent_columns(robot.tree, rates).reshape(8, 3, -1)
+    positions, rotations = kinematics.frame_poses(body.robot, names)
+    points = positions[index] + rotate(rotations[index], body.offsets[part])
+    return points, rotations[index], tree.moves[np.array([tree.frame_bodies[tree.frame(name)] for name in frames])]
 
 
 class _Places(NamedTuple):

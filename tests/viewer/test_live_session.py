@@ -211,6 +211,6 @@ def test_the_page_of_a_robot_does_not_complain_of_its_own_scheme(
 ) -> None:
     monkeypatch.setattr(_checks, "_said_ignored", set())  # each set of tasks is warned of once
     made = default_session(osik.load_robot("arm7"))
-    compile_step(made.robot, Controller(made.tasks, made.scheme, made.limits), made.dt)
+    compile_step(made.robot, Controller(dict(made.tasks), made.scheme, made.limits), made.dt)
     assert len({task.priority for task in made.tasks.values()}) > 1 and isinstance(made.scheme, osik.WeightedQP)
     assert not [w for w in recwarn if issubclass(w.category, osik.OsikWarning)]

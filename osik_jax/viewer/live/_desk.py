@@ -59,7 +59,7 @@ class Desk:
             if self._told[0] is now and self._told[1] is self._session:
                 return self._told[2]
             targets = {k: t for k, task in now.tasks.items() if (t := getattr(task, "target", None)) is not None}
-            kept = with_targets(Controller(self._session.tasks, now.scheme, ()), targets)
+            kept = with_targets(Controller(dict(self._session.tasks), now.scheme, ()), targets)
             self._told = now, self._session, dataclasses.replace(self._session, tasks=kept.tasks)
             return self._told[2]
 

@@ -267,7 +267,8 @@ class ControlLoop:
                 # numbers may have changed during compilation, so the wanted controller runs, not the compiled one
                 self._running, self._is_behind = self._wanted, False
                 self._job = _Job(program, self._running.numbers())
-        self._here(list(controller.tasks))  # compiled here, so that the control thread need not
+        if not self._stop.is_set():
+            self._here(list(controller.tasks))  # compiled here, so that the control thread need not
 
     def _not_compiled(self, controller: Controller, error: Exception) -> None:
         """Return to the running controller and report the error."""

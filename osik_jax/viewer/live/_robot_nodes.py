@@ -80,20 +80,16 @@ def add_label(scene: SceneApi, name: str, span: Float[np.ndarray, "points 3"]) -
 
 def _by_body(shapes: RobotParts, data: mujoco.MjData) -> dict[int, dict[tuple[int, int, int, int], Surface]]:
     """Return the surfaces of each body by colour (0 to 255), in the body's frame."""
-    out: dict[int, dict[tuple[int, int, int, int], Surface]] = {}
+    from trimesh.util import append_faces  # comes with viser
+
+    out: dict[int, dict[tuple[int, int, int, int], tuple[list[np.ndarray], list[np.ndarray]]]] = {}
     positions, rotations = shapes.poses(data)
     for part, body, position, rotation in zip(shapes.parts, shapes.bodies, positions, rotations, strict=True):
         turn = data.xmat[body].reshape(3, 3)
         own = part_triangles(part)
         vertices = (own.vertices @ rotation.T + position - data.xpos[body]) @ turn
         red, green, blue, alpha = (round(255 * float(x)) for x in np.clip(part.color, 0.0, 1.0))
-        pieces = out.setdefault(int(body), {})
-        pieces[red, green, blue, alpha] = _joined(pieces.get((red, green, blue, alpha)), Surface(vertices, own.faces))
-    return out
-
-
-def _joined(first: Surface | None, second: Surface) -> Surface:
-    if first is None:
-        return second
-    faces = np.concatenate([first.faces, second.faces + len(first.vertices)])
-    return Surface(np.concatenate([first.vertices, second.vertices]), faces)
+        pieces = out.setdefault(int(body), {}).setdefault((red, green, blue, alpha), ([], []))
+        pieces[0].append(vertices)
+        pieces[1].append(own.faces)
+    return {body: {color: Surface(*append_faces(*own)) for color, own in each.items()} for body, each in out.items()}

@@ -81,7 +81,7 @@ class Session:
         """
         tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
         limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
-        return Controller(tasks, self.scheme, [no_limits, *(limit for limit in limits if limit is not None)])
+        return Controller(tasks, self.scheme, (no_limits, *(limit for limit in limits if limit is not None)))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the session to a file for ``load_session``.

@@ -28,9 +28,8 @@ State = tuple[Array, Array, Any]
 """State passed from step to step: configuration (nq,), velocity (nv,) and warm start."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Controller:
-    """Tasks, scheme and limits of a control step.
+class Controller(eqx.Module):
+    """Tasks, scheme and limits of a control step, a pytree.
 
     Attributes:
         tasks: by name.
@@ -38,22 +37,17 @@ class Controller:
         limits: hard bounds on the velocity.
     """
 
-    tasks: Mapping[str, Task]
+    tasks: dict[str, Task]
     scheme: Scheme
-    limits: Sequence[Limit]
-
-    def parts(self) -> tuple[dict[str, Task], Scheme, tuple[Limit, ...]]:
-        """Return tasks, scheme and limits as a pytree."""
-        return dict(self.tasks), self.scheme, tuple(self.limits)
+    limits: tuple[Limit, ...]
 
     def numbers(self) -> list[Array]:
         """Return the numbers that may change without compiling, in a fixed order."""
-        leaves = jax.tree.leaves(self.parts())
-        return [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in leaves]
+        return [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in jax.tree.leaves(self)]
 
     def structure(self) -> tuple[Any, ...]:
         """Return a key of the compiled program: controllers with equal structure share a program."""
-        leaves, tree = jax.tree.flatten(self.parts())
+        leaves, tree = jax.tree.flatten(self)
         return (tree, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
 
 
@@ -102,15 +96,15 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
     The push is a velocity (nv,) that is added to the controller's. For a batch, all numbers, states and pushes have a
     leading axis.
     """
-    tree = jax.tree.structure(controller.parts())
+    tree = jax.tree.structure(controller)
     numbers, lead = controller.numbers(), () if batch is None else (batch,)
 
     def step(numbers: list[Array], state: State, push: Array) -> tuple[State, Array, dict[str, Array]]:
-        tasks, scheme, limits = jax.tree.unflatten(tree, numbers)
+        own = jax.tree.unflatten(tree, numbers)
         q, velocity, warm_start = state
-        tasks, limits = remembering((tasks, limits), velocity, True)
+        tasks, limits = remembering((own.tasks, own.limits), velocity, True)
         # not `solve`, which warns of a weighted scheme's ignored priorities: the page has a menu of schemes
-        answer = one_step(robot, q, tasks, scheme, checked_limits(robot, limits), in_type_of(dt, q), warm_start)
+        answer = one_step(robot, q, tasks, own.scheme, checked_limits(robot, limits), in_type_of(dt, q), warm_start)
         moved = integrate(robot, q, answer.velocity + push, dt)
         return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
 
@@ -132,7 +126,4 @@ def stacked(controllers: Sequence[Controller]) -> Controller:
         raise OsikValueError(
             "the robots of a batch differ in more than numbers: they need tasks of the same names and kinds"
         )
-    parts = jax.tree.map(
-        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *(c.parts() for c in controllers)
-    )
-    return Controller(*parts)
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *controllers)
