@@ -24,14 +24,15 @@ def test_steps_are_those_of_plain_jax(name, near, rng):
     route, low = ChainRoute(tuple(wanted), tuple(wanted.values())), np.asarray(robot.position_lower)
     high, tolerance = np.asarray(robot.position_upper), jnp.array([1e-3, 1e-2])
     limits = jnp.where(jnp.isfinite(low), 0.5 * low, low), jnp.where(jnp.isfinite(high), 0.5 * high, high)
-    search = chain_search(robot, route, Settings(robot.q0, *limits, 0, tolerance, 64), warm=False, near=near)
+    settings = Settings(robot.q0, *limits, 0, tolerance, 64)
+    search = jax.jit(lambda: chain_search(robot, route, settings, warm=False, near=near))()  # one program, not hundreds
 
     def poses(q):
         return osik.forward_kinematics(robot, q).frame_poses(robot, route.frames)
 
-    goal = Goal(*jax.vmap(poses)(robot.q0 + 0.8 * rng.standard_normal((LANES, robot.nq))))
+    goal = Goal(*jax.jit(jax.vmap(poses))(robot.q0 + 0.8 * rng.standard_normal((LANES, robot.nq))))
     goal = goal._replace(position=goal.position.at[0, 0, 0].set(jnp.nan))  # harms its own lane alone
-    x, stopped = search.begin(jnp.arange(LANES), goal), 0
+    x, stopped = jax.jit(ChainSearch.begin)(search, jnp.arange(LANES), goal), 0
     for steps in (1, 4, 4, 4):
         expected = jax.jit(ChainSearch.advance_plain, static_argnums=3)(search, x, goal, steps)
         found = jax.jit(ChainSearch.advance, static_argnums=3)(search, x, goal, steps)
@@ -58,6 +59,6 @@ def test_robots_of_a_batch_have_their_own_chains(rng):
         search = chain_search(robot, route, settings, warm=False, near=False)
         return search.advance(x, goal, 3), search.advance_plain(x, goal, 3)
 
-    found, expected = jax.vmap(both)(robots, x, goal)
+    found, expected = jax.jit(jax.vmap(both))(robots, x, goal)
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)

@@ -67,7 +67,7 @@ def on_one_warp(monkeypatch, tmp_path):
     _dispatch.hierarchy_solver.cache_clear()
 
 
-@pytest.mark.variants(slow=[f"{f.__name__}-exact" for f in FAMILIES] + [f"{f.__name__}-damped" for f in FAMILIES[2:-1]])
+@pytest.mark.variants(slow=[f"{f.__name__}-{damping}" for f in FAMILIES for damping in ("exact", "damped")][:-1])
 @pytest.mark.parametrize("damping", [0.0, DAMPED], ids=["exact", "damped"])
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 def test_the_answers_are_those_of_the_cpu(family, damping, rng, request):
