@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..robot import Robot
+from ._files import write_calibration
+from ._residuals import Combination, Residuals
 from ._setup import BASE, FixedFrame, Setup
 from ._unknowns import Parameter
 
@@ -20,41 +22,6 @@ _SHOWN = 0.05
 """Least part of an unknown in a combination, by what it does to the measurements, that is shown."""
 
 
-class Combination(NamedTuple):
-    """A change of several unknowns that changes no measurement.
-
-    Attributes:
-        coefficients: change of each unknown by its name, the largest 1 [m or rad].
-        ratio: how much the measurements change relative to the best observed combination, 0 to 1.
-    """
-
-    coefficients: dict[str, float]
-    ratio: float
-
-    def __str__(self) -> str:
-        """Return ``a + 0.5 b - c``."""
-        parts = [(("+ ", "- ")[v < 0.0], f"{abs(v):.3g} ", name) for name, v in self.coefficients.items()]
-        return " ".join(sign + size.removeprefix("1 ") + name for sign, size, name in parts).removeprefix("+ ")
-
-
-class Residuals(NamedTuple):
-    """Differences between prediction and readings of one measurement.
-
-    Attributes:
-        kind: of the measurement, with its frames: ``"Points of tool0"``.
-        unit: of the rows.
-        before: with the numbers as given [unit]. (n, k)
-        after: with the fit [unit]. (n, k)
-        weights: of each reading by the robust loss: small for outliers, 1 for least squares. (n,)
-    """
-
-    kind: str
-    unit: str
-    before: Float[Array, "n k"]
-    after: Float[Array, "n k"]
-    weights: Float[Array, " n"]
-
-
 class Calibration(eqx.Module):
     """Result of ``calibrate``; a pytree, so under ``vmap`` each array has the batch's axis in front.
 
@@ -62,11 +29,15 @@ class Calibration(eqx.Module):
         setup: robot, base and fixed frames with the fitted numbers.
         parameters: which numbers were unknown (static).
         units: of each (static).
+        kinds: kind and unit of each measurement (static).
         vector: fitted change of each number [m or rad]. (p,)
         covariance: of the changes. In directions that neither data nor a prior determine it is 0. (p, p)
         deviation: standard deviation of each change; inf if neither data nor a prior determine it. (p,)
         information: ``J' J`` of the measurements over their standard deviations. (p, p)
         noise: size of the residuals of each measurement relative to the sigma that was given, of the inliers. (g,)
+        before: differences between prediction and readings of each measurement, with the numbers as given. (n, k)
+        after: the same with the fit. (n, k)
+        weights: of each measurement's readings by the robust loss. (n,)
         directions: rows are combinations of unknowns, each in its own scale, from the best observed one. (p, p)
         scale: of each unknown in ``directions``. (p,)
         ratios: singular value of each direction relative to the largest. (p,)
@@ -167,15 +138,15 @@ class Calibration(eqx.Module):
 
     def figure(self) -> Figure:
         """Return a picture of the residuals before and after the fit."""
-        from ._picture import draw_residuals
+        from ._picture import draw_residuals  # loads matplotlib
 
         return draw_residuals(self.residuals)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write values, deviations, residuals and unobservable combinations to a YAML file."""
-        from ._files import write_calibration
-
-        write_calibration(self, path)
+        """Write changes, deviations, residuals and undetermined combinations to a YAML file."""
+        numbers = zip(self.names, np.asarray(self.vector), np.asarray(self.deviation), self.units, strict=True)
+        frames = {"base": self.base, **self.frames}
+        write_calibration(path, bool(self.converged), list(numbers), self.residuals, self.unobservable, frames)
 
 
 def _rms(rows: Array) -> float:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -15,9 +14,8 @@ from .._whole_file import write_text
 from ..robot import Robot
 from ..robot.loading._mjmodel import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
-
-if TYPE_CHECKING:
-    from ._calibration import Calibration
+from ._residuals import Combination, Residuals
+from ._setup import FixedFrame
 
 _POSITION, _QUATERNION, _PIXEL = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("u", "v")
 
@@ -108,28 +106,42 @@ def _configurations(robot: Robot, joints: dict[str, np.ndarray], path: str) -> n
     return q
 
 
-def write_calibration(found: Calibration, path: str | os.PathLike[str]) -> None:
-    """Write a calibration as YAML: changes and deviations in SI units, residuals, what is not determined."""
-    lines = [f"converged: {json.dumps(bool(found.converged))}", "unknowns:"]
-    parts = zip(found.names, np.asarray(found.vector), np.asarray(found.deviation), found.units, strict=True)
-    lines += [f"  {json.dumps(n)}: {{change: {_number(v)}, sigma: {_number(s)}, unit: {u}}}" for n, v, s, u in parts]
-    lines += ["residuals:"]
-    for part in found.residuals:
-        before, after = (np.sqrt(np.square(np.asarray(rows)).mean()) for rows in (part.before, part.after))
-        numbers = f"readings: {len(part.after)}, rms_before: {_number(before)}, rms_after: {_number(after)}"
-        lines.append(f"  - {{of: {json.dumps(part.kind)}, {numbers}, unit: {json.dumps(part.unit)}}}")
-    lost = [
-        json.dumps({name: float(f"{value:.6g}") for name, value in c.coefficients.items()}) for c in found.unobservable
-    ]
-    lines += ["undetermined:" if lost else "undetermined: []", *(f"  - {line}" for line in lost)]
-    frames = {"base": found.base, **found.frames}
-    lines.append("frames:")
-    for name, frame in frames.items():
-        numbers = (json.dumps(np.asarray(part).tolist()) for part in (frame.position, frame.rotation))
-        position, rotation = numbers
-        parent = json.dumps(frame.parent)
-        lines.append(f"  {json.dumps(name)}: {{parent: {parent}, position: {position}, rotation: {rotation}}}")
+def write_calibration(
+    path: str | os.PathLike[str],
+    converged: bool,
+    numbers: Sequence[tuple[str, float, float, str]],
+    residuals: Sequence[Residuals],
+    undetermined: Sequence[Combination],
+    frames: Mapping[str, FixedFrame],
+) -> None:
+    """Write a calibration as YAML, in SI units.
+
+    Args:
+        path: the file.
+        converged: whether the fit did.
+        numbers: name, change, deviation and unit of each unknown.
+        residuals: of each measurement.
+        undetermined: combinations of unknowns.
+        frames: fixed frames by name.
+    """
+    lines = [f"converged: {json.dumps(converged)}", "unknowns:"]
+    lines += [f"  {json.dumps(n)}: {{change: {_number(v)}, sigma: {_number(s)}, unit: {u}}}" for n, v, s, u in numbers]
+    lines += ["residuals:", *(f"  - {_of_residuals(part)}" for part in residuals)]
+    lines += ["undetermined:" if undetermined else "undetermined: []"]
+    lines += [f"  - {json.dumps({n: round(v, 6) for n, v in one.coefficients.items()})}" for one in undetermined]
+    lines += ["frames:", *(f"  {json.dumps(name)}: {_of_frame(frame)}" for name, frame in frames.items())]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _of_residuals(part: Residuals) -> str:
+    before, after = (_number(np.sqrt(np.square(np.asarray(rows)).mean())) for rows in (part.before, part.after))
+    numbers = f"readings: {len(part.after)}, rms_before: {before}, rms_after: {after}"
+    return f"{{of: {json.dumps(part.kind)}, {numbers}, unit: {json.dumps(part.unit)}}}"
+
+
+def _of_frame(frame: FixedFrame) -> str:
+    position, rotation = (json.dumps(np.asarray(part).tolist()) for part in (frame.position, frame.rotation))
+    return f"{{parent: {json.dumps(frame.parent)}, position: {position}, rotation: {rotation}}}"
 
 
 def _number(value: float) -> str:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import ArrayLike
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
-if TYPE_CHECKING:
-    from ._calibration import Residuals
+from ._residuals import Residuals
 
 _BEFORE, _AFTER, _INK = "#c98b2b", "#2f6fb0", "#2b2f36"
 _OUTLIER = 0.1
@@ -38,6 +37,7 @@ def draw_residuals(parts: Sequence[Residuals]) -> Figure:
         place.set_title(part.kind, color=_INK, fontsize=10, loc="left")
         place.set_ylabel(f"residual [{unit}]", color=_INK)
         place.set_xlabel("reading", color=_INK)
+        place.xaxis.set_major_locator(MaxNLocator(integer=True))
         place.grid(alpha=0.3)
         place.legend(frameon=False, fontsize=9)
     return figure
