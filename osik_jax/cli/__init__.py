@@ -1,5 +1,6 @@
 """The command line."""
 
+from ._calibrate import Calibrate as Calibrate
 from ._demo import Demo as Demo
 from ._ik import Ik as Ik
 from ._info import Info as Info
