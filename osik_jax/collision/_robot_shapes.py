@@ -13,11 +13,13 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._plausible import first_of
+from ..robot._size import robot_size
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
-from ._convex import ConvexShape, bounding_ball, geom_shape, shape_table
+from ._convex import ConvexShape, geom_shape, shape_table
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
-from ._table import RobotShapes, ShapeKind
+from ._spheres import cover
+from ._table import RobotShapes
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None
@@ -73,7 +75,7 @@ def _made(robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | bytes |
     if touching:
         _warn_of_touching([f"{parts[i].name}-{parts[j].name}" for i, j in touching])
     kept = [pair for pair in kept if pair not in set(touching)]
-    own, centers, radii, overshoots = _balls(shapes)
+    owner, balls = cover(shapes, float(robot_size(robot)))
     return RobotShapes(
         names=tuple(part.name for part in parts),
         links=tuple(part.aliases[0] for part in parts),
@@ -81,10 +83,10 @@ def _made(robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | bytes |
         table=shape_table(shapes),
         pairs=np.array(kept, np.int32).reshape(-1, 2),
         world=np.array(moves(robot, parts), bool),
-        sphere_shape=own,
-        sphere_center=centers,
-        sphere_radius=radii,
-        sphere_overshoot=overshoots,
+        sphere_shape=owner,
+        sphere_center=balls.center,
+        sphere_radius=balls.radius,
+        sphere_overshoot=balls.overshoot,
         touching=tuple((parts[i].name, parts[j].name) for i, j in touching),
     )
 
@@ -126,12 +128,3 @@ def _warn_of_touching(pairs: list[str]) -> None:
         f"{first_of(pairs, 8)}. If they are meant to touch, an SRDF or <exclude> says so; otherwise their shapes are "
         "too large"
     )
-
-
-def _balls(shapes: Sequence[ConvexShape]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a ball around each shape: number of the shape, centre, radius, and how far it sticks out at most [m]."""
-    numbers = [k for k, shape in enumerate(shapes) if shape.kind is not ShapeKind.HALF_SPACE]
-    balls = [bounding_ball(shapes[k]) for k in numbers]
-    radii = np.array([radius for _, radius in balls])
-    centers = np.array([center for center, _ in balls]).reshape(-1, 3)
-    return np.array(numbers, np.int32), centers, radii, radii
