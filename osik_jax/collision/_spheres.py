@@ -99,7 +99,8 @@ def cover(shapes: Sequence[ConvexShape], size: float) -> tuple[Int[np.ndarray, "
             return file["shape"], Balls(*(file[name] for name in Balls._fields))
     balls = [covering_balls(shape, LEAST * size) for shape in shapes]
     owner = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(one.radius) for one in balls])
-    together = Balls(*(np.concatenate(column) for column in zip(*balls, strict=True)))
+    center, radius, overshoot = (np.concatenate(column) for column in zip(*balls, strict=True))
+    together = Balls(center, radius, overshoot)
     if path is not None:
         with contextlib.suppress(OSError), whole_file(path) as file:
             np.savez(file, shape=owner, **together._asdict())

@@ -112,7 +112,7 @@ def test_a_shape_is_inside_its_balls_and_they_stick_out_no_farther_than_told(nam
     beyond = (balls.center @ ways.T + balls.radius[:, None] - table_support(table, 0, ways)).max(1)
     assert (beyond <= balls.overshoot + 1e-9).all()
     assert (
-        balls.overshoot - beyond < 0.03 * np.abs(shape.vertices).max(initial=max(size)) + 1e-3
+        balls.overshoot - beyond < 0.05 * np.abs(shape.vertices).max(initial=max(size)) + 1e-3
     ).all()  # a tight bound
     assert len(balls.radius) <= MOST and (len(balls.radius) == 1) == (name == "ball")
     if name == "box":
