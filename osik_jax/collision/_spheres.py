@@ -41,6 +41,9 @@ _VERTICES = 48
 _EXTENT = 0.2
 """Weight of a cell's extent beside its overshoot where a cut is chosen."""
 
+_CELLS, _THIN = 200, 1e-5
+"""Number of cells that a user's balls have to hold, and the radius [m] of the prism along a capsule's axis."""
+
 _STEPS = 40
 """Number of subgradient steps towards a ball's best centre."""
 
@@ -96,8 +99,8 @@ def cover(shapes: Sequence[ConvexShape], size: float) -> tuple[Int[np.ndarray, "
     path = _cache_path(shapes, size)
     if path is not None and path.is_file():
         with contextlib.suppress(OSError, ValueError, KeyError), open_npz(path) as file:
-            return file["shape"], Balls(*(file[name] for name in Balls._fields))
-    balls = [covering_balls(shape, LEAST * size) for shape in shapes]
+            return file["shape"], Balls(file["center"], file["radius"], file["overshoot"])
+    balls = [covering_balls(shape, size) for shape in shapes]
     owner = np.repeat(np.arange(len(shapes), dtype=np.int32), [len(one.radius) for one in balls])
     center, radius, overshoot = (np.concatenate(column) for column in zip(*balls, strict=True))
     together = Balls(center, radius, overshoot)
@@ -116,20 +119,51 @@ def _cache_path(shapes: Sequence[ConvexShape], size: float) -> Path | None:
     return Path(folder) / f"spheres_{digest}.npz" if folder else None
 
 
-def covering_balls(shape: ConvexShape, least: float) -> Balls:
-    """Return balls that contain a shape; none for a half space.
-
-    Args:
-        shape: the shape.
-        least: overshoot that is small enough for a shape of any thickness [m].
-    """
+def covering_balls(shape: ConvexShape, size: float) -> Balls:
+    """Return balls that contain a shape of a robot of some size [m]; none for a half space."""
+    least = LEAST * size
     if shape.kind is ShapeKind.HALF_SPACE:
         return Balls(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     if shape.kind in (ShapeKind.SPHERE, ShapeKind.CAPSULE):
-        found = _along_axis(*shape.size[:2], least)
+        found = _along_axis(float(shape.size[0]), float(shape.size[1]), least)
     else:
         found = _in_cells(_polytope(shape), least)
     return found._replace(center=shape.position + found.center @ shape.rotation.T)
+
+
+def needed_radii(
+    shape: ConvexShape, centers: Float[np.ndarray, "s 3"], radii: Float[np.ndarray, " s"]
+) -> Float[np.ndarray, " s"]:
+    """Return radii [m] with which balls contain a shape: each cell of a partition goes to the ball that grows least.
+
+    A ball without a cell needs 0.
+    """
+    polytope = _polytope(shape)
+    cells = _partition(polytope.corners)
+    own = (centers - shape.position) @ shape.rotation
+    needed = np.array([np.linalg.norm(cell[:, None] - own, axis=2).max(0) for cell in cells]) + polytope.around
+    holder = (needed - radii).argmin(1)
+    return np.array([needed[holder == ball, ball].max(initial=0.0) for ball in range(len(centers))])
+
+
+def overshoots(
+    shape: ConvexShape, centers: Float[np.ndarray, "s 3"], radii: Float[np.ndarray, " s"]
+) -> Float[np.ndarray, " s"]:
+    """Return how far balls with centres inside of a shape stick out of it at most [m]."""
+    polytope = _polytope(shape)
+    depths = (polytope.heights - (centers - shape.position) @ shape.rotation @ polytope.normals.T).min(1)
+    return radii - polytope.around + polytope.excess - depths
+
+
+def _partition(corners: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "n 3"]]:
+    """Return the corners of ``_CELLS`` convex cells of a polytope; the longest one is cut in its middle."""
+    axes = np.linalg.svd(corners - corners.mean(0), full_matrices=False)[2]
+    cells = [corners]
+    for _ in range(_CELLS - 1):
+        extents = [np.ptp(cell @ axes.T, axis=0).max() for cell in cells]
+        longest = cells.pop(int(np.argmax(extents)))
+        cells += _halves(longest, axes[np.ptp(longest @ axes.T, axis=0).argmax()])
+    return cells
 
 
 def _along_axis(radius: float, half_length: float, least: float) -> Balls:
@@ -140,13 +174,17 @@ def _along_axis(radius: float, half_length: float, least: float) -> Balls:
     along = np.linspace(-half_length, half_length, count) if count > 1 else np.zeros(1)
     half_gap = half_length / max(count - 1, 1)
     radii = np.full(count, np.hypot(radius, half_gap))  # two neighbours hold the part of the cylinder between them
-    return Balls(along[:, None] * [0.0, 0.0, 1.0], radii, radii - radius)
+    return Balls(along[:, None] * np.array([0.0, 0.0, 1.0]), radii, radii - radius)
 
 
 def _polytope(shape: ConvexShape) -> _Polytope:
     """Return a polytope around a box or cylinder, or near a hull; in the shape's axes."""
     around, excess = float(shape.size[0]) if shape.kind is ShapeKind.HULL else 0.0, 0.0
-    if shape.kind is ShapeKind.BOX:
+    if shape.kind in (ShapeKind.SPHERE, ShapeKind.CAPSULE):
+        half = float(shape.size[1])  # its axis, as a prism so thin that it has faces
+        points, around = prism() * (_THIN, _THIN, half + _THIN), float(shape.size[0])
+        excess = 2.0 * _THIN
+    elif shape.kind is ShapeKind.BOX:
         points = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(-1, 3) * shape.size
     elif shape.kind is ShapeKind.CYLINDER:
         points = prism() * shape.size[[0, 0, 1]]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from example_files import example_file
+from refusals import refuses
 from robot_support import directions, mesh_vertices, pinocchio_geometry, table_support
 
 import osik_jax as osik
@@ -103,7 +104,7 @@ SHAPES = {
 def test_a_shape_is_inside_its_balls_and_they_stick_out_no_farther_than_told(name: str):
     kind, size, vertices = SHAPES[name]
     shape = ConvexShape(kind, np.array(size, float), np.array([1.0, 2.0, 3.0]), TURN, np.asarray(vertices, float))
-    balls = covering_balls(shape, 1e-3)
+    balls = covering_balls(shape, 1e-3 / LEAST)
     points = inside(shape, 20_000)
     assert uncovered(points, balls.center, balls.radius) < 1e-9
     ways = directions(4000)
@@ -116,7 +117,10 @@ def test_a_shape_is_inside_its_balls_and_they_stick_out_no_farther_than_told(nam
     ).all()  # a tight bound
     assert len(balls.radius) <= MOST and (len(balls.radius) == 1) == (name == "ball")
     if name == "box":
-        assert covering_balls(shape, 0.1).overshoot.max() <= 0.1 and len(covering_balls(shape, 0.1).radius) <= 8
+        assert (
+            covering_balls(shape, 0.1 / LEAST).overshoot.max() <= 0.1
+            and len(covering_balls(shape, 0.1 / LEAST).radius) <= 8
+        )
 
 
 def test_balls_are_kept_in_the_cache_folder(tmp_path, monkeypatch: pytest.MonkeyPatch):
@@ -138,3 +142,72 @@ def test_balls_are_kept_in_the_cache_folder(tmp_path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
     assert np.array_equal(robot_shapes(osik.load_robot("ur5")).sphere_center, first.sphere_center)
     assert first.sphere_overshoot.min() >= 0.0 and robot_size(robot) * LEAST > 0.005
+
+
+def given_for_panda(panda: osik.Robot):
+    """The spheres that this package makes, in the axes of the links."""
+    shapes = robot_shapes(panda)
+    found: dict[str, list] = {}
+    for row, center, radius in zip(shapes.sphere_shape, shapes.sphere_center, shapes.sphere_radius, strict=True):
+        at = panda.frame_names.index(shapes.links[row])
+        turn, place = np.asarray(panda.frame_rotation[at], float), np.asarray(panda.frame_position[at], float)
+        found.setdefault(shapes.links[row], []).append(
+            {"center": ((center - place) @ turn).tolist(), "radius": float(radius)}
+        )
+    return shapes, found
+
+
+def as_collision(ball: dict) -> str:
+    place, radius = " ".join(map(str, ball["center"])), ball["radius"]
+    return f'<collision><origin xyz="{place}"/><geometry><sphere radius="{radius}"/></geometry></collision>'
+
+
+def test_given_spheres_cover_after_they_are_grown(tmp_path):
+    """Those of cuRobo's files, of spherized URDFs and of dictionaries."""
+    panda = osik.load_robot("panda")
+    own, given = given_for_panda(panda)
+    smaller = {link: [{**one, "radius": 0.8 * one["radius"]} for one in some] for link, some in given.items()}
+    del smaller["panda_link3"]
+    with pytest.warns(osik.OsikWarning) as told:
+        found = robot_shapes(panda, spheres=smaller)
+    texts = [str(one.message) for one in told]
+    assert any("leave surface uncovered, so they are grown: panda_link0 by" in text for text in texts)
+    assert any("shapes without a given sphere get spheres of their own: panda_link3" in text for text in texts)
+    for row in range(len(found.names)):
+        count, first = found.table.count[row], found.table.first[row]
+        if count:
+            hull = found.table.vertices[first : first + count]
+            points = np.concatenate([hull, np.random.default_rng(0).dirichlet(0.1 * np.ones(count), 5000) @ hull])
+            points = points @ found.table.rotation[row].T + found.table.position[row]
+            assert uncovered(points, *balls_of(found, row)) < 1e-9
+    ways = directions(2000)
+    for k, row in enumerate(found.sphere_shape):
+        beyond = (ways @ found.sphere_center[k] + found.sphere_radius[k] - table_support(found.table, row, ways)).max()
+        assert beyond <= found.sphere_overshoot[k] + 1e-9
+    text = "".join(f'<link name="{link}">{"".join(map(as_collision, some))}</link>' for link, some in given.items())
+    joints = "".join(
+        f'<joint name="{link}" type="fixed"><parent link="panda_link0"/><child link="{link}"/></joint>'
+        for link in given
+        if link != "panda_link0"
+    )
+    (tmp_path / "balls.urdf").write_text(f'<robot name="r">{text}{joints}</robot>')
+    yaml = {"robot_cfg": {"kinematics": {"collision_spheres": "spheres.yml"}}}
+    (tmp_path / "robot.yml").write_text(str(yaml))
+    (tmp_path / "spheres.yml").write_text(str({"collision_spheres": given}))
+    for name in ("balls.urdf", "robot.yml"):
+        read = robot_shapes(panda, spheres=tmp_path / name)
+        assert len(read.sphere_radius) == len(own.sphere_radius)
+        assert robot_shapes(panda, spheres=tmp_path / name) is read
+
+
+def test_spheres_that_are_none_are_refused(tmp_path):
+    panda = osik.load_robot("panda")
+    refuses(TypeError, r"spheres is float; it is a path, or \{link", robot_shapes, panda, spheres=1.0)
+    refuses(KeyError, "no link with a collision shape 'hand'", robot_shapes, panda, spheres={"hand": []})
+    wrong = {"panda_hand": [{"radius": 1.0}]}
+    refuses(ValueError, "the spheres of 'panda_hand' are not", robot_shapes, panda, spheres=wrong)
+    refuses(FileNotFoundError, "lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
+    (tmp_path / "a.yml").write_text("joints: 3")
+    refuses(ValueError, "it has no collision_spheres", robot_shapes, panda, spheres=tmp_path / "a.yml")
+    urdf = example_file("panda_description/urdf/panda.urdf")
+    refuses(ValueError, "none of the collision shapes is a sphere", robot_shapes, panda, spheres=urdf)
