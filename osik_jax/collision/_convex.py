@@ -13,8 +13,7 @@ from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot.loading._meshes import unread_points
 from ..robot.loading._urdf_meshes import thickened
-from ._geometry import Kind, qhull, round_polyhedron
-from ._shape import CollisionShape
+from ._geometry import qhull, round_polyhedron
 from ._table import ShapeKind, ShapeTable
 
 NO_VERTICES = np.zeros((0, 3))
@@ -89,17 +88,6 @@ def model_shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Convex
     if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
         return _simple(int(model.geom_type[geom]), model.geom_size[geom].copy(), position, rotation)
     return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, hull_vertices(_model_points(model, geom)))
-
-
-def added_shape(shape: CollisionShape) -> ConvexShape:
-    """Return a user's shape in its frame; its numbers are concrete."""
-    size, position, rotation = (np.asarray(part, float) for part in (shape.size, shape.position, shape.rotation))
-    if shape.hull is not None:
-        radius = np.array([float(shape.hull.radius) * abs(size).max(), 0.0, 0.0])
-        return ConvexShape(ShapeKind.HULL, radius, position, rotation, np.asarray(shape.hull.vertices, float) * size)
-    kinds = {Kind.BOX: ShapeKind.BOX, Kind.CYLINDER: ShapeKind.CYLINDER, Kind.PLANE: ShapeKind.HALF_SPACE}
-    round_kind = ShapeKind.CAPSULE if size[1] > 0.0 else ShapeKind.SPHERE
-    return ConvexShape(kinds.get(shape.kind, round_kind), size, position, rotation)
 
 
 def _simple(

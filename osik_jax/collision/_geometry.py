@@ -91,7 +91,7 @@ def unit_core(kind: Kind) -> UnitCore:
     if kind is Kind.BOX:
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(-1, 3)
         return UnitCore(corners, np.eye(3), np.eye(3))
-    return convex_hull(_prism() if kind is Kind.CYLINDER else round_polyhedron(1))
+    return convex_hull(prism() if kind is Kind.CYLINDER else round_polyhedron(1))
 
 
 def convex_hull(points: np.ndarray) -> UnitCore:
@@ -109,8 +109,8 @@ def convex_hull(points: np.ndarray) -> UnitCore:
     outermost = hull.points[hull.vertices]
     radius = 0.0
     if len(outermost) > MOST_VERTICES:
-        hull = _thinned(outermost)
-        radius = _reach_outside(outermost, hull)
+        hull = thinned(outermost, MOST_VERTICES)
+        radius = reach_outside(outermost, hull)
     faces, normals = hull.simplices, hull.equations[:, :3]
     ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     normals_of_edges = np.tile(np.arange(len(faces)), 3)
@@ -144,17 +144,17 @@ def qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
         raise OsikValueError(f"these {len(points)} points have no convex hull: {str(error).splitlines()[0]}") from None
 
 
-def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
-    """Return the hull of ``MOST_VERTICES`` of these vertices, chosen so that the others are only slightly outside."""
+def thinned(points: np.ndarray, most: int) -> scipy.spatial.ConvexHull:
+    """Return the hull of ``most`` of these vertices, chosen so that the others are only slightly outside."""
     chosen = scipy.spatial.ConvexHull(points, qhull_options=f"TA{_FIRST_VERTICES}").vertices
     hull = qhull(points[chosen])
-    while len(chosen) < MOST_VERTICES:
+    while len(chosen) < most:
         outside = points @ hull.equations[:, :3].T + hull.equations[:, 3]
         furthest = np.argmax(outside, 0)  # of each face
         order = np.argsort(-outside[furthest, np.arange(len(furthest))])
         new = dict.fromkeys(furthest[order].tolist())
         new = [point for point in new if point not in set(chosen.tolist())]
-        room = min(_VERTICES_A_ROUND, MOST_VERTICES - len(chosen))
+        room = min(_VERTICES_A_ROUND, most - len(chosen))
         if not new:
             break
         chosen = np.concatenate([chosen, new[:room]])
@@ -162,7 +162,7 @@ def _thinned(points: np.ndarray) -> scipy.spatial.ConvexHull:
     return hull
 
 
-def _reach_outside(points: np.ndarray, hull: scipy.spatial.ConvexHull) -> float:
+def reach_outside(points: np.ndarray, hull: scipy.spatial.ConvexHull) -> float:
     """Return the largest distance of a point to the hull [m].
 
     The face whose plane a point is furthest above need not be the nearest one: triangles of a flat side share a plane.
@@ -236,7 +236,7 @@ def unit_rows(rows: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
     return jnp.where(is_zero, 0.0, rows / jnp.sqrt(jnp.where(is_zero, 1.0, square)))
 
 
-def _prism() -> np.ndarray:
+def prism() -> np.ndarray:
     """Return a prism around the cylinder of radius 1 between z = -1 and 1."""
     angle = 2.0 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
     ring = np.stack([np.cos(angle), np.sin(angle)], -1) / np.cos(np.pi / CYLINDER_SIDES)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int
 
-from .._errors import OsikValueError, warn
+from .._errors import OsikTypeError, OsikValueError, warn
+from ..robot.loading._meshes import joined, read_mesh
+from ..robot.loading._packages import Packages
 from ._convex import hull_vertices
 from ._geometry import qhull
 
@@ -14,6 +19,23 @@ _CONVEX = 0.99
 
 _CONCAVITY = 0.02
 """Concavity that CoACD leaves in a part, relative to the size of the mesh."""
+
+
+def triangles(source: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices [m] and faces of a mesh file, or of a pair of arrays.
+
+    Raises:
+        TypeError: neither a path nor a pair.
+        ValueError: the file cannot be read, or the arrays have the wrong shape.
+    """
+    if isinstance(source, str | os.PathLike):
+        return joined(read_mesh(Packages().path(source)))
+    if not isinstance(source, tuple | list) or len(source) != 2:
+        raise OsikTypeError(f"a mesh is a path, or vertices (n, 3) and faces (m, 3); got {type(source).__name__}")
+    vertices, faces = np.asarray(source[0], float), np.asarray(source[1], int)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise OsikValueError(f"the vertices of a mesh have shape {vertices.shape}, expected (n, 3)")
+    return vertices, faces
 
 
 def convex_parts(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]) -> list[Float[np.ndarray, "v 3"]]:

@@ -13,18 +13,23 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._plausible import first_of
+from ..robot._size import robot_size
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
-from ._convex import ConvexShape, bounding_ball, geom_shape, shape_table
+from ._convex import ConvexShape, geom_shape, shape_table
+from ._given_spheres import Spheres, cover_by_given, read_spheres
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
-from ._table import RobotShapes, ShapeKind
+from ._spheres import cover
+from ._table import RobotShapes
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None
 """An SRDF: its path, text or content; ``True``: the file beside the URDF; ``None``: no SRDF."""
 
 
-def robot_shapes(robot: Robot, srdf: Given = None, spheres: Any = None) -> RobotShapes:
+def robot_shapes(
+    robot: Robot, srdf: Given = None, spheres: Spheres | str | os.PathLike[str] | None = None
+) -> RobotShapes:
     """Return the collision shapes of a robot, the spheres that cover them, and the pairs that are kept apart.
 
     Shapes are the robot's geoms that collide (``contype`` and ``conaffinity``): all collision shapes of a URDF. Meshes
@@ -37,30 +42,42 @@ def robot_shapes(robot: Robot, srdf: Given = None, spheres: Any = None) -> Robot
     Args:
         robot: the robot.
         srdf: see ``Given``. Its authors allow what they hold for impossible, so no SRDF is read unless one is named.
-        spheres: the user's own spheres instead of those that are made here.
+        spheres: the user's own spheres instead of those that are made here: a ``.yaml`` of cuRobo, a URDF whose
+            collision shapes are spheres, or ``{link: [{"center": (x, y, z), "radius": r}]}`` in the links' axes [m].
+            Where they leave surface uncovered they are grown.
 
     Raises:
         FileNotFoundError: no such file; a mesh is not found.
+        KeyError: spheres of a link without collision shapes.
         TypeError: the robot is traced.
         ValueError: nothing of the robot collides, a mesh cannot be read, or a geom has no distance.
 
     Warns:
-        OsikWarning: pairs touch in every configuration, or the SRDF names links that the robot lacks.
+        OsikWarning: pairs touch in every configuration, the SRDF names links that the robot lacks, or given spheres
+            were grown.
     """
     if is_traced(robot):
         raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)
-    if srdf is None or isinstance(srdf, Srdf):
-        return _made(robot, srdf, spheres)
-    source = read_source(srdf, "SRDF")
-    return _made(robot, None, spheres, srdf=source.content)
+    rules, texts = (srdf, {}) if srdf is None or isinstance(srdf, Srdf) else (None, {"srdf": _content(srdf)})
+    if isinstance(spheres, str | os.PathLike):
+        changed = os.stat(spheres).st_mtime_ns
+        return _made(robot, rules, None, file=(os.fspath(spheres), changed), **texts)
+    return _made(robot, rules, spheres, **texts)
+
+
+def _content(srdf: str | os.PathLike[str]) -> str:
+    content = read_source(srdf, "SRDF").content
+    return content if isinstance(content, str) else content.decode("utf-8", "replace")
 
 
 @remembered
-def _made(robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | bytes | None = None) -> RobotShapes:
-    if srdf is not None:
-        rules = read_srdf(srdf if isinstance(srdf, str) else srdf.decode("utf-8", "replace"))
+def _made(
+    robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | None = None, file: tuple[str, int] | None = None
+) -> RobotShapes:
+    rules = rules if srdf is None else read_srdf(srdf)
+    spheres = spheres if file is None else read_spheres(file[0])
     found = members(robot, {})
     solid = [k for k, member in enumerate(found) if member.solid]
     parts = [found[k] for k in solid]
@@ -73,18 +90,19 @@ def _made(robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | bytes |
     if touching:
         _warn_of_touching([f"{parts[i].name}-{parts[j].name}" for i, j in touching])
     kept = [pair for pair in kept if pair not in set(touching)]
-    own, centers, radii, overshoots = _balls(shapes)
+    links, size = tuple(part.aliases[0] for part in parts), float(robot_size(robot))
+    owner, balls = cover(shapes, size) if spheres is None else cover_by_given(robot, spheres, links, shapes, size)
     return RobotShapes(
         names=tuple(part.name for part in parts),
-        links=tuple(part.aliases[0] for part in parts),
+        links=links,
         bodies=np.array([part.body for part in parts], np.int32),
         table=shape_table(shapes),
         pairs=np.array(kept, np.int32).reshape(-1, 2),
         world=np.array(moves(robot, parts), bool),
-        sphere_shape=own,
-        sphere_center=centers,
-        sphere_radius=radii,
-        sphere_overshoot=overshoots,
+        sphere_shape=owner,
+        sphere_center=balls.center,
+        sphere_radius=balls.radius,
+        sphere_overshoot=balls.overshoot,
         touching=tuple((parts[i].name, parts[j].name) for i, j in touching),
     )
 
@@ -126,12 +144,3 @@ def _warn_of_touching(pairs: list[str]) -> None:
         f"{first_of(pairs, 8)}. If they are meant to touch, an SRDF or <exclude> says so; otherwise their shapes are "
         "too large"
     )
-
-
-def _balls(shapes: Sequence[ConvexShape]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return a ball around each shape: number of the shape, centre, radius, and how far it sticks out at most [m]."""
-    numbers = [k for k, shape in enumerate(shapes) if shape.kind is not ShapeKind.HALF_SPACE]
-    balls = [bounding_ball(shapes[k]) for k in numbers]
-    radii = np.array([radius for _, radius in balls])
-    centers = np.array([center for center, _ in balls]).reshape(-1, 3)
-    return np.array(numbers, np.int32), centers, radii, radii

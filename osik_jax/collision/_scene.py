@@ -21,10 +21,11 @@ from ..kinematics._rigid import compose, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
-from ._convex import ConvexShape, added_shape, shape_table
+from ._convex import ConvexShape, shape_table
+from ._geometry import Kind
 from ._pairs import members
 from ._shape import CollisionShape
-from ._table import RobotShapes, ShapeTable
+from ._table import RobotShapes, ShapeKind, ShapeTable
 
 _Shape = CollisionShape | ConvexShape
 
@@ -346,11 +347,22 @@ def _convex_shapes(name: str, given: Any) -> list[ConvexShape]:
                 raise OsikTypeError(f"{name!r} is traced: make the scene outside of jit, and move the shape in there")
             if part.frame is not None:
                 raise OsikValueError(f"{name!r} is in the frame {part.frame!r}; make it in the world, then attach it")
-            part = added_shape(part)
+            part = _added_shape(part)
         if not all(np.isfinite(numbers).all() for numbers in part[1:]):
             raise OsikValueError(f"{name!r} has numbers that are not finite")
         made.append(part)
     return made
+
+
+def _added_shape(shape: CollisionShape) -> ConvexShape:
+    """Return a user's shape in its frame; its numbers are concrete."""
+    size, position, rotation = (np.asarray(part, float) for part in (shape.size, shape.position, shape.rotation))
+    if shape.hull is not None:
+        radius = np.array([float(shape.hull.radius) * abs(size).max(), 0.0, 0.0])
+        return ConvexShape(ShapeKind.HULL, radius, position, rotation, np.asarray(shape.hull.vertices, float) * size)
+    kinds = {Kind.BOX: ShapeKind.BOX, Kind.CYLINDER: ShapeKind.CYLINDER, Kind.PLANE: ShapeKind.HALF_SPACE}
+    round_kind = ShapeKind.CAPSULE if size[1] > 0.0 else ShapeKind.SPHERE
+    return ConvexShape(kinds.get(shape.kind, round_kind), size, position, rotation)
 
 
 def _room(argument: str, what: str, given: int | None, count: int) -> int:

@@ -10,14 +10,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikValueError
 from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import as_floats, concrete
 from ..numerics._host import Numbers, is_traced, module_of, tree_to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
-from ..robot.loading._meshes import joined, read_mesh
-from ..robot.loading._packages import Packages
 from ._geometry import Kind, UnitCore, convex_hull
+from ._mesh_parts import convex_parts, triangles
 
 
 class CollisionShape(eqx.Module):
@@ -174,28 +173,9 @@ class CollisionShape(eqx.Module):
         Warns:
             OsikWarning: the mesh is not convex, and its hull is taken.
         """
-        from ._mesh_parts import convex_parts  # which makes shapes for the core of what is here
-
         vertices, faces = triangles(source)
         parts = convex_parts(vertices * scale, faces)
         return tuple(cls.convex(part, position, rotation, frame=frame) for part in parts)
-
-
-def triangles(source: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices [m] and faces of a mesh file, or of a pair of arrays.
-
-    Raises:
-        TypeError: neither a path nor a pair.
-        ValueError: the file cannot be read, or the arrays have the wrong shape.
-    """
-    if isinstance(source, str | os.PathLike):
-        return joined(read_mesh(Packages().path(source)))
-    if not isinstance(source, tuple | list) or len(source) != 2:
-        raise OsikTypeError(f"a mesh is a path, or vertices (n, 3) and faces (m, 3); got {type(source).__name__}")
-    vertices, faces = np.asarray(source[0], float), np.asarray(source[1], int)
-    if vertices.ndim != 2 or vertices.shape[1] != 3:
-        raise OsikValueError(f"the vertices of a mesh have shape {vertices.shape}, expected (n, 3)")
-    return vertices, faces
 
 
 def _along(radius: Any, start: Any, end: Any, what: str) -> tuple[Numbers, Numbers, Numbers]:

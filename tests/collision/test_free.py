@@ -44,6 +44,7 @@ def shelf(rng: np.random.Generator) -> tuple[osik.Scene, np.ndarray, np.ndarray]
         name: osik.CollisionShape.box(np.array(size) / 2, at + turn @ place, turn)
         for name, (size, place) in parts.items()
     }
+    shapes["lamp"] = board([1, 1, 0.02], [0.2, 0, 0.6])  # an elbow that is up touches it
     foot = at + turn @ [0, rng.uniform(-0.15, 0.15), 0.015]
     shapes["can"] = osik.CollisionShape.cylinder(0.03, foot, foot + 0.14 * UP)
     grip = turn @ np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # the fingers open along the shelf, and point into it

@@ -360,7 +360,7 @@ def test_scenes_of_moveit(tmp_path: Path, panda):
     excess = found["shelf:2"] - (2.0 * ways[:, 2] + np.maximum(0.2 * ways[:, 2], round_part))
     assert excess.min() > -1e-6 and excess.max() < 0.005 * 0.1
     np.testing.assert_allclose(scene.table.position[4], [0, 0, -0.5], atol=1e-7)
-    corners = np.eye(4, 3) + [5, 0, 0]
+    corners = np.eye(4, 3) + np.array([5, 0, 0])
     np.testing.assert_allclose(found["tent"], (ways @ corners.T).max(1), atol=1e-6)
     assert scene.partners == ("hand",) and np.flatnonzero(scene.contact[:, 0]).tolist() == [0]
     same = osik.Scene.from_file(written(tmp_path, "a.scene", TEXT))

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import osik_jax as osik
+
 FOLDER = Path(__file__).parents[2] / "examples"
 GALLERY = FOLDER.parent / "docs" / "gallery.md"
 Names = dict[str, Any]
@@ -103,6 +105,12 @@ def ur5_keeps_off_a_post(names: Names) -> None:
     assert names["left"] < 5e-3
 
 
+def collision_free(names: Names) -> None:
+    free = names["free"]
+    assert 10 < free.sum() < 40
+    assert osik.is_free(names["robot"], names["found"].q[free], names["scene"], srdf=True).all()
+
+
 def panda_thousand_targets(names: Names) -> None:
     found = names["found"]
     assert found.converged.sum() > 700
@@ -130,7 +138,7 @@ def carry_a_box(names: Names) -> None:
 CHECKS: list[Callable[[Names], None]] = [
     ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
     g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person, carry_a_box,
+    retarget_a_person, carry_a_box, collision_free,
 ]  # fmt: skip
 
 
