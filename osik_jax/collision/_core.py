@@ -73,7 +73,7 @@ def core_robot(
     tree, table = robot.tree, shapes.table
     first, vertices = _packed_vertices(table)
     count = np.where(first >= 0, -(-np.asarray(table.count) // _PACK) * _PACK, 0)
-    moves = _moves(tree, range(tree.nq) if entries is None else entries, posed)
+    moves, groups = _moves(tree, range(tree.nq) if entries is None else entries, posed)
     index, factor = tree.qpos_source
     sizes = [len(tree.body_parents), len(tree.joint_types), len(tree.dof_joint), len(index)]
     sizes += [len(shapes.names), len(shapes.pairs), len(vertices) // 3]
@@ -81,6 +81,7 @@ def core_robot(
         sizes,
         tree_integers(tree)[1:],
         moves,
+        groups,
         table.kind,
         shapes.bodies,
         np.maximum(first, 0),
@@ -137,15 +138,21 @@ def _bounds(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
     return centers, radii
 
 
-def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]) -> np.ndarray:
-    """Return for each body 0 if no search moves it, 2 + f if it goes along with posed frame f, else 1."""
+def _moves(
+    tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return for each body 0 if no search moves it, 2 + f if it goes along with posed frame f, else 1; and its group.
+
+    No search moves bodies of one group relative to each other; group 0 stands still.
+    """
     (index, factor), starts = tree.qpos_source, tree.full_qpos_address
     own = np.zeros(len(tree.body_parents), bool)
     for joint, body in enumerate(tree.joint_bodies):
         own[body] |= bool(factor[starts[joint]]) and int(index[starts[joint]]) in entries
-    moves = np.zeros(len(own), int)
+    groups = np.zeros(len(own), int)
     for body in range(1, len(own)):
-        moves[body] = own[body] or moves[tree.body_parents[body]] > 0
+        groups[body] = body if own[body] else groups[tree.body_parents[body]]
+    moves = np.minimum(groups, 1)
     for f, name in enumerate(posed):
         if name is None:
             continue
@@ -154,7 +161,7 @@ def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | No
             if not own[body] and tree.body_parents[body] in carried:
                 carried.add(body)
         moves[[body for body in carried if moves[body]]] = 2 + f
-    return moves
+    return moves, groups
 
 
 def check_scene(scene: Any) -> None:

@@ -17,7 +17,8 @@ template <class Real> struct ShapedRobot {
   using In = const Real*;
   int bodies, joints, dofs, full, shapes, pairs, vertices;
   const int *parents, *types, *owners, *source;          // [bodies], [joints] twice, [full]
-  const int *moves, *kind, *body, *first, *count, *world;  // [bodies] whether the search moves it; [shapes] five times
+  const int *moves, *group;                              // [bodies] whether the search moves it; its rigid group, 0 if not
+  const int *kind, *body, *first, *count, *world;        // [shapes] each
   const int* pair;                                       // [pairs, 2]
   In factor, offset, reference, position, quaternion, joint_position, joint_axis;
   In size, place, turn, center, bound, points;           // [shapes, 3] twice, [shapes, 9], centre [shapes, 3] and radius of
@@ -27,7 +28,7 @@ template <class Real> struct ShapedRobot {
     bodies = *i.take(1), joints = *i.take(1), dofs = *i.take(1), full = *i.take(1);
     shapes = *i.take(1), pairs = *i.take(1), vertices = *i.take(1);
     parents = i.take(bodies), types = i.take(joints), owners = i.take(joints), source = i.take(full);
-    moves = i.take(bodies), kind = i.take(shapes), body = i.take(shapes), first = i.take(shapes), count = i.take(shapes);
+    moves = i.take(bodies), group = i.take(bodies), kind = i.take(shapes), body = i.take(shapes), first = i.take(shapes), count = i.take(shapes);
     world = i.take(shapes), pair = i.take(2 * pairs);
     Reader<In> r{numbers};
     factor = r.take(full), offset = r.take(full), reference = r.take(full), position = r.take(3 * bodies);
@@ -74,7 +75,7 @@ template <class Real> class Collision {
   List bound;
   std::vector<int> carrier;                // body of each shape
   std::vector<Pair> pairs;                 // those that are kept apart
-  int fixed = 0;                           // the first ones, which no search moves
+  int fixed = 0;                           // the first ones, whose distance no search changes
 
  public:
   struct Nearest {
@@ -104,10 +105,11 @@ template <class Real> class Collision {
       for (int s = 0; s < scene.rows && scene.body[r] >= 0; ++s)
         if (scene.body[s] < 0 && !scene.among[r * scene.rows + s]) add_pair(robot.shapes + r, robot.shapes + s);
     }
-    auto is_fixed = [&](Pair p) { return !(moves(p.i) || moves(p.j)); };
+    auto is_fixed = [&](Pair p) { return group(p.i) == group(p.j); };
     fixed = int(std::stable_partition(pairs.begin(), pairs.end(), is_fixed) - pairs.begin());
   }
   int moves(int shape) const { return carrier[shape] < 0 ? 0 : robot.moves[carrier[shape]]; }
+  int group(int shape) const { return carrier[shape] < 0 ? 0 : robot.group[carrier[shape]]; }
 
   // Place the shapes at a configuration [nq].
   void place(const Real* q) {
@@ -122,7 +124,7 @@ template <class Real> class Collision {
       center[k] = turn * local_center[k] + at;
     }
   }
-  // The first pair nearer than `least`, among those that a search moves or those that it does not; or none.
+  // The first pair nearer than `least`, among those whose distance a search changes or the fixed ones; or none.
   Nearest nearer(Real least, bool is_moving) {
     const int start = is_moving ? fixed : 0, end = is_moving ? int(pairs.size()) : fixed;
     for (int k = start; k < end; ++k) {

@@ -35,7 +35,7 @@ class Freedom {
 
   explicit Freedom(const ShapedRobot<double>& robot) : collision(robot), robot(robot) {}
 
-  // Take a target's scene; false if shapes touch that no joint of the search moves.
+  // Take a target's scene; false if shapes touch that no joint of the search parts.
   bool begin(const xla::Call& call, int target, const double* home) {
     const int own = call.size(7, 0) > 1 ? target : 0;
     if (own != row) collision.set(scene_of(call, 7, robot.shapes, target)), row = own;

@@ -239,6 +239,15 @@ def test_overlap_of_parts_that_no_joint_of_the_frames_moves():
     assert "crate overlap by" in found.explain() and "where q0 puts them" in found.explain()
 
 
+def test_overlap_of_closed_fingers_is_told_at_once(problems):
+    """The frame carries both, so that the search moves them, but not apart."""
+    robot, (scene, place, turn) = osik.load_robot("panda"), problems[0]
+    found = osik.inverse_kinematics(robot, {"panda_hand": (place, turn)}, scene=scene)
+    assert found.obstruction == 1 and found.steps == 0 and "leftfinger" in found.explain()
+    allowed = osik.inverse_kinematics(robot, {"panda_hand": (place + [0.0, 0.0, 0.4], turn)}, scene=scene, srdf=True)
+    assert allowed.obstruction != 1
+
+
 def test_held_objects_are_kept_off_the_scene(panda):
     home = osik.inverse_kinematics(panda, {"panda_hand": (np.array([0.5, 0.0, 0.5]), DOWN)}, scene=osik.Scene())
     start = np.asarray(home.q)
