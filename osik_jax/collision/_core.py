@@ -138,9 +138,7 @@ def _bounds(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
     return centers, radii
 
 
-def _moves(
-    tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]
-) -> tuple[np.ndarray, np.ndarray]:
+def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]) -> tuple[np.ndarray, np.ndarray]:
     """Return for each body 0 if no search moves it, 2 + f if it goes along with posed frame f, else 1; and its group.
 
     No search moves bodies of one group relative to each other; group 0 stands still.

@@ -119,8 +119,8 @@ def _obstruction(reason: int, one: str, other: str, gap: float) -> str:
     """Return why no configuration is free; ``reason``: of ``InverseKinematicsSolution.obstruction``."""
     how = f"{one} and {other} overlap by {-gap:.3g} m" if gap < 0.0 else f"{one} and {other} are {gap:.3g} m apart"
     return {
-        1: f"{how} where q0 puts them, and no joint of these frames moves them apart: change q0 or the scene, or give an "
-        "srdf= that allows the pair",
+        1: f"{how} where q0 puts them, and no joint of these frames moves them apart: change q0 or the scene, or allow "
+        "the pair by srdf=",
         2: f"{how} wherever the target is met: an obstacle stands around the target, so no configuration is free",
         3: f"something is in the way in every solution found; in the best one {how}",
     }[reason]

@@ -244,7 +244,9 @@ def test_overlap_of_closed_fingers_is_told_at_once(problems):
     robot, (scene, place, turn) = osik.load_robot("panda"), problems[0]
     found = osik.inverse_kinematics(robot, {"panda_hand": (place, turn)}, scene=scene)
     assert found.obstruction == 1 and found.steps == 0 and "leftfinger" in found.explain()
-    allowed = osik.inverse_kinematics(robot, {"panda_hand": (place + [0.0, 0.0, 0.4], turn)}, scene=scene, srdf=True)
+    allowed = osik.inverse_kinematics(
+        robot, {"panda_hand": (place + np.array([0.0, 0.0, 0.4]), turn)}, scene=scene, srdf=True
+    )
     assert allowed.obstruction != 1
 
 
