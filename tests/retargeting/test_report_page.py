@@ -3,11 +3,13 @@
 import csv
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from motion_files import dancer, sliding, write_bvh
+from playwright.sync_api import sync_playwright
 
 import osik_jax as osik
 from osik_jax.cli._retarget import Retarget
@@ -128,3 +130,26 @@ def test_a_folder_has_a_page_per_clip_and_an_index_with_links(tmp_path: Path, ca
     kept = (out / "dance <1>" / "report.json").stat().st_mtime_ns
     assert run() == 1 and page.exists() and (out / "dance <1>" / "report.json").stat().st_mtime_ns == kept
     capsys.readouterr()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 390])
+def test_pages_fit_a_desk_and_a_phone(written: Path, width: int, tmp_path: Path) -> None:
+    """In a browser, with long notes: nothing is wider than the window, and the scene of a clip is no strip."""
+    (tmp_path / "clips").mkdir()
+    shutil.copy(written.parent / "dance <1>.bvh", tmp_path / "clips")
+    out = tmp_path / "out"
+    assert Retarget(clip=str(tmp_path / "clips"), robot="nao", out=out, animation=False).run() == 0
+    noted = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    noted["notes"] = {"dance <1>": ["feet slip by 20 mm, " * 40, "a_name_without_spaces_" * 20]}
+    write_index(noted, out / "index.html")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport={"width": width, "height": 800})
+        for path in (out / "index.html", written / "report.html"):
+            page.goto(path.as_uri())
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+        root = page.evaluate("['#root', '#osik'].map(name => document.querySelector(name).getBoundingClientRect())")
+        scene, figures = root
+        assert scene["width"] >= min(width, 900) and scene["height"] >= 250 and figures["width"] >= 340
+        browser.close()
