@@ -71,7 +71,7 @@ def shared_length(clip: Clip) -> int:
 
 def even(count: int, most: int) -> int:
     """Return the largest chunk size up to ``most`` for which ``count`` items split into nearly equal chunks."""
-    return -(-count // -(-count // most)) if most > 0 else most
+    return -(-count // -(-count // most))
 
 
 _Lane = tuple[Goals, Array, Bounds, Array]

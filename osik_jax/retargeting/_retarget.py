@@ -15,8 +15,8 @@ import numpy as np
 from .._errors import OsikValueError, warn
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
+from ..numerics._arguments import check_count
 from ..robot import Robot
-from ..scaling import run_in_chunks
 from ..scaling._progress import reported
 from ._body import measured
 from ._guess import describe_profile
@@ -134,6 +134,7 @@ class Retargeter(OnRobot):
         Raises:
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
+        check_count("chunk", chunk)
         if any(self._for(motion) is not self for motion in motions):
             return self._from_sources(motions, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
@@ -149,18 +150,14 @@ class Retargeter(OnRobot):
         for i, clip in enumerate(clips):
             groups.setdefault((shared_length(clip), clip.touching), []).append(i)
         found: dict[int, Retargeted] = {}
-        for (length, touching), members in sorted(groups.items()):
-            lanes = [as_lane(clips[i], length) for i in members]
-            results = run_in_chunks(
-                solve_side_by_side,
-                jax.tree.map(lambda *leaves: np.stack(leaves), *lanes),
-                chunk=even(len(members), chunk),
-                shared=self._shared(touching),
-                progress=progress,
-                unit="clips",
-            )
-            for lane, i in enumerate(members):
-                found[i] = self._finished(clips[i], jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
+        with reported(len(clips), 0, progress, "clips") as advance:
+            for (length, _), members in sorted(groups.items()):
+                size = even(len(members), chunk)
+                for first in range(0, len(members), size):
+                    some = members[first : first + size]
+                    made = self._solved([clips[i] for i in some], length, size)
+                    found |= {i: record() for i, record in zip(some, made, strict=True)}
+                    advance(len(some))
         return [found[i] for i in range(len(clips))]
 
     def _from_sources(self, motions: Sequence[Source], **options: Any) -> list[Retargeted]:

@@ -269,6 +269,8 @@ def test_many_clips_give_what_each_gives_alone(nao, dance, danced, monkeypatch):
         assert (one.iterations, one.cost) == (other.iterations, other.cost)
     filled_up = own._solved([own._prepared(short, None, None)], 32, 2)[0]()
     np.testing.assert_allclose(filled_up.q, together[1].q, atol=1e-12)
+    with pytest.raises(ValueError, match="chunk is 0"):
+        own.retarget_all([motion], chunk=0, progress=False)
     with pytest.raises(ValueError, match="short: .*it takes three"):
         own.retarget_all([motion, dataclasses.replace(short, positions=short.positions[:2])], progress=False)
 
@@ -282,7 +284,7 @@ from osik_jax.retargeting import Retargeter, _lanes, _retarget, load_motion
 motion, own = load_motion(sys.argv[1]), Retargeter(osik.load_robot("nao"), max_iterations=3)
 motions = [motion, dataclasses.replace(motion, positions=motion.positions[::-1], rotations=None), motion]
 alone = [own.retarget(clip) for clip in motions]
-_lanes.one_a_core = _retarget.one_a_core = lambda: False  # as where there are GPUs
+_lanes.cpu_is_default = _retarget.cpu_is_default = lambda: False  # as where there are GPUs
 over = []
 solve = _lanes._over_devices(5)
 _lanes._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
