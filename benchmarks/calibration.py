@@ -110,6 +110,7 @@ STUDIES = {
             cal.Unknown("frame_rotation", "table", axes="xy"),
         ),
         {"post": cal.FixedFrame(position=(0.35, 0.2, 0.1)), "table": cal.FixedFrame(position=(0.0, 0.0, -0.02))},
+        readings=80,
     ),
     "G1's arm, points: offsets, base": Study(
         _g1,

@@ -14,7 +14,7 @@ from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ._calibration import Calibration
-from ._fit import LOSSES, Fit, Rows, fit, is_negligible, normal_matrix
+from ._fit import LEAST_SCALE, LOSSES, Fit, Loss, Rows, fit, is_negligible, normal_matrix
 from ._measurements import Measurement, check_measurements
 from ._setup import FixedFrame, Setup, make_setup
 from ._unknowns import Parameter, Unknown, apply, parameters_of, unit_of
@@ -65,7 +65,7 @@ def calibrate(
         loss: ``"squared"``; with outliers ``"huber"``, ``"cauchy"`` or ``"geman_mcclure"`` (the strongest), which weigh
             readings by their distance in units of the noise, whose scale comes from the median of their lengths.
         noise: ``"given"``: deviations follow from sigma. ``"estimated"``: from sigma times the size of the residuals,
-            for each measurement. With a robust loss always estimated.
+            for each measurement. With a robust loss always estimated, from a scale of at least sigma if that is given.
         rank_tolerance: singular value of the Jacobian relative to the largest, columns scaled to length 1, below which
             a combination of unknowns counts as unobservable.
         max_iterations: greatest number of steps.
@@ -83,7 +83,9 @@ def calibrate(
     setup = make_setup(robot, frames or {}, base)
     given = check_measurements(setup, measurements)
     parameters, precision = parameters_of(setup, unknowns)
-    return _calibrated(setup, given, precision, rank_tolerance, parameters, loss, noise, max_iterations)
+    weighting = Loss(loss, 1.0 if noise == "given" else LEAST_SCALE, len(parameters))
+    estimated = loss != "squared" or noise == "estimated"
+    return _calibrated(setup, given, precision, rank_tolerance, parameters, weighting, estimated, max_iterations)
 
 
 def rows_at(
@@ -101,8 +103,8 @@ def _calibrated(
     precision: Float[Array, " p"],
     rank_tolerance: Array | float,
     parameters: tuple[Parameter, ...],
-    loss: str,
-    noise: str,
+    loss: Loss,
+    estimated: bool,
     limit: int,
 ) -> Calibration:
     start = jnp.zeros_like(precision)
@@ -111,7 +113,6 @@ def _calibrated(
     found = fit(rows_of, fixed_rows, start, jnp.maximum(precision, _HELD), loss, limit)
     directions, scale, ratios = _directions(found)
     observable = ratios > rank_tolerance
-    estimated = loss != "squared" or noise == "estimated"
     covariance, deviation = _covariance(found, precision, directions, scale, ratios * observable, estimated)
     sizes = tuple(one.deviations() for one in measurements)
     return Calibration(

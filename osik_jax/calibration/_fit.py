@@ -18,12 +18,26 @@ _TUNING = {"huber": 1.345, "cauchy": 2.385, "geman_mcclure": 3.787}
 """Lengths in standard deviations at which a loss has 95 % of the efficiency of least squares for normal noise."""
 _MEDIANS = {1: 0.67449, 2: 1.17741, 3: 1.53817, 6: 2.31260}
 """Median of the length of k standard normal numbers."""
-_LEAST_SCALE = 1e-3
+LEAST_SCALE = 1e-3
 """Least scale of the noise relative to the given one: more than half of exact readings would make it 0."""
 
 _FIRST_DAMPING, _LEAST_DAMPING, _GREATEST_DAMPING = 1e-3, 1e-9, 1e9
 """Damping relative to the diagonal of the normal matrix. The least one is below what slows convergence down."""
 _SHRINK, _GROW = 0.1, 10.0
+
+
+class Loss(NamedTuple):
+    """How readings are weighted.
+
+    Attributes:
+        name: one of ``LOSSES``.
+        least_scale: least scale of the noise relative to the given one.
+        unknowns: how many there are: a fit to few readings makes their residuals smaller than the noise.
+    """
+
+    name: str
+    least_scale: float
+    unknowns: int
 
 
 class Fit(NamedTuple):
@@ -70,7 +84,7 @@ def fit(
     fixed_rows: Callable[[Array], Rows],
     start: Float[Array, " p"],
     precision: Float[Array, " p"],
-    loss: str,
+    loss: Loss,
     limit: int,
 ) -> Fit:
     """Minimise the loss of the rows plus ``precision * change^2``.
@@ -80,7 +94,7 @@ def fit(
         fixed_rows: the same without, for the search.
         start: first change. (p,)
         precision: of the prior of each unknown, 1 / variance. (p,)
-        loss: one of ``LOSSES``.
+        loss: how readings are weighted.
         limit: greatest number of iterations.
     """
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.5
@@ -98,22 +112,25 @@ def fit(
         factor = jnp.where(first, 1.0, jnp.where(better, _SHRINK, _GROW))
         damping = jnp.clip(state.damping * factor, _LEAST_DAMPING, _GREATEST_DAMPING)
         step, length = _step(rows, jacobian, _weights(rows, loss), precision, change, damping)
-        converged = (length < tolerance) | (damping >= _GREATEST_DAMPING)
-        return _State(change, rows, jacobian, before, change + step, damping, state.iterations + 1, converged)
+        return _State(change, rows, jacobian, before, change + step, damping, state.iterations + 1, length < tolerance)
+
+    def goes_on(state: _State) -> Bool[Array, ""]:
+        return ~state.converged & (state.damping < _GREATEST_DAMPING) & (state.iterations < limit)
 
     rows, jacobian = jax.tree.map(
         lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(partial(_with_jacobian, fixed_rows), start)
     )
     damping = jnp.asarray(_FIRST_DAMPING, start.dtype)
     state = _State(start, rows, jacobian, rows, start, damping, jnp.asarray(0), jnp.asarray(False))
-    last = jax.lax.while_loop(lambda s: ~s.converged & (s.iterations < limit), advance, state)
+    last = jax.lax.while_loop(goes_on, advance, state)
     rows = rows_of(last.change)
     weights = _weights(rows, loss)
     # one more step carries the derivative
-    change = last.change + _step(rows, last.jacobian, weights, precision, last.change, _LEAST_DAMPING)[0]
+    step = _step(rows, last.jacobian, weights, precision, last.change, _LEAST_DAMPING)[0]
+    change = last.change + jnp.where(jnp.isfinite(step), step, 0.0)  # of a reading that is NaN, in jit
     lengths = _lengths(rows, loss)
     spread = tuple((w**2 * (r**2).mean(-1)).mean() for w, r in zip(weights, rows, strict=True))
-    slope = tuple(_slope(u, r.shape[1], loss) for u, r in zip(lengths, rows, strict=True))
+    slope = tuple(_slope(u, r.shape[1], loss.name) for u, r in zip(lengths, rows, strict=True))
     return Fit(change, rows, last.before, last.jacobian, weights, spread, slope, last.iterations, last.converged)
 
 
@@ -166,15 +183,16 @@ def _cost(rows: Rows, weights: tuple[Array, ...], precision: Array, change: Arra
     return total
 
 
-def _lengths(rows: Rows, loss: str) -> tuple[Array, ...]:
+def _lengths(rows: Rows, loss: Loss) -> tuple[Array, ...]:
     """Return the length of each reading's rows relative to its tuning length, with the scale of the noise by MAD."""
-    if loss == "squared":
+    if loss.name == "squared":
         return tuple(jnp.zeros(r.shape[0], r.dtype) for r in rows)
-    found = []
+    count, found = sum(r.size for r in rows), []
+    shrunk = (max(count - loss.unknowns, 1) / count) ** 0.5
     for r in rows:
         length = jnp.sqrt((r**2).sum(-1) + jnp.finfo(r.dtype).tiny)
-        scale = jnp.maximum(jnp.median(length), _LEAST_SCALE * _MEDIANS[r.shape[1]])
-        found.append(length / scale * (_MEDIANS[1] / _TUNING[loss]))
+        scale = jnp.maximum(jnp.median(length) / shrunk, loss.least_scale * _MEDIANS[r.shape[1]])
+        found.append(length / scale * (_MEDIANS[1] / _TUNING[loss.name]))
     return tuple(found)
 
 
@@ -185,8 +203,8 @@ def _weight(u: Array, loss: str) -> Array:
     return {"squared": jnp.ones_like(u), "cauchy": 1.0 / (1.0 + u**2), "geman_mcclure": 1.0 / (1.0 + u**2) ** 2}[loss]
 
 
-def _weights(rows: Rows, loss: str) -> tuple[Array, ...]:
-    return tuple(jax.lax.stop_gradient(_weight(u, loss)) for u in _lengths(rows, loss))
+def _weights(rows: Rows, loss: Loss) -> tuple[Array, ...]:
+    return tuple(jax.lax.stop_gradient(_weight(u, loss.name)) for u in _lengths(rows, loss))
 
 
 def _slope(u: Array, k: int, loss: str) -> Array:

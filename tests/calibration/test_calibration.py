@@ -216,11 +216,14 @@ def test_a_lane_with_nan_leaves_the_others_alone(ur5: osik.Robot):
     bad = seen.copy()
     bad[0, 0, 0] = np.nan
 
-    def run(q: jax.Array, seen: jax.Array) -> jax.Array:
-        return cal.calibrate(ur5, cal.Points("tool0", q, seen), [cal.Unknown("joint_offset", "elbow_joint")]).vector
+    def run(q: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = cal.calibrate(ur5, cal.Points("tool0", q, seen), [cal.Unknown("joint_offset", "elbow_joint")])
+        return found.vector, found.converged
 
     both = jax.jit(jax.vmap(run))
-    np.testing.assert_array_equal(both(q, bad)[1], both(q, seen)[1])
+    (vectors, converged), (healthy, _) = both(q, bad), both(q, seen)
+    np.testing.assert_array_equal(vectors[1], healthy[1])
+    assert np.isfinite(vectors).all() and converged.tolist() == [False, True]
 
 
 def test_files_and_command(ur5: osik.Robot, tmp_path, capsys: pytest.CaptureFixture[str]):
