@@ -1,4 +1,4 @@
-"""Panda at a shelf: which of 48 grips of a can have a configuration in which nothing touches, and what is in the way."""
+"""Panda at a shelf: which of 48 grips of a can have a configuration that touches nothing, and what is in the way."""
 
 from collections import Counter
 

@@ -57,8 +57,6 @@ def _yaml_spheres(path: Path) -> Spheres:
         import yaml
     except ImportError as missing:
         raise missing_extra("reading a .yaml of spheres", "PyYAML", "scenes") from missing
-    if not path.is_file():
-        raise FileNotFoundError(f"no file of spheres {str(path)!r}")
     found = yaml.safe_load(path.read_text(encoding="utf-8"))
     for key in ("robot_cfg", "kinematics"):
         found = found.get(key, found) if isinstance(found, Mapping) else found

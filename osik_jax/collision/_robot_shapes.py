@@ -62,8 +62,9 @@ def robot_shapes(
         srdf = srdf_beside(robot.holder.path)
     rules, texts = (srdf, {}) if srdf is None or isinstance(srdf, Srdf) else (None, {"srdf": _content(srdf)})
     if isinstance(spheres, str | os.PathLike):
-        changed = os.stat(spheres).st_mtime_ns
-        return _made(robot, rules, None, file=(os.fspath(spheres), changed), **texts)
+        if not os.path.isfile(spheres):
+            raise FileNotFoundError(f"no file of spheres {os.fspath(spheres)!r}")
+        return _made(robot, rules, None, file=(os.fspath(spheres), os.stat(spheres).st_mtime_ns), **texts)
     return _made(robot, rules, spheres, **texts)
 
 
