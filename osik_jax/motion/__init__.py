@@ -1,0 +1,9 @@
+"""From poses to a timed motion: paths of joints, their least time, chunks and streams of poses."""
+
+from ._follow import Followed as Followed
+from ._follow import follow as follow
+from ._motion import Motion as Motion
+from ._motion import load_motion as load_motion
+from ._retime import retime as retime
+from ._timing import SlowPart as SlowPart
+from ._timing import Timing as Timing

@@ -1,0 +1,203 @@
+"""From poses of frames to a timed motion of the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from scipy.interpolate import CubicSpline
+
+from .._errors import OsikTypeError, OsikValueError
+from ..control._checks import checked_start
+from ..inverse import inverse_kinematics
+from ..inverse._inverse_kinematics import joint_box
+from ..robot import Robot
+from ..robot._joint_selection import dof_names
+from ._joint_path import Free, PathSearch
+from ._motion import Motion
+from ._pose_path import Poses, corners, interpolated, lengths, read_poses
+from ._retime import Limit, checked_limits, checked_speed, frame_speeds, resampled, retimed_pieces
+from ._timing import SlowPart, Timing, sampled
+
+_PARTS = 32, 1024
+"""Fewest and most parts of each piece of the path, between two corners."""
+_SHARE = 0.3  # of the tolerance that interpolation of the joints may use
+
+
+class Followed(NamedTuple):
+    """Motion along poses.
+
+    Attributes:
+        timings: of the pieces of the path, each from rest to rest; corners of the path are between them.
+        starts: times at which they begin, and the end of the last one [s]. (pieces + 1,)
+        position_error: largest distance of a frame from the smooth curve through its poses, between samples too [m].
+        orientation_error: largest angle from it [rad].
+        robot: the robot.
+        frame: the first frame, whose speed is wanted.
+    """
+
+    timings: list[Timing]
+    starts: Float[np.ndarray, " k"]
+    position_error: float
+    orientation_error: float
+    robot: Robot
+    frame: str
+
+    @property
+    def duration(self) -> float:
+        """The whole time [s]."""
+        return float(self.starts[-1])
+
+    def at(self, time: Float[ArrayLike, " T"]) -> Float[np.ndarray, "4 T n"]:
+        """Return positions, velocities, accelerations and jerks at times [s] (outside jit)."""
+        time = np.clip(np.asarray(time, float), 0.0, self.duration)
+        piece = np.clip(np.searchsorted(self.starts, time, side="right") - 1, 0, len(self.timings) - 1)
+        found = np.zeros((4, len(time), self.robot.nv))
+        for i in np.unique(piece):
+            found[:, piece == i] = sampled(self.timings[i], time[piece == i] - self.starts[i])
+        return found
+
+    def sample(self, dt: float) -> Motion:
+        """Return the motion at times ``dt`` apart [s], the last of which is the end or just after it."""
+        if not dt > 0.0:
+            raise OsikValueError(f"dt is {dt!r}; it is the positive time between two samples [s]")
+        time = np.arange(int(np.ceil(self.duration / dt - 1e-9)) + 1) * dt
+        q, v, a, _ = self.at(time)
+        return Motion(*map(jnp.asarray, (time, q, v, a)), joints=tuple(dof_names(self.robot)))
+
+    def slow_parts(self, dt: float = 0.005) -> list[SlowPart]:
+        """Return where the first frame is slower than wanted by 1 %, and the joint and limit that are nearest there.
+
+        Args:
+            dt: time between the samples that are looked at [s].
+        """
+        found = []
+        for start, timing in zip(self.starts, self.timings, strict=False):
+            time = np.arange(0.0, float(timing.duration), dt)
+            q, v = sampled(timing, time)[:2]
+            parts = timing.slow_parts(frame_speeds(self.robot, self.frame, q, v), time)
+            found += [part._replace(start=part.start + start, end=part.end + start) for part in parts]
+        return found
+
+
+def follow(
+    robot: Robot,
+    poses: Mapping[str, Any],
+    *,
+    free: Free | None = None,
+    speed: float | None = None,
+    velocity: Limit = None,
+    acceleration: Limit = None,
+    jerk: Limit = None,
+    position_tolerance: float = 1e-4,
+    orientation_tolerance: float = 1.7e-3,
+    q0: Float[ArrayLike, " n"] | None = None,
+    key: int | Array = 0,
+) -> Followed:
+    """Return a continuous, timed motion that leads frames along poses (outside jit).
+
+    The frames move on smooth curves through their poses. At corners, where a path turns by more than 30 degrees, they
+    stop. Branches of the inverse kinematics are chosen by dynamic programming over the whole path; the free motion of
+    the joints is the smoothest near that choice. Each piece between corners is timed by ``retime``.
+
+    Args:
+        robot: the robot; hinges and slides alone (``locked_joints`` locks others).
+        poses: by frame, two poses or more: positions (N, 3) alone, whose orientation is free; a pair of positions and
+            quaternions w x y z (N, 4) or rotation matrices (N, 3, 3); or matrices (N, 4, 4).
+        free: by frame, its own axis "x", "y" or "z" about which it may turn, such as ``{"tool": "z"}``.
+        speed: wanted speed of the first frame [m/s], kept where joints allow it. Default: as fast as possible.
+        velocity, acceleration, jerk: limits as in ``retime``.
+        position_tolerance: largest distance of a frame from its curve [m].
+        orientation_tolerance: largest angle [rad].
+        q0: configuration to begin near. (n,)
+        key: other searches for the branches.
+
+    Returns:
+        The motion: ``at(time)``, ``sample(dt)``, ``slow_parts()``.
+
+    Raises:
+        KeyError: no such frame or joint.
+        TypeError: ``free`` is no axis.
+        ValueError: poses that are out of reach (the message says which, by how much and why), one pose, two equal
+            poses in a row, or no continuous path through poses that are in reach one by one.
+    """
+    read, free = read_poses(robot, poses), _checked_free(poses, free)
+    if robot.nq != robot.nv:
+        raise OsikValueError("poses are followed by hinges and slides alone: lock the other joints, or fix the base")
+    limits, wanted = checked_limits(robot, velocity, acceleration, jerk), checked_speed(speed)
+    along = lengths(read)
+    start = None if q0 is None else checked_start(robot, q0)
+    search = PathSearch(robot, free, *map(np.asarray, joint_box(robot, None)), start, key)
+    path, errors = _within_tolerance(search, read, along, (position_tolerance, orientation_tolerance))
+    frame = next(iter(read))
+    timings = retimed_pieces(path, limits, robot, wanted, frame)
+    starts = np.append(0.0, np.cumsum([float(one.duration) for one in timings]))
+    return Followed(timings, starts, *errors, robot, frame)
+
+
+def _checked_free(poses: Mapping[str, Any], free: Free | None) -> Free:
+    for name, axis in (free or {}).items():
+        if name not in poses or axis not in ("x", "y", "z"):
+            raise OsikTypeError(f'free has {name!r}: {axis!r}; it is, by frames with poses, the axis "x", "y" or "z"')
+    return free or {}
+
+
+def _within_tolerance(
+    search: PathSearch, poses: Mapping[str, Poses], along: np.ndarray, tolerance: tuple[float, float]
+) -> tuple[Float[np.ndarray, "k P n"], tuple[float, float]]:
+    """Return the pieces of a joint path whose splines keep the frames on their curves, and the largest errors."""
+    pieces = len(corners(poses)) - 1
+    parts = max(_PARTS[0], 1 << int(np.ceil(np.log2(max(1, len(along) // pieces)))))
+    path = None
+    while True:
+        at = interpolated(poses, along, parts)
+        if path is None:
+            path = search.path(at, np.linspace(0.0, 1.0, pieces * parts + 1))
+            if path is None:
+                raise OsikValueError(_why_not(search, poses))
+        else:
+            path = search.refined(_doubled(path), at)
+        split = np.stack([path[i * parts : (i + 1) * parts + 1] for i in range(pieces)])
+        errors = _errors_between(search, split, poses, along)
+        if errors[0] <= _SHARE * tolerance[0] and errors[1] <= _SHARE * tolerance[1]:
+            return split, errors
+        if 2 * parts > _PARTS[1]:
+            raise OsikValueError(
+                f"between poses the path is {errors[0]:.3g} m and {errors[1]:.3g} rad off its curve, {parts} parts a "
+                "piece: give larger tolerances, or poses that are farther from singularities"
+            )
+        parts *= 2
+
+
+def _doubled(path: np.ndarray) -> np.ndarray:
+    """Return a path with one point between each two, by cubic interpolation."""
+    return CubicSpline(np.arange(len(path)), path)(np.arange(2 * len(path) - 1) / 2.0)
+
+
+def _errors_between(
+    search: PathSearch, pieces: np.ndarray, poses: Mapping[str, Poses], along: np.ndarray
+) -> tuple[float, float]:
+    """Return the largest distance [m] and angle [rad] from the curves, at four samples to each part."""
+    fine = interpolated(poses, along, 4 * (pieces.shape[1] - 1))
+    is_angle = np.concatenate([[False] if one.rotation is None else [False, True] for one in fine.values()])
+    errors = search.errors(resampled(pieces, 4), fine)[0].reshape(-1, len(is_angle), 3)
+    largest = np.linalg.norm(errors, axis=2).max(axis=0)
+    return float(largest[~is_angle].max()), float(largest[is_angle].max(initial=0.0))
+
+
+def _why_not(search: PathSearch, poses: Mapping[str, Poses]) -> str:
+    """Return why there is no path: the poses that cannot be reached, or that none is continuous."""
+    if any(search.free.get(name) for name in poses):
+        return "no continuous path was found through the poses, with free axes: try another key, or q0"
+    targets = {name: one.position if one.rotation is None else tuple(one) for name, one in poses.items()}
+    found = inverse_kinematics(search.robot, targets, key=search.key)
+    missed = np.flatnonzero(~np.asarray(found.converged))
+    if len(missed) == 0:
+        return "each pose can be reached, and no continuous path through all was found: try another key, free= or q0"
+    shown = ", ".join(map(str, missed[:10])) + (", ..." if len(missed) > 10 else "")
+    first = int(missed[0])
+    why = found.explain(first)
+    return f"{len(missed)} of {len(found.converged)} poses cannot be reached: {shown}. Pose {first}: {why}"

@@ -1,0 +1,218 @@
+"""Least time under limits of jerk: a barrier method in the squared rate of a smooth reference motion.
+
+The least-time motion without limits of jerk, smoothed, is a reference s(z) that starts and ends at rest. Its time z is
+stretched or shrunk: ``b = (dz/dt)^2`` is a quadratic spline on a uniform grid. Limits of speed and acceleration are
+linear in b and its derivatives. A limit of jerk, divided by ``sqrt(b)``, is ``|linear| <= j / sqrt(b)``. Its right side
+is convex, so the tangent is a bound from the inside, and each step minimises a convex problem with feasible answers
+(F. Debrouwere et al., "Time-optimal path following for robots with convex-concave constraints using sequential convex
+programming", T-RO 2013), here by one Newton step of a barrier method. The reference makes the rate smooth and positive
+at the ends, where the path speed is 0 and derivatives by s are infinite.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._cells import Cells, timed
+
+_STEPS = 50
+_SHRINK = 0.75  # of the barrier's weight in a step
+_LEAST_GAP = 1e-5  # of the duration
+_MOST = 4.0
+"""Largest squared rate, a bound on b where the reference stands still: it is hardly slower than the optimum."""
+PLACES = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
+"""Where limits hold in each cell, by its width."""
+_PIECES = np.array([[0.5, 0.5, 0.0], [-1.0, 1.0, 0.0], [0.5, -1.0, 0.5]])
+"""Coefficients of a cell's polynomial, rising powers, by those of a uniform quadratic B-spline."""
+_CUBIC = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
+"""The same of a uniform cubic B-spline."""
+_STENCILS = np.array([[[1.0, x, x**2], [0.0, 1.0, 2.0 * x], [0.0, 0.0, 2.0]] for x in PLACES]) @ _PIECES
+"""Value, slope and second derivative of the quadratic B-spline at the places, by its coefficients."""
+_SHARES = np.array([1.0, 3.0, 3.0, 1.0]) / 8.0
+"""Weights of the places in an integral over a cell."""
+
+
+class Rows(NamedTuple):
+    """Limits at four places of each of K cells, linear in b, its slope and its second derivative.
+
+    Attributes:
+        fixed: rows ``fixed . (b, b', b'') <= 1``: speeds and both signs of accelerations. (P, m, 3)
+        jerk: rows ``sqrt(b) |jerk . (b, b', b'')| <= 1``. (P, n, 3)
+    """
+
+    fixed: Float[Array, "P m 3"]
+    jerk: Float[Array, "P n 3"]
+
+
+def reference(cells: Cells, ramp: Array, count: int) -> tuple[Float[Array, ""], Float[Array, "K 4"]]:
+    """Return the width and the cubics of a smooth motion s(z) from rest to rest, on ``count`` cells of equal width.
+
+    Args:
+        cells: the least-time motion without limits of jerk.
+        ramp: time that the smoothing spreads a jump of acceleration over [s].
+        count: number of cells.
+    """
+    duration = cells.start[-1]
+    spread = jnp.maximum(ramp, 4.0 * duration / count)
+    width = (duration + spread) / (count - 4)
+    along = cells.at(width * (jnp.arange(count + 3) - 3.0) - 0.5 * spread)[0]
+    smooth = _moving_mean(along, spread / width)
+    four = jnp.stack([smooth[i : i + count] for i in range(4)], axis=1)
+    return width, (four @ _CUBIC.T.astype(width.dtype)) / width ** jnp.arange(4)
+
+
+def _moving_mean(values: Float[Array, " K"], window: Array) -> Float[Array, " K"]:
+    """Return the mean over a window around each value; the window's length in values need not be whole."""
+    count = len(values)
+    sums = jnp.append(0.0, jnp.cumsum(jnp.pad(values, count, mode="edge")))
+    middle = count + 0.5 + jnp.arange(count)
+    ends = jnp.stack([middle - 0.5 * window, middle + 0.5 * window])
+    low, high = jnp.interp(ends, jnp.arange(len(sums), dtype=values.dtype), sums)
+    return (high - low) / window
+
+
+def rows_of(
+    path: Float[Array, "4 P n"],
+    thirds: Float[Array, "2 P n"],
+    progress: Float[Array, "4 P"],
+    cap: Float[Array, " P"],
+    limits: Float[Array, "3 n"],
+) -> Rows:
+    """Return the rows of limits for a reference motion.
+
+    Args:
+        path: the path and its three derivatives by s.
+        thirds: the third derivatives at both ends of the cell, which differ if a knot is inside.
+        progress: s and its three derivatives by z.
+        cap: largest squared path speed, by limits that are not of joints.
+        limits: of speed, acceleration and jerk.
+    """
+    (_, q1, q2, _), (_, s1, s2, s3) = path, progress[..., None]
+    first, second = q1 * s1, q2 * s1**2 + q1 * s2
+    zero, alone = jnp.zeros_like(q1), 3.0 * q2 * s1 * s2 + q1 * s3
+    speed = jnp.stack([(first / limits[0]) ** 2, zero, zero], axis=-1)
+    speed = jnp.concatenate([speed, (s1 / jnp.sqrt(cap)[:, None])[..., None] ** 2 * jnp.eye(3)[:1]], axis=1)
+    pull = jnp.stack([second, 0.5 * first, zero], axis=-1) / limits[1][:, None]
+    jerk = [jnp.stack([q3 * s1**3 + alone, 1.5 * second, 0.5 * first], axis=-1) for q3 in thirds]
+    jerk = jnp.concatenate(jerk, axis=1) / jnp.tile(limits[2], 2)[:, None]
+    return Rows(jnp.concatenate([speed, pull, -pull], axis=1), jerk)
+
+
+def stretched(width: Array, cubics: Float[Array, "K 4"], rows: Rows) -> tuple[Cells, Float[Array, ""]]:
+    """Return the least-time progress, and its duration, whose derivative by the rows is that of the optimum.
+
+    By the envelope theorem the derivative of the least duration is that of the barrier's terms alone, at the answer.
+    """
+    square, weight = jax.tree.map(jax.lax.stop_gradient, _optimum(width, *jax.lax.stop_gradient(rows)))
+    pieces = jnp.stack([square[i : i + len(cubics)] for i in range(3)], axis=1) @ _PIECES.T.astype(width.dtype)
+    cells = timed(jnp.broadcast_to(width, len(cubics)), cubics, pieces / width ** jnp.arange(3))
+    cells = jax.lax.stop_gradient(cells)
+    barrier = -weight * sum(jnp.log(margin).sum() for margin in _margins(rows, _values(square, width)))
+    return cells, cells.start[-1] + barrier - jax.lax.stop_gradient(barrier)
+
+
+def _values(square: Float[Array, " K2"], width: Array) -> Float[Array, "P 3"]:
+    """Return b and its two derivatives at the places, by the spline's coefficients."""
+    three = jnp.stack([square[i : len(square) - 2 + i] for i in range(3)], axis=1)
+    return jnp.einsum("ecs,ks->kec", _stencils(width), three).reshape(-1, 3)
+
+
+def _stencils(width: Array) -> Float[Array, "4 3 3"]:
+    return _STENCILS.astype(width.dtype) / width ** jnp.arange(3)[:, None]
+
+
+def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Array]:
+    """Return by how much of each limit the motion stays below it."""
+    jerk = jnp.sqrt(values[:, :1]) * jnp.einsum("knc,kc->kn", rows.jerk, values)
+    return 1.0 - jnp.einsum("kmc,kc->km", rows.fixed, values), 1.0 - jerk, 1.0 + jerk
+
+
+def _optimum(width: Array, fixed: Array, jerk: Array) -> tuple[Float[Array, " K2"], Float[Array, ""]]:
+    """Return the coefficients of b, and the last weight of the barrier."""
+    rows = Rows(fixed, jerk)
+    scale = width / len(PLACES) / (fixed.shape[1] + 2 * jerk.shape[1])
+
+    def step(square: Array, power: Array) -> tuple[Array, None]:
+        weight = scale * jnp.maximum(_SHRINK**power, _LEAST_GAP)
+        return _newton(square, width, rows, weight), None
+
+    square = jax.lax.scan(step, _slow(width, rows), jnp.arange(_STEPS, dtype=width.dtype))[0]
+    return square, scale * _LEAST_GAP
+
+
+def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:
+    """Return a constant b at which all limits hold, by a fifth."""
+    ones = jnp.zeros((len(rows.fixed), 3), width.dtype).at[:, 0].set(1.0)
+    fixed, jerk, _ = _margins(rows, ones)
+    square = 0.8 / jnp.maximum(jnp.maximum(jnp.max(1.0 - fixed), 1.0), jnp.max(jnp.abs(1.0 - jerk)) ** (2.0 / 3.0))
+    return jnp.full(len(rows.fixed) // len(PLACES) + 2, square)
+
+
+def _newton(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array) -> Float[Array, " K2"]:
+    """Return the coefficients after one Newton step of the barrier problem, inside all limits."""
+    values, stencils = _values(square, width), _stencils(width)
+    b, share = values[:, 0], jnp.tile(width * _SHARES, len(square) - 2)
+    margin, slope = _linear_margins(rows, values)
+    scaled = slope / margin[..., None]
+    down = weight * scaled.sum(axis=1)
+    down = down.at[:, 0].add(0.5 * share * b**-1.5).reshape(-1, len(PLACES), 3)
+    down = jnp.einsum("kec,ecs->ks", down, stencils)
+    curvature = weight * jnp.einsum("kmc,kmd->kcd", scaled, scaled)
+    curvature = curvature.at[:, 0, 0].add(0.75 * share * b**-2.5).reshape(-1, len(PLACES), 3, 3)
+    curvature = jnp.einsum("ecs,kecd,edt->kst", stencils, curvature, stencils)
+    diagonal, *beside = _bands(curvature)
+    ends = 1.0 / square, -1.0 / (_MOST - square)
+    diagonal = diagonal + weight * (ends[0] ** 2 + ends[1] ** 2)
+    move = _solve_banded(diagonal, *beside, _added(down) + weight * (ends[0] + ends[1]))
+    taken = jnp.max(-jnp.einsum("kmc,kc->km", scaled, _values(move, width)))
+    most = jnp.maximum(taken, jnp.maximum(jnp.max(-move * ends[0]), jnp.max(-move * ends[1])))
+    return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(most, 1e-9))
+
+
+def _linear_margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Float[Array, "P m"], Float[Array, "P m 3"]]:
+    """Return the margins of all rows, and their slopes by (b, b', b''), those of jerk by the tangent of 1 / sqrt(b)."""
+    root = jnp.sqrt(values[:, :1, None])
+    shrink = jnp.zeros_like(rows.jerk).at[..., 0].set(0.5 / values[:, :1])
+    slopes = -rows.fixed, -shrink - root * rows.jerk, -shrink + root * rows.jerk
+    return jnp.concatenate(_margins(rows, values), axis=1), jnp.concatenate(slopes, axis=1)
+
+
+def _added(cells: Float[Array, "K 3"]) -> Float[Array, " K2"]:
+    """Return the sums of what the cells contribute to their three coefficients."""
+    return sum(jnp.pad(cells[:, i], (i, 2 - i)) for i in range(3))  # pyright: ignore
+
+
+def _bands(cells: Float[Array, "K 3 3"]) -> tuple[Array, Array, Array]:
+    """Return the diagonal and the two bands left of it, by rows. Each (K + 2,)."""
+    diagonal = _added(jnp.diagonal(cells, axis1=1, axis2=2))
+    one = jnp.pad(cells[:, 0, 1], (1, 1)) + jnp.pad(cells[:, 1, 2], (2, 0))
+    return diagonal, one, jnp.pad(cells[:, 0, 2], (2, 0))
+
+
+def _solve_banded(diagonal: Array, one: Array, two: Array, right: Float[Array, " K2"]) -> Float[Array, " K2"]:
+    """Return the solution of a symmetric positive system with five bands, by its factors L D L'."""
+
+    def forward(carry: Any, row: Any) -> tuple[Any, Any]:
+        (pivot, near, y), (pivot_2, y_2) = carry
+        entry, below, below_2, value = row
+        far = below_2 / pivot_2
+        own_near = (below - below_2 * near) / pivot
+        own = entry - own_near**2 * pivot - far**2 * pivot_2
+        own_y = value - own_near * y - far * y_2
+        return ((own, own_near, own_y), (pivot, y)), (own_near, far, own_y / own)
+
+    def backward(carry: Any, row: Any) -> tuple[Any, Any]:
+        (x, x_2), (near, far, value) = carry, row
+        own = value - near * x - far * x_2
+        return (own, x), own
+
+    unit, zero = jnp.ones((), right.dtype), jnp.zeros((), right.dtype)
+    start = (unit, zero, zero), (unit, zero)
+    near, far, value = jax.lax.scan(forward, start, (diagonal, one, two, right))[1]
+    rows = jnp.append(near[1:], 0.0), jnp.append(far[2:], jnp.zeros(2, far.dtype)), value
+    return jax.lax.scan(backward, (zero, zero), rows, reverse=True)[1]

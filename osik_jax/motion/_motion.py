@@ -1,0 +1,179 @@
+"""Sampled motion of a robot's joints, and its files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._errors import OsikValueError, missing_extra
+from .._npz import open_npz
+from .._whole_file import whole_file, write_text
+from ..control import Trajectory
+from ..robot import Robot
+from ..robot._joint_selection import dof_names
+
+_KINDS = "position", "velocity", "acceleration"
+_LEROBOT = "observation.state", "action", "timestamp"
+
+
+class Motion(eqx.Module):
+    """Joint positions, velocities and accelerations at increasing times.
+
+    Attributes:
+        time: [s]. (T,)
+        position: of the joints [rad or m]. (T, n)
+        velocity: [rad/s or m/s]. (T, n)
+        acceleration: [rad/s^2 or m/s^2]. (T, n)
+        joints: their names (static).
+    """
+
+    time: Float[Array, " T"]
+    position: Float[Array, "T n"]
+    velocity: Float[Array, "T n"]
+    acceleration: Float[Array, "T n"]
+    joints: tuple[str, ...] = eqx.field(default=(), static=True)
+
+    @classmethod
+    def of(cls, robot: Robot, trajectory: Trajectory) -> Motion:
+        """Return the motion of a rollout: each step's velocity, and its changes as accelerations.
+
+        Raises:
+            ValueError: the robot has joints that are no hinges or slides.
+        """
+        if robot.nq != robot.nv:
+            raise OsikValueError("a motion has one number a joint: hinges and slides alone; lock the other joints")
+        velocity, time = trajectory.solution.velocity, trajectory.time
+        pulls = jnp.diff(velocity, axis=0) / jnp.diff(time)[:, None]
+        acceleration = jnp.concatenate([pulls, jnp.zeros_like(velocity[:1])])
+        return cls(time, trajectory.q[:-1], velocity, acceleration, tuple(dof_names(robot)))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the motion to a file, whose name's end says its kind.
+
+        - ``.npz``: arrays ``time``, ``position``, ``velocity``, ``acceleration`` and ``joints``.
+        - ``.csv``: a row a sample; columns ``time``, ``position.JOINT``, ``velocity.JOINT``, ``acceleration.JOINT``.
+        - ``.parquet``: LeRobot's columns ``observation.state`` (the positions), ``action`` (those of the next sample)
+          and ``timestamp``, beside the velocities and accelerations. It needs the extra ``motion``.
+
+        Raises:
+            ValueError: another end of the name.
+            ModuleNotFoundError: ``.parquet`` without pyarrow.
+            OSError: the file cannot be written.
+        """
+        kind = _kind(path)
+        if kind == ".csv":
+            write_text(path, self._as_csv())
+            return
+        with whole_file(path) as file:
+            if kind == ".npz":
+                np.savez(file, joints=np.array(self._names(), str), time=self.time, **self._arrays())
+            else:
+                _pyarrow("parquet").write_table(self._as_table(), file)
+
+    def _names(self) -> list[str]:
+        return list(self.joints) or [str(i) for i in range(self.position.shape[1])]
+
+    def _arrays(self) -> dict[str, Any]:
+        return {kind: np.asarray(getattr(self, kind)) for kind in _KINDS}
+
+    def _as_csv(self) -> str:
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(["time", *(f"{kind}.{name}" for kind in _KINDS for name in self._names())])
+        rows.writerows(np.column_stack([self.time, *self._arrays().values()]).tolist())
+        return text.getvalue()
+
+    def _as_table(self) -> Any:
+        arrow, arrays = _pyarrow(), self._arrays()
+        state = arrays["position"]
+        columns = {_LEROBOT[0]: state, _LEROBOT[1]: np.concatenate([state[1:], state[-1:]])}
+        columns |= {kind: arrays[kind] for kind in _KINDS[1:]}
+        table = arrow.table(
+            {name: list(values) for name, values in columns.items()} | {_LEROBOT[2]: np.asarray(self.time)}
+        )
+        return table.replace_schema_metadata({"joints": "\n".join(self._names())})
+
+
+def load_motion(path: str | os.PathLike[str]) -> Motion:
+    """Return a motion that ``Motion.save`` wrote; from CSV and Parquet of others, velocities may be missing.
+
+    Missing velocities and accelerations are those of differences.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: another kind of file, columns missing, or times that do not increase.
+        ModuleNotFoundError: ``.parquet`` without pyarrow.
+    """
+    time, arrays, joints = {".npz": _from_npz, ".csv": _from_csv, ".parquet": _from_parquet}[_kind(path)](path)
+    if len(time) < 2 or not (np.diff(time) > 0.0).all():
+        back = int(np.argmax(np.diff(time) <= 0.0)) + 1 if len(time) > 1 else 0
+        raise OsikValueError(f"{os.fspath(path)}: times have to increase, two or more; sample {back} does not")
+    for kind, before in zip(_KINDS[1:], _KINDS, strict=False):
+        if kind not in arrays:
+            arrays[kind] = np.gradient(arrays[before], time, axis=0)
+    return Motion(jnp.asarray(time), *(jnp.asarray(arrays[kind]) for kind in _KINDS), joints=tuple(joints))
+
+
+def _kind(path: str | os.PathLike[str]) -> str:
+    kind = Path(path).suffix.lower()
+    if kind not in (".npz", ".csv", ".parquet"):
+        raise OsikValueError(f"{os.fspath(path)}: a motion's file ends in .npz, .csv or .parquet")
+    return kind
+
+
+def _missing(path: Any, column: str) -> OsikValueError:
+    return OsikValueError(f"{os.fspath(path)} has no {column}: it is no motion that Motion.save wrote")
+
+
+def _from_npz(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    with open_npz(path) as file:
+        for name in ("time", "position", "joints"):
+            if name not in file:
+                raise _missing(path, name)
+        return file["time"], {kind: file[kind] for kind in _KINDS if kind in file}, [str(n) for n in file["joints"]]
+
+
+def _from_csv(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    with open(path, encoding="utf-8", newline="") as file:
+        head, *rows = list(csv.reader(file))
+    if "time" not in head:
+        raise _missing(path, "column time")
+    try:
+        values = np.array(rows, float)
+    except ValueError as error:
+        raise OsikValueError(f"{os.fspath(path)} cannot be read as a table of numbers: {error}") from error
+    joints = [name.partition(".")[2] for name in head if name.startswith("position.")]
+    if not joints:
+        raise _missing(path, "columns position.JOINT")
+    columns = {kind: [head.index(f"{kind}.{name}") for name in joints if f"{kind}.{name}" in head] for kind in _KINDS}
+    arrays = {kind: values[:, own] for kind, own in columns.items() if len(own) == len(joints)}
+    return values[:, head.index("time")], arrays, joints
+
+
+def _from_parquet(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    table = _pyarrow("parquet").read_table(path)
+    for column in (_LEROBOT[0], _LEROBOT[2]):
+        if column not in table.column_names:
+            raise _missing(path, f"column {column}")
+    given = {"position": _LEROBOT[0], "velocity": "velocity", "acceleration": "acceleration"}
+    arrays = {k: np.stack(table[name].to_numpy()) for k, name in given.items() if name in table.column_names}
+    names = (table.schema.metadata or {}).get(b"joints", b"").decode()
+    return table[_LEROBOT[2]].to_numpy(), arrays, names.split("\n") if names else []
+
+
+def _pyarrow(part: str | None = None) -> Any:
+    """Return pyarrow, or a module of it."""
+    import importlib
+
+    try:
+        return importlib.import_module("pyarrow" if part is None else f"pyarrow.{part}")
+    except ModuleNotFoundError as error:
+        raise missing_extra("a .parquet file", "pyarrow", "motion") from error

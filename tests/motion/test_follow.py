@@ -1,0 +1,116 @@
+"""Timed motions along poses: tool and joints beside dense samples in NumPy, MuJoCo's kinematics as the judge."""
+
+import mujoco
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.motion import follow
+
+ARM = osik.load_robot("arm7")
+LIMITS = {
+    "velocity": np.array([2.175] * 4 + [2.61] * 3),
+    "acceleration": np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]),
+    "jerk": np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0]),
+}
+RADIUS, TOP = 0.15, np.array([0.5, 0.0, 0.25])
+
+
+def raster(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Poses on a lying cylinder: rows along its axis, there and back, tool axes into it."""
+    position, rotation = [], []
+    for row, angle in enumerate(np.linspace(-0.3, 0.3, rows)):
+        outward = np.array([np.sin(angle), 0.0, np.cos(angle)])
+        for y in np.linspace(-0.1, 0.1, columns)[:: -1 if row % 2 else 1]:
+            position.append(TOP + RADIUS * outward + [0.0, y, 0.0])
+            side = np.array([0.0, -1.0, 0.0])
+            rotation.append(np.stack([np.cross(side, -outward), side, -outward], axis=1))
+    return np.array(position), np.array(rotation)
+
+
+def placed(q: np.ndarray, frame: str = "hand") -> tuple[np.ndarray, np.ndarray]:
+    """Positions (T, 3) and rotations (T, 3, 3) of a frame by MuJoCo."""
+    model = ARM.mj_model
+    data, number = mujoco.MjData(model), mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, frame)
+    assert number >= 0
+    found = []
+    for row in q:
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        found.append((data.site_xpos[number].copy(), data.site_xmat[number].reshape(3, 3).copy()))
+    return np.array([p for p, _ in found]), np.array([r for _, r in found])
+
+
+@pytest.fixture(scope="module")
+def followed():
+    return follow(ARM, {"hand": raster(3, 8)}, speed=0.3, **LIMITS)
+
+
+@pytest.mark.slow
+def test_limits_hold_at_a_millisecond_and_nothing_jumps(followed) -> None:
+    time = np.arange(0.0, followed.duration, 1e-3)
+    q, v, a, j = followed.at(time)
+    for seen, kind in zip((v, a, j), LIMITS.values(), strict=True):
+        assert (np.abs(seen) <= 1.0001 * kind).all()
+    assert (np.abs(np.diff(q, axis=0)) / 1e-3 <= 1.0001 * LIMITS["velocity"]).all()
+    assert (np.abs(np.diff(a, axis=0)) / 1e-3 <= 1.0001 * LIMITS["jerk"]).all()
+    lower, upper = np.asarray(ARM.position_lower), np.asarray(ARM.position_upper)
+    assert (lower <= q).all() and (q <= upper).all()
+
+
+@pytest.mark.slow
+def test_the_tool_stays_on_the_cylinder_and_meets_all_poses(followed) -> None:
+    q = followed.at(np.arange(0.0, followed.duration, 2e-3))[0]
+    place, turn = placed(q)
+    distance = np.hypot(place[:, 0] - TOP[0], place[:, 2] - TOP[2])
+    rows, _ = raster(3, 8)
+    on_row = np.abs(place[:, 1]) < 0.0995  # between rows the curve is a chord of the cylinder
+    assert np.abs(distance - RADIUS)[on_row].max() < 1e-4
+    outward = (place - TOP) * [1.0, 0.0, 1.0] / distance[:, None]
+    tilt = np.arccos(np.clip(-(turn[:, :, 2] * outward).sum(axis=1), -1.0, 1.0))
+    assert np.degrees(tilt[on_row]).max() < 0.1
+    nearest = np.linalg.norm(place[:, None] - rows, axis=2).min(axis=0)
+    assert nearest.max() < 1e-3  # of samples 2 ms apart
+
+
+@pytest.mark.slow
+def test_the_wanted_speed_is_kept_on_rows(followed) -> None:
+    place, _ = placed(followed.at(np.arange(0.0, followed.duration, 1e-3))[0])
+    speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / 1e-3
+    assert speed.max() <= 0.3001 and (speed > 0.297).mean() > 0.6
+    slow = followed.slow_parts()
+    assert slow and all(part.limit in ("speed", "acceleration", "jerk") for part in slow)
+
+
+def test_a_tool_may_spin_about_a_free_axis() -> None:
+    poses = raster(2, 8)
+    fast = follow(ARM, {"hand": poses}, free={"hand": "z"}, velocity=LIMITS["velocity"], acceleration=5.0)
+    place, turn = placed(fast.at(np.linspace(0.0, fast.duration, 200))[0])
+    assert fast.position_error < 1e-4 and fast.orientation_error < 1.7e-3
+    assert np.abs(turn[:, 2, 2] + np.cos(np.arcsin((place[:, 0] - TOP[0]) / RADIUS))).max() < 2e-3
+
+
+POSES = raster(1, 8)
+
+
+@pytest.mark.parametrize(
+    "poses, more, message",
+    [
+        ({"hand": (POSES[0][:1], POSES[1][:1])}, {}, "there is one pose"),
+        ({"hand": POSES[0][[0, 1, 1, 2]]}, {}, "poses 1 and 2 are equal"),
+        ({"hand": POSES[0] * np.nan}, {}, "not finite"),
+        ({"hand": POSES[0][:, :2]}, {}, "have shape"),
+        (
+            {"hand": POSES[0] + np.linspace(0, 1.5, 8)[:, None] * [1.0, 0.0, 0.0]},
+            {},
+            "cannot be reached: .*, 7. Pose 2: not found",
+        ),
+        ({"hnd": POSES}, {}, "did you mean 'hand'"),
+        ({"hand": POSES}, {"free": {"hand": "w"}}, "axis"),
+        ({"hand": POSES}, {"speed": 0.0}, "speed is"),
+        ({"hand": POSES}, {"jerk": 0.0}, "limits of jerk are positive"),
+    ],
+)
+def test_what_cannot_be_is_refused(poses, more, message) -> None:
+    with pytest.raises(osik.OsikError, match=message):
+        follow(ARM, poses, **({"acceleration": 5.0} | more))

@@ -1,0 +1,80 @@
+"""Files of motions: what was written is read again, and what is no motion is refused."""
+
+import csv
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import osik_jax as osik
+from osik_jax.motion import Motion, load_motion, retime
+
+MOTION = retime(np.array([[0.0, 0.0], [1.0, 0.5], [1.5, 2.0]]), acceleration=5.0, velocity=2.0, cells=40).sample(0.02)
+MOTION = Motion(MOTION.time, MOTION.position, MOTION.velocity, MOTION.acceleration, joints=("lift", "turn"))
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv", "parquet"])
+def test_a_file_gives_the_same_motion(tmp_path, kind) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
+    MOTION.save(tmp_path / f"motion.{kind}")
+    found = load_motion(tmp_path / f"motion.{kind}")
+    assert found.joints == MOTION.joints
+    for name in ("time", "position", "velocity", "acceleration"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(MOTION, name))
+
+
+def test_columns_of_a_csv(tmp_path) -> None:
+    MOTION.save(tmp_path / "motion.csv")
+    with open(tmp_path / "motion.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(MOTION.time)
+    np.testing.assert_array_equal([float(row["velocity.turn"]) for row in rows], MOTION.velocity[:, 1])
+
+
+def test_a_table_of_positions_alone_gets_velocities_by_differences(tmp_path) -> None:
+    time = np.linspace(0.0, 1.0, 101)
+    table = np.column_stack([time, np.sin(time)])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="time,position.a", comments="")
+    np.testing.assert_allclose(load_motion(tmp_path / "a.csv").velocity[1:-1, 0], np.cos(time[1:-1]), atol=1e-4)
+
+
+def test_a_rollout_is_a_motion() -> None:
+    arm = osik.load_robot("arm7")
+    path = osik.rollout(arm, arm.q0, {"hand": osik.FrameTask(arm, "hand")}, dt=0.01, steps=5)
+    motion = Motion.of(arm, path)
+    np.testing.assert_array_equal(motion.position, path.q[:-1])
+    assert motion.velocity.shape == motion.acceleration.shape == (5, 7) and motion.joints[0] == "joint1"
+
+
+def test_parquet_needs_its_extra(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install \".\[motion\]\""):
+        MOTION.save(tmp_path / "motion.parquet")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("time,position.a\n0,1\n1,2\n1,3\n", "times have to increase, two or more; sample 2 does not"),
+        ("time,position.a\n1,1\n0,2\n", "sample 1 does not"),
+        ("time,position.a\n0,1\n", "two or more"),
+        ("a,b\n0,1\n", "no column time"),
+        ("time,a\n0,1\n", "no columns position.JOINT"),
+        ("time,position.a\n0,x\n", "cannot be read as a table of numbers"),
+    ],
+)
+def test_what_is_no_motion_is_refused(tmp_path, text, message) -> None:
+    (tmp_path / "motion.csv").write_text(text)
+    with pytest.raises(osik.OsikError, match=message):
+        load_motion(tmp_path / "motion.csv")
+
+
+def test_other_ends_of_names_are_refused(tmp_path) -> None:
+    with pytest.raises(osik.OsikError, match=r"ends in .npz, .csv or .parquet"):
+        MOTION.save(tmp_path / "motion.txt")
+    np.savez(tmp_path / "other.npz", a=jnp.zeros(2))
+    with pytest.raises(osik.OsikError, match="has no time"):
+        load_motion(tmp_path / "other.npz")

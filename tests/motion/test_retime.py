@@ -1,0 +1,146 @@
+"""Least time along paths, beside dense samples in NumPy, closed forms and central differences."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import osik_jax as osik
+from osik_jax.motion import retime
+
+VELOCITY = np.array([2.175, 2.0, 2.61])
+ACCELERATION = np.array([15.0, 7.5, 20.0])
+JERK = np.array([300.0, 100.0, 500.0])
+LIMITS = {"velocity": VELOCITY, "acceleration": ACCELERATION}
+POINTS = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
+CELLS = 120
+
+
+@partial(jax.jit, static_argnames="smooth")
+def timed(points, velocity, acceleration, jerk, smooth=False):
+    more = {"jerk": jerk} if smooth else {}
+    return retime(points, velocity=velocity, acceleration=acceleration, cells=CELLS, **more)
+
+
+def run(points=POINTS, velocity=VELOCITY, acceleration=ACCELERATION, jerk=JERK, smooth=False):
+    return timed(points, velocity, acceleration, jerk, smooth=smooth)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_limits_hold_between_samples_and_nothing_jumps(smooth) -> None:
+    for seed in range(3):
+        points = np.cumsum(np.random.default_rng(seed).normal(size=(6, 3)) * 0.5, axis=0)
+        timing = run(points, smooth=smooth)
+        time = np.linspace(0.0, float(timing.duration), 1 << 13)
+        q, v, a, j = np.asarray(timing.at(jnp.asarray(time)))
+        np.testing.assert_allclose(q[[0, -1]], points[[0, -1]], atol=1e-9)
+        # of NumPy's differences: velocities and accelerations are those of the positions
+        dt = time[1]
+        seen_v, seen_a = np.diff(q, axis=0) / dt, np.diff(q, n=2, axis=0) / dt**2
+        assert (np.abs(seen_v) <= 1.0001 * VELOCITY).all() and (np.abs(seen_a) <= 1.0001 * ACCELERATION).all()
+        np.testing.assert_allclose(seen_v, 0.5 * (v[1:] + v[:-1]), atol=2e-3)
+        assert np.abs(v[[0, -1]]).max() < 1e-6
+        if smooth:
+            assert (np.abs(j) <= 1.0001 * JERK).all() and (np.abs(np.diff(a, axis=0)) <= 1.01 * JERK * dt + 1e-6).all()
+            assert np.abs(a[[0, -1]]).max() < 1e-3 * ACCELERATION.max()
+
+
+def test_the_path_is_the_not_a_knot_spline() -> None:
+    timing = run()
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(POINTS, axis=0), axis=1)))
+    s = np.linspace(0.0, 1.0, 50)
+    wanted = CubicSpline(along / along[-1], POINTS)(s)
+    np.testing.assert_allclose(timing.path.derivatives(jnp.asarray(s))[0], wanted, atol=1e-9)
+
+
+def test_a_straight_line_takes_the_time_of_the_closed_form() -> None:
+    line = np.array([[0.0, 0.0, 0.0], [0.5, 1.0, 0.2]])
+    v, a = 2.0, 7.5  # of the second joint, which limits the line
+    cells = {"cells": CELLS}
+    np.testing.assert_allclose(retime(line, **LIMITS, **cells).duration, 1.0 / v + v / a, rtol=1e-3)
+    smooth = retime(line, **LIMITS, jerk=JERK).duration
+    assert 1.0 <= smooth / (1.0 / v + v / a + a / JERK[1]) < 1.02
+
+
+def test_the_time_is_least() -> None:
+    """Some limit is reached nearly everywhere: of speed or of acceleration."""
+    timing = retime(POINTS, **LIMITS, cells=1000)
+    time = jnp.linspace(0.0, float(timing.duration), 1000)
+    _, v, a, _ = np.abs(np.asarray(timing.at(time)))
+    used = np.maximum((v / VELOCITY).max(axis=1), (a / ACCELERATION).max(axis=1))
+    assert used.max() <= 1.0001
+    assert (used > 0.97).mean() > 0.95
+
+
+ARGUMENTS = jnp.asarray(POINTS), jnp.asarray(VELOCITY), jnp.asarray(ACCELERATION), jnp.asarray(JERK)
+
+
+def slopes(of, kind: int, smooth: bool) -> tuple[float, float]:
+    """Derivative of the duration along a random change of one argument, and its central difference."""
+    change = jnp.asarray(np.random.default_rng(kind).normal(size=ARGUMENTS[kind].shape)) * ARGUMENTS[kind].std()
+    gradient = jax.grad(lambda *given: run(*given, smooth=smooth).duration, argnums=kind)(*ARGUMENTS)
+    ends = []
+    for step in (1e-4, -1e-4):
+        given = [a + step * change if i == kind else a for i, a in enumerate(ARGUMENTS)]
+        ends.append(float(of(run(*given, smooth=smooth))))
+    return float((gradient * change).sum()), (ends[0] - ends[1]) / 2e-4
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2])
+def test_duration_has_the_derivatives_of_central_differences(kind) -> None:
+    found, wanted = slopes(lambda timing: timing.duration, kind, smooth=False)
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [0, 1])
+def test_with_jerk_derivatives_are_those_of_the_least_time(kind) -> None:
+    """Of the duration before its stretch, whose grid changes with the arguments in the second order of its width."""
+    found, wanted = slopes(lambda timing: timing.duration / timing.stretch, kind, smooth=True)
+    np.testing.assert_allclose(found, wanted, rtol=1e-2)
+
+
+def test_many_paths_in_one_call() -> None:
+    paths = np.cumsum(np.random.default_rng(1).normal(size=(4, 6, 3)) * 0.5, axis=1)
+    many = jax.vmap(lambda points: run(points).duration)(paths)
+    np.testing.assert_allclose(many, [run(points).duration for points in paths], rtol=1e-9)
+    paths[1] = np.nan
+    np.testing.assert_allclose(jax.vmap(lambda points: run(points).duration)(paths)[2:], many[2:], rtol=1e-9)
+
+
+def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
+    arm = osik.load_robot("arm7")
+    points = np.asarray(arm.q0) + np.linspace(0.0, 1.0, 5)[:, None] * np.array([0.8, 0.3, 0.2, 0.4, 0.0, 0.2, 0.0])
+    given = {"robot": arm, "frame": "hand", "acceleration": 5.0, "cells": CELLS}
+    timing = retime(points, speed=0.2, **given)
+    time = np.linspace(0.0, float(timing.duration), 512)
+    q = np.asarray(timing.at(jnp.asarray(time)))[0]
+    place = jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])(jnp.asarray(q))
+    speed = np.linalg.norm(np.diff(np.asarray(place), axis=0), axis=1) / time[1]
+    assert speed.max() <= 0.2001 and (speed > 0.199).mean() > 0.8
+    parts = timing.slow_parts(speed, time[:-1])
+    assert len(parts) == 2 and {part.limit for part in parts} == {"acceleration"}  # at both ends
+    assert parts[0].joint in timing.joints and parts[0].slowest < 0.05
+
+
+@pytest.mark.parametrize(
+    "points, more, message",
+    [
+        (POINTS[:1], {}, "two or more"),
+        (POINTS[[0, 1, 1, 2]], {}, "waypoints 1 and 2 are equal"),
+        (np.full((3, 3), np.nan), {}, "waypoint 0 is not finite"),
+        (POINTS, {"acceleration": [1.0, 0.0, 1.0]}, "limits of acceleration are positive; these are not: 1 0"),
+        (POINTS, {"velocity": -1.0}, "limits of velocity are positive"),
+        (POINTS, {"jerk": 0.0}, "limits of jerk are positive"),
+        (POINTS, {"acceleration": None}, "no limit of acceleration"),
+        (POINTS, {"velocity": [1.0, 2.0]}, "velocity has shape"),
+        (POINTS, {"speed": 0.1}, "robot=, frame= and speed="),
+        (POINTS, {"velocity": {"a": 1.0}}, "names need robot="),
+    ],
+)
+def test_what_cannot_be_is_refused(points, more, message) -> None:
+    with pytest.raises(osik.OsikError, match=message):
+        retime(points, **(LIMITS | more))
