@@ -144,6 +144,6 @@ def _in_body(
 def _tell(grown: Sequence[tuple[float, str]], bare: Sequence[str]) -> None:
     told = [f"{link} by {1e3 * growth:.3g} mm" for growth, link in sorted(grown, reverse=True) if growth > _TOLERANCE]
     if told:
-        warn(f"the given spheres leave surface uncovered, so they are grown: {first_of(told)}")
+        warn(f"the given spheres are grown until they are sure to cover their shapes: {first_of(told)}")
     if bare:
         warn(f"shapes without a given sphere get spheres of their own: {first_of(list(dict.fromkeys(bare)))}")

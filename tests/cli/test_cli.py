@@ -229,4 +229,4 @@ def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch)
     orange = (pixels[..., 0] > pixels[..., 2] + 60).mean(0)  # the spheres are in the right half
     assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
     assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
-    assert "no file of spheres" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
+    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")

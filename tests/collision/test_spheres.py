@@ -171,7 +171,7 @@ def test_given_spheres_cover_after_they_are_grown(tmp_path):
     with pytest.warns(osik.OsikWarning) as told:
         found = robot_shapes(ur5, spheres=smaller)
     texts = [str(one.message) for one in told]
-    assert any("leave surface uncovered, so they are grown: upper_arm_link by" in text for text in texts)
+    assert any("are grown until they are sure to cover their shapes: upper_arm_link by" in text for text in texts)
     assert any("shapes without a given sphere get spheres of their own: wrist_1_link" in text for text in texts)
     for row in range(len(found.names)):
         count, first = found.table.count[row], found.table.first[row]
@@ -206,7 +206,7 @@ def test_spheres_that_are_none_are_refused(tmp_path):
     refuses(KeyError, "no link with a collision shape 'hand'", robot_shapes, panda, spheres={"hand": []})
     wrong = {"panda_hand": [{"radius": 1.0}]}
     refuses(ValueError, "the spheres of 'panda_hand' are not", robot_shapes, panda, spheres=wrong)
-    refuses(FileNotFoundError, "lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
+    refuses(FileNotFoundError, "no spheres file .*lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
     (tmp_path / "a.yml").write_text("joints: 3")
     refuses(ValueError, "it has no collision_spheres", robot_shapes, panda, spheres=tmp_path / "a.yml")
     urdf = example_file("panda_description/urdf/panda.urdf")
