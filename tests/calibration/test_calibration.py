@@ -17,6 +17,8 @@ from osik_jax import calibration as cal
 from osik_jax.cli import main
 
 RNG = np.random.default_rng
+GATE = ["SO-101, distances and a plane"]
+NIGHT = [name for name in studies.STUDIES if name not in GATE]
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +114,7 @@ def test_offsets_axes_and_rotations_are_what_replace_sets(ur5: osik.Robot):
     np.testing.assert_allclose(tips_of(again, q)[0], tips_of(true, q)[0], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=GATE, release=NIGHT)
 @pytest.mark.parametrize("name", studies.STUDIES)
 def test_errors_are_as_large_as_sigma_says(name: str):
     """Coverage by a normal law; with 100 cases of 8 to 14 numbers the deviation is known to 3 %."""
@@ -163,7 +165,7 @@ def test_what_cannot_be_told_apart_is_named(ur5: osik.Robot):
     assert known.sigma[names[0]] == pytest.approx(1e-4, rel=1e-3) and len(known.unobservable) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=GATE, release=NIGHT)
 @pytest.mark.parametrize("name", studies.STUDIES)
 def test_the_same_optimum_as_scipy(name: str):
     assert studies.beside_scipy(studies.STUDIES[name])[0] < 1e-3  # of a deviation
