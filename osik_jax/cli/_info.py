@@ -90,22 +90,22 @@ def _print_spheres(console: Console, robot: Robot, given: str, png: str) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from ..collision import robot_shapes
+    from ..collision import covering_spheres
     from ..viewer._figures import sphere_picture
 
     try:
-        shapes = robot_shapes(robot, spheres=given or None)
+        spheres = covering_spheres(robot, given or None)
     except (OSError, ValueError, KeyError, ImportError) as error:
         raise CommandError(str(error)) from None
     table = Table("shape", "spheres", "radii, mm", "stick out, mm")
-    for row, name in enumerate(shapes.names):
-        own = shapes.sphere_shape == row
+    for row, name in enumerate(spheres.names):
+        own = spheres.shape == row
         if own.any():
-            radii, over = 1e3 * shapes.sphere_radius[own], 1e3 * shapes.sphere_overshoot[own]
+            radii, over = 1e3 * spheres.radius[own], 1e3 * spheres.overshoot[own]
             span = f"{radii.min():.1f} to {radii.max():.1f}"
             table.add_row(escape(name), str(own.sum()), span, f"{over.mean():.1f}, at most {over.max():.1f}")
     console.print(table)
-    over = 1e3 * shapes.sphere_overshoot
+    over = 1e3 * spheres.overshoot
     console.print(
         f"{len(over)} spheres stick out by {over.mean():.1f} mm in the mean and {over.max():.1f} mm at most; "
         "no surface is uncovered",
@@ -113,7 +113,7 @@ def _print_spheres(console: Console, robot: Robot, given: str, png: str) -> int:
         soft_wrap=True,
     )
     if png:
-        console.print(f"{sphere_picture(png, robot, shapes)}: the robot, and its spheres", markup=False)
+        console.print(f"{sphere_picture(png, robot, spheres)}: the robot, and its spheres", markup=False)
     return 0
 
 

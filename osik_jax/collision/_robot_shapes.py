@@ -1,4 +1,4 @@
-"""Collision shapes of a robot: exact convex shapes, covering spheres, and the pairs that are kept apart."""
+"""Collision shapes of a robot: exact convex shapes, the pairs that are kept apart, and covering spheres."""
 
 from __future__ import annotations
 
@@ -21,17 +21,15 @@ from ._convex import ConvexShape, geom_shape, shape_table
 from ._given_spheres import Spheres, cover_by_given, read_spheres
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
 from ._spheres import cover
-from ._table import RobotShapes
+from ._table import CoveringSpheres, RobotShapes
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None
 """An SRDF: its path, text or content; ``True``: the file beside the URDF; ``None``: no SRDF."""
 
 
-def robot_shapes(
-    robot: Robot, srdf: Given = None, spheres: Spheres | str | os.PathLike[str] | None = None
-) -> RobotShapes:
-    """Return the collision shapes of a robot, the spheres that cover them, and the pairs that are kept apart.
+def robot_shapes(robot: Robot, srdf: Given = None) -> RobotShapes:
+    """Return the collision shapes of a robot, and the pairs that are kept apart.
 
     Shapes are the robot's geoms that collide (``contype`` and ``conaffinity``): all collision shapes of a URDF. Meshes
     are their convex hulls. Kept apart are all pairs but those of one body, of bodies with one joint between them
@@ -43,19 +41,14 @@ def robot_shapes(
     Args:
         robot: the robot.
         srdf: see ``Given``. Its authors allow what they hold for impossible, so no SRDF is read unless one is named.
-        spheres: the user's own spheres instead of those that are made here: a ``.yaml`` of cuRobo, a URDF whose
-            collision shapes are spheres, or ``{link: [{"center": (x, y, z), "radius": r}]}`` in the links' axes [m].
-            They are grown until they are sure to cover their shapes.
 
     Raises:
         FileNotFoundError: no such file; a mesh is not found.
-        KeyError: spheres of a link without collision shapes.
         TypeError: the robot is traced.
         ValueError: nothing of the robot collides, a mesh cannot be read, or a geom has no distance.
 
     Warns:
-        OsikWarning: pairs touch in every configuration, the SRDF names links that the robot lacks, or given spheres
-            were grown.
+        OsikWarning: pairs touch in every configuration, or the SRDF names links that the robot lacks.
     """
     check_robot(robot, "robot_shapes(robot)")
     if is_traced(robot):
@@ -63,13 +56,35 @@ def robot_shapes(
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)
     if srdf is None or isinstance(srdf, Srdf):
-        rules, files = srdf, {}
-    else:
-        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
-        rules, files = None, {"srdf": srdf if is_text else _stamped(srdf, "SRDF")}
-    if isinstance(spheres, str | os.PathLike):
-        return _made(robot, rules, None, balls=_stamped(spheres, "spheres"), **files)
-    return _made(robot, rules, spheres, **files)
+        return _made(robot, srdf)
+    is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
+    return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
+
+
+def covering_spheres(robot: Robot, given: Spheres | str | os.PathLike[str] | None = None) -> CoveringSpheres:
+    """Return spheres that contain the collision shapes of a robot; made once, and kept in the cache folder.
+
+    Args:
+        robot: the robot.
+        given: spheres of your own: a ``.yaml`` of cuRobo, a URDF whose collision shapes are spheres, or
+            ``{link: [{"center": (x, y, z), "radius": r}]}`` in the links' axes [m]. They are grown until they are sure
+            to cover their shapes.
+
+    Raises:
+        FileNotFoundError: no such file; a mesh is not found.
+        KeyError: spheres of a link without collision shapes.
+        TypeError: the robot is traced, or the spheres are none.
+        ValueError: as of ``robot_shapes``; a file without spheres.
+
+    Warns:
+        OsikWarning: given spheres were grown, or shapes have none.
+    """
+    shapes = robot_shapes(robot)
+    convex = _solid(robot)[2]
+    given = read_spheres(_stamped(given, "spheres")[0]) if isinstance(given, str | os.PathLike) else given
+    size = float(robot_size(robot))
+    owner, balls = cover(convex, size) if given is None else cover_by_given(robot, given, shapes.links, convex, size)
+    return CoveringSpheres(shapes.names, owner, shapes.bodies[owner], *balls)
 
 
 def _stamped(path: Any, kind: str) -> tuple[str, int]:
@@ -85,43 +100,34 @@ def _stamped(path: Any, kind: str) -> tuple[str, int]:
 
 
 @remembered
-def _made(
-    robot: Robot,
-    rules: Srdf | None,
-    spheres: Any,
-    *,
-    srdf: str | tuple[str, int] | None = None,
-    balls: tuple[str, int] | None = None,
-) -> RobotShapes:
+def _made(robot: Robot, rules: Srdf | None, *, srdf: str | tuple[str, int] | None = None) -> RobotShapes:
     rules = rules if srdf is None else read_srdf(srdf if isinstance(srdf, str) else srdf[0])
-    spheres = spheres if balls is None else read_spheres(balls[0])
-    found = members(robot, {})
-    solid = [k for k, member in enumerate(found) if member.solid]
-    parts = [found[k] for k in solid]
-    _check(found, parts)
-    shapes = [_shape(robot, k, found[k]) for k in solid]
-    number = {k: n for n, k in enumerate(solid)}
+    found, solid, shapes = _solid(robot)
+    parts, number = [found[k] for k in solid], {k: n for n, k in enumerate(solid)}
     possible = [(number[i], number[j]) for i, j in own_pairs(robot, found)]
     kept = _without_allowed(robot, parts, possible, rules)
     touching = always_touching(robot, [part.body for part in parts], shapes, kept)
     if touching:
         _warn_of_touching([f"{parts[i].name}-{parts[j].name}" for i, j in touching])
     kept = [pair for pair in kept if pair not in set(touching)]
-    links, size = tuple(part.aliases[0] for part in parts), float(robot_size(robot))
-    owner, covering = cover(shapes, size) if spheres is None else cover_by_given(robot, spheres, links, shapes, size)
     return RobotShapes(
         names=tuple(part.name for part in parts),
-        links=links,
+        links=tuple(part.aliases[0] for part in parts),
         bodies=np.array([part.body for part in parts], np.int32),
         table=shape_table(shapes),
         pairs=np.array(kept, np.int32).reshape(-1, 2),
         world=np.array(moves(robot, parts), bool),
-        sphere_shape=owner,
-        sphere_center=covering.center,
-        sphere_radius=covering.radius,
-        sphere_overshoot=covering.overshoot,
         touching=tuple((parts[i].name, parts[j].name) for i, j in touching),
     )
+
+
+@remembered
+def _solid(robot: Robot) -> tuple[list[Member], list[int], list[ConvexShape]]:
+    """Return all geoms, the numbers of those that collide, and the shapes of these."""
+    found = members(robot, {})
+    solid = [k for k, member in enumerate(found) if member.solid]
+    _check(found, [found[k] for k in solid])
+    return found, solid, [_shape(robot, k, found[k]) for k in solid]
 
 
 def _check(found: Sequence[Member], solid: Sequence[Member]) -> None:

@@ -45,7 +45,7 @@ class ShapeTable(NamedTuple):
 
 
 class RobotShapes(NamedTuple):
-    """Collision shapes of a robot, the spheres that cover them, and the pairs that may touch.
+    """Collision shapes of a robot, and the pairs that may touch.
 
     Attributes:
         names: of the shapes, such as ``"forearm_link:0"``; all different.
@@ -54,10 +54,6 @@ class RobotShapes(NamedTuple):
         table: the shapes; poses are in the moving body.
         pairs: shapes of the robot that are kept apart from each other: first < second. (p, 2)
         world: whether each shape is kept off the scene. (k,)
-        sphere_shape: shape that each covering sphere belongs to. (s,)
-        sphere_center: in the axes of the moving body [m]. (s, 3)
-        sphere_radius: [m]. Together the spheres of a shape contain it. (s,)
-        sphere_overshoot: how far each sphere sticks out of its shape at most [m]. (s,)
         touching: names of the pairs that are not kept apart because they touch in every configuration.
     """
 
@@ -67,8 +63,24 @@ class RobotShapes(NamedTuple):
     table: ShapeTable
     pairs: Int[np.ndarray, "p 2"]
     world: np.ndarray
-    sphere_shape: Int[np.ndarray, " s"]
-    sphere_center: Float[np.ndarray, "s 3"]
-    sphere_radius: Float[np.ndarray, " s"]
-    sphere_overshoot: Float[np.ndarray, " s"]
     touching: tuple[tuple[str, str], ...] = ()
+
+
+class CoveringSpheres(NamedTuple):
+    """Spheres that contain the collision shapes of a robot.
+
+    Attributes:
+        names: of the shapes, as in ``RobotShapes``.
+        shape: shape that each sphere belongs to. (s,)
+        body: moving body that it is fixed to. (s,)
+        center: in the axes of that body [m]. (s, 3)
+        radius: [m]. Together the spheres of a shape contain it. (s,)
+        overshoot: how far each sphere sticks out of its shape at most [m]. (s,)
+    """
+
+    names: tuple[str, ...]
+    shape: Int[np.ndarray, " s"]
+    body: Int[np.ndarray, " s"]
+    center: Float[np.ndarray, "s 3"]
+    radius: Float[np.ndarray, " s"]
+    overshoot: Float[np.ndarray, " s"]

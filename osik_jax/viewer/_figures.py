@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Float
 from PIL import Image
 
 from ..collision import CollisionShape
-from ..collision._table import RobotShapes
+from ..collision._table import CoveringSpheres
 from ..robot import Robot
 from ..robot._mujoco import model_bodies, mujoco_poses, robot_com
 from ._animate import paint_over
@@ -93,10 +93,10 @@ def hero_picture(
     return Path(path)
 
 
-def sphere_picture(path: str | Path, robot: Robot, shapes: RobotShapes) -> Path:
+def sphere_picture(path: str | Path, robot: Robot, spheres: CoveringSpheres) -> Path:
     """Save a picture (.png) of a robot at home, and beside it the spheres that cover its collision shapes."""
     size, azimuth = (1600, 900), 30.0
-    figures = [robot_parts(robot), _sphere_parts(robot, shapes)]
+    figures = [robot_parts(robot), _sphere_parts(robot, spheres)]
     source = next(mujoco_poses(robot, robot.q0))
     corners = [figure.corners(source) for figure in figures]
     shifts = _side_by_side(corners, azimuth, None)
@@ -109,16 +109,16 @@ def sphere_picture(path: str | Path, robot: Robot, shapes: RobotShapes) -> Path:
     return Path(path)
 
 
-def _sphere_parts(robot: Robot, shapes: RobotShapes) -> RobotParts:
+def _sphere_parts(robot: Robot, spheres: CoveringSpheres) -> RobotParts:
     """Return the covering spheres as parts; neighbouring shapes have different colours."""
     colors = np.array([[0.16, 0.45, 0.75, 1.0], [0.93, 0.55, 0.19, 1.0], [0.35, 0.65, 0.35, 1.0]])
     parts = tuple(
         Part(k, mujoco.mjtGeom.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), colors[shape % len(colors)])
-        for k, (radius, shape) in enumerate(zip(shapes.sphere_radius, shapes.sphere_shape, strict=True))
+        for k, (radius, shape) in enumerate(zip(spheres.radius, spheres.shape, strict=True))
     )
-    bodies = np.array(model_bodies(robot))[shapes.bodies[shapes.sphere_shape]]
+    bodies = np.array(model_bodies(robot))[spheres.body]
     turns = np.broadcast_to(np.eye(3), (len(parts), 3, 3))
-    return RobotParts(robot.mj_model, "geoms", parts, bodies, (shapes.sphere_center, turns))
+    return RobotParts(robot.mj_model, "geoms", parts, bodies, (spheres.center, turns))
 
 
 def _side_by_side(

@@ -7,10 +7,10 @@ from refusals import refuses
 from robot_support import directions, mesh_vertices, pinocchio_geometry, table_support
 
 import osik_jax as osik
+from osik_jax.collision import covering_spheres, robot_shapes
 from osik_jax.collision._convex import ConvexShape, shape_table
-from osik_jax.collision._robot_shapes import robot_shapes
 from osik_jax.collision._spheres import LEAST, MOST, covering_balls
-from osik_jax.collision._table import RobotShapes, ShapeKind
+from osik_jax.collision._table import CoveringSpheres, ShapeKind
 from osik_jax.robot._size import robot_size
 from osik_jax.robot.loading._embedded import EXAMPLES
 
@@ -37,9 +37,9 @@ def uncovered(points: np.ndarray, centers: np.ndarray, radii: np.ndarray) -> flo
     )
 
 
-def balls_of(shapes: RobotShapes, row: int) -> tuple[np.ndarray, np.ndarray]:
-    own = shapes.sphere_shape == row
-    return shapes.sphere_center[own], shapes.sphere_radius[own]
+def balls_of(spheres: CoveringSpheres, row: int) -> tuple[np.ndarray, np.ndarray]:
+    own = spheres.shape == row
+    return spheres.center[own], spheres.radius[own]
 
 
 @pytest.mark.filterwarnings("ignore:these pairs touch")
@@ -49,7 +49,7 @@ def balls_of(shapes: RobotShapes, row: int) -> tuple[np.ndarray, np.ndarray]:
 def test_no_point_of_a_true_mesh_is_outside(name: str):
     """20,000 points on each mesh as Pinocchio reads it, and the corners of the hulls; meshes need not be convex."""
     robot = osik.load_robot(name)
-    shapes = robot_shapes(robot)
+    shapes, spheres = robot_shapes(robot), covering_spheres(robot)
     model, geometry = pinocchio_geometry(example_file(EXAMPLES[name][0]))
     for thing in geometry.geometryObjects:
         if hasattr(thing.geometry, "num_vertices"):
@@ -62,9 +62,9 @@ def test_no_point_of_a_true_mesh_is_outside(name: str):
             faces = np.array([[triangle[k] for k in range(3)] for triangle in triangles])
             points = np.concatenate([corners, on_triangles(corners, faces, 20_000)])
             rows = [k for k, link in enumerate(shapes.links) if link == frame.name and shapes.table.count[k]]
-            assert min(uncovered(points, *balls_of(shapes, row)) for row in rows) < 1e-6
-    assert set(shapes.sphere_shape) == set(range(len(shapes.names)))
-    assert np.bincount(shapes.sphere_shape).max() <= MOST
+            assert min(uncovered(points, *balls_of(spheres, row)) for row in rows) < 1e-6
+    assert set(spheres.shape) == set(range(len(shapes.names)))
+    assert np.bincount(spheres.shape).max() <= MOST
 
 
 def inside(shape: ConvexShape, count: int) -> np.ndarray:
@@ -125,36 +125,36 @@ def test_a_shape_is_inside_its_balls_and_they_stick_out_no_farther_than_told(nam
 
 def test_balls_are_kept_in_the_cache_folder(tmp_path, monkeypatch: pytest.MonkeyPatch):
     robot = osik.load_robot("ur5")
-    first = robot_shapes(robot)
+    first = covering_spheres(robot)
     (path,) = (tmp_path / "osik_jax").glob("spheres_*.npz")
-    again = robot_shapes(osik.load_robot("ur5"))
-    assert again is not first and np.array_equal(again.sphere_radius, first.sphere_radius)
+    again = covering_spheres(osik.load_robot("ur5"))
+    assert again is not first and np.array_equal(again.radius, first.radius)
     path.write_bytes(b"damaged")
-    assert np.array_equal(robot_shapes(osik.load_robot("ur5")).sphere_center, first.sphere_center)
+    assert np.array_equal(covering_spheres(osik.load_robot("ur5")).center, first.center)
     assert path.stat().st_size > 100
     with np.load(path) as file:
         changed = {**file, "radius": 2.0 * file["radius"]}
     np.savez(path, **changed)
-    read = robot_shapes(osik.load_robot("ur5"))
-    assert np.array_equal(read.sphere_radius, 2.0 * first.sphere_radius)  # what is in the file is taken
-    longer = robot_shapes(osik.load_robot("ur5").scaled(length=1.5))
-    np.testing.assert_allclose(longer.sphere_radius.max(), 1.5 * first.sphere_radius.max(), rtol=1e-5)
+    read = covering_spheres(osik.load_robot("ur5"))
+    assert np.array_equal(read.radius, 2.0 * first.radius)  # what is in the file is taken
+    longer = covering_spheres(osik.load_robot("ur5").scaled(length=1.5))
+    np.testing.assert_allclose(longer.radius.max(), 1.5 * first.radius.max(), rtol=1e-5)
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    assert np.array_equal(robot_shapes(osik.load_robot("ur5")).sphere_center, first.sphere_center)
-    assert first.sphere_overshoot.min() >= 0.0 and robot_size(robot) * LEAST > 0.005
+    assert np.array_equal(covering_spheres(osik.load_robot("ur5")).center, first.center)
+    assert first.overshoot.min() >= 0.0 and robot_size(robot) * LEAST > 0.005
 
 
 def given_for(robot: osik.Robot):
     """The spheres that this package makes, in the axes of the links."""
-    shapes = robot_shapes(robot)
+    shapes, spheres = robot_shapes(robot), covering_spheres(robot)
     found: dict[str, list] = {}
-    for row, center, radius in zip(shapes.sphere_shape, shapes.sphere_center, shapes.sphere_radius, strict=True):
+    for row, center, radius in zip(spheres.shape, spheres.center, spheres.radius, strict=True):
         at = robot.frame_names.index(shapes.links[row])
         turn, place = np.asarray(robot.frame_rotation[at], float), np.asarray(robot.frame_position[at], float)
         found.setdefault(shapes.links[row], []).append(
             {"center": ((center - place) @ turn).tolist(), "radius": float(radius)}
         )
-    return shapes, found
+    return shapes.table, spheres, found
 
 
 def as_collision(ball: dict) -> str:
@@ -165,25 +165,25 @@ def as_collision(ball: dict) -> str:
 def test_given_spheres_cover_after_they_are_grown(tmp_path):
     """Those of cuRobo's files, of spherized URDFs and of dictionaries."""
     ur5 = osik.load_robot("ur5")
-    own, given = given_for(ur5)
+    table, own, given = given_for(ur5)
     smaller = {link: [{**one, "radius": 0.8 * one["radius"]} for one in some] for link, some in given.items()}
     del smaller["wrist_1_link"]
     with pytest.warns(osik.OsikWarning) as told:
-        found = robot_shapes(ur5, spheres=smaller)
+        found = covering_spheres(ur5, smaller)
     texts = [str(one.message) for one in told]
     assert any("are grown until they are sure to cover their shapes: upper_arm_link by" in text for text in texts)
     assert any("shapes without a given sphere get spheres of their own: wrist_1_link" in text for text in texts)
     for row in range(len(found.names)):
-        count, first = found.table.count[row], found.table.first[row]
+        count, first = table.count[row], table.first[row]
         if count:
-            hull = found.table.vertices[first : first + count]
+            hull = table.vertices[first : first + count]
             points = np.concatenate([hull, np.random.default_rng(0).dirichlet(0.1 * np.ones(count), 5000) @ hull])
-            points = points @ found.table.rotation[row].T + found.table.position[row]
+            points = points @ table.rotation[row].T + table.position[row]
             assert uncovered(points, *balls_of(found, row)) < 1e-9
     ways = directions(2000)
-    for k, row in enumerate(found.sphere_shape):
-        beyond = (ways @ found.sphere_center[k] + found.sphere_radius[k] - table_support(found.table, row, ways)).max()
-        assert beyond <= found.sphere_overshoot[k] + 1e-9
+    for k, row in enumerate(found.shape):
+        beyond = (ways @ found.center[k] + found.radius[k] - table_support(table, row, ways)).max()
+        assert beyond <= found.overshoot[k] + 1e-9
     text = "".join(f'<link name="{link}">{"".join(map(as_collision, some))}</link>' for link, some in given.items())
     joints = "".join(
         f'<joint name="{link}" type="fixed"><parent link="base_link"/><child link="{link}"/></joint>'
@@ -195,19 +195,18 @@ def test_given_spheres_cover_after_they_are_grown(tmp_path):
     (tmp_path / "robot.yml").write_text(str(yaml))
     (tmp_path / "spheres.yml").write_text(str({"collision_spheres": given}))
     for name in ("balls.urdf", "robot.yml"):
-        read = robot_shapes(ur5, spheres=tmp_path / name)
-        assert len(read.sphere_radius) == len(own.sphere_radius)
-        assert robot_shapes(ur5, spheres=tmp_path / name) is read
+        read = covering_spheres(ur5, tmp_path / name)
+        assert len(read.radius) == len(own.radius)
 
 
 def test_spheres_that_are_none_are_refused(tmp_path):
     panda = osik.load_robot("panda")
-    refuses(TypeError, r"spheres is float; it is a path, or \{link", robot_shapes, panda, spheres=1.0)
-    refuses(KeyError, "no link with a collision shape 'hand'", robot_shapes, panda, spheres={"hand": []})
+    refuses(TypeError, r"spheres is float; it is a path, or \{link", covering_spheres, panda, 1.0)
+    refuses(KeyError, "no link with a collision shape 'hand'", covering_spheres, panda, {"hand": []})
     wrong = {"panda_hand": [{"radius": 1.0}]}
-    refuses(ValueError, "the spheres of 'panda_hand' are not", robot_shapes, panda, spheres=wrong)
-    refuses(FileNotFoundError, "no spheres file .*lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
+    refuses(ValueError, "the spheres of 'panda_hand' are not", covering_spheres, panda, wrong)
+    refuses(FileNotFoundError, "no spheres file .*lost.yml", covering_spheres, panda, tmp_path / "lost.yml")
     (tmp_path / "a.yml").write_text("joints: 3")
-    refuses(ValueError, "it has no collision_spheres", robot_shapes, panda, spheres=tmp_path / "a.yml")
+    refuses(ValueError, "it has no collision_spheres", covering_spheres, panda, tmp_path / "a.yml")
     urdf = example_file("panda_description/urdf/panda.urdf")
-    refuses(ValueError, "none of the collision shapes is a sphere", robot_shapes, panda, spheres=urdf)
+    refuses(ValueError, "none of the collision shapes is a sphere", covering_spheres, panda, urdf)
