@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError, unknown_name
+from .._errors import OsikValueError
 from ..numerics._arguments import as_array, check_not_negative, concrete
 from ._model import RobotModel
 from ._tree import KinematicTree
+from .loading._followers import match_names
 
 Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
@@ -43,7 +43,7 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
         return factors.at[1:].set(_factor(given, what, dtype))
     seen: dict[int, str] = {}
     for pattern, factor in given.items():
-        for body in _bodies(tree, pattern):
+        for body in (1 + k for k in match_names("body", pattern, tree.body_names[1:])):
             if body in seen:
                 raise OsikValueError(
                     f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"
@@ -61,14 +61,3 @@ def _factor(value: Any, what: str, dtype: np.dtype) -> Array:
     if what.startswith("length") and seen is not None and not seen.all():
         raise OsikValueError(f"{what} is {value}; a length is scaled by a positive factor")
     return factor
-
-
-def _bodies(tree: KinematicTree, pattern: str) -> list[int]:
-    """Return the moving bodies named ``pattern``, else those that match it as a glob."""
-    names = dict(zip(tree.body_names[1:], range(1, len(tree.body_names)), strict=True))
-    found = [body for name, body in names.items() if name == pattern] or [
-        body for name, body in names.items() if fnmatch.fnmatchcase(name, pattern)
-    ]
-    if not found:
-        raise unknown_name("body", pattern, tuple(names))
-    return found
