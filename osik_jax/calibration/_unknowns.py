@@ -19,7 +19,7 @@ from ..kinematics._rigid import compose
 from ..numerics._arguments import concrete
 from ..robot import Robot
 from ..robot._joint_selection import is_scalar, select_joints
-from ..robot._replace import find_names
+from ..robot.loading._followers import match_names
 from ._setup import BASE, Setup
 
 _UNITS = {
@@ -131,7 +131,7 @@ def _names(setup: Setup, unknown: Unknown) -> list[str]:
     given = (unknown.names,) if isinstance(unknown.names, str) else tuple(unknown.names)
     if kind != "joint":
         known = robot.body_names if kind == "body" else (*robot.frame_names, *setup.names[1:])
-        return list(dict.fromkeys(name for pattern in given for name in find_names(known, pattern, kind)))
+        return list(dict.fromkeys(known[k] for pattern in given for k in match_names(kind, pattern, known)))
     joints = dict.fromkeys(joint for pattern in given for joint in select_joints(robot, pattern))
     for joint in joints:
         if not is_scalar(robot, joint):

@@ -15,7 +15,7 @@ from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
-from ._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE
+from ._tree import BALL, HINGE, QPOS_WIDTH, SLIDE
 from .loading._keyframes import keyframe_home, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
@@ -91,11 +91,9 @@ def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Numbers:
 
 
 def _with_unit_quaternions(robot: RobotModel, q: Float[Numbers, " nq"]) -> Float[Numbers, " nq"]:
-    for joint, start in robot.tree.qpos_address.items():
-        kind = robot.tree.joint_types[joint]
-        if kind in (FREE, BALL):
-            part = slice(start + QPOS_WIDTH[kind] - 4, start + QPOS_WIDTH[kind])
-            q = replaced_at(q, part, q[part] / module_of(q).linalg.norm(q[part]))
+    for start in robot.tree.quaternions:
+        part = slice(start, start + 4)
+        q = replaced_at(q, part, q[part] / module_of(q).linalg.norm(q[part]))
     return q
 
 

@@ -12,8 +12,8 @@ from jaxtyping import Array, Float
 from .._errors import OsikValueError
 from ..numerics._arguments import as_array, check_not_negative, concrete
 from ._model import RobotModel
-from ._replace import find_names
 from ._tree import KinematicTree
+from .loading._followers import match_names
 
 Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
@@ -43,8 +43,7 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
         return factors.at[1:].set(_factor(given, what, dtype))
     seen: dict[int, str] = {}
     for pattern, factor in given.items():
-        for name in find_names(tree.body_names[1:], pattern, "body"):
-            body = tree.body_names.index(name, 1)
+        for body in (1 + k for k in match_names("body", pattern, tree.body_names[1:])):
             if body in seen:
                 raise OsikValueError(
                     f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"

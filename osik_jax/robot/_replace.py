@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import fnmatch
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._home_configuration import home_configuration
 from ._model import RobotModel
 from ._tree import DOF_WIDTH, QPOS_WIDTH, KinematicTree
+from .loading._followers import match_names
 
 Rows = dict[str, int | slice]
 """Place of each name in an array: a row, or the entries of a joint."""
@@ -48,9 +48,11 @@ def _replaced(robot: RobotModel, field: str, value: Any) -> Array:
     if not isinstance(value, Mapping):
         return to_jax(_checked(field, value, old.shape, old.dtype, field))
     new, rows, given = on_host(old), _rows_of(robot.tree, field), {}
+    names = tuple(rows)
     for pattern, row_value in value.items():
         _refuse_frame(robot.tree, field, pattern)
-        for name in find_names(tuple(rows), pattern, field.split("_")[0].replace("dof", "joint")):
+        for number in match_names(field.split("_")[0].replace("dof", "joint"), pattern, names):
+            name = names[number]
             if name in given:
                 raise OsikValueError(f"{field} gives {name!r} twice, by {given[name]!r} and by {pattern!r}")
             given[name] = pattern
@@ -90,19 +92,6 @@ def _rows_of(tree: KinematicTree, field: str) -> Rows:
 def _entries(start: int, width: int) -> int | slice:
     """Return the entries of a joint: an index for a hinge or slide, a slice for a ball or free joint."""
     return int(start) if width == 1 else slice(int(start), int(start) + width)
-
-
-def find_names(names: Sequence[str], pattern: Any, kind: str) -> list[str]:
-    """Return the name equal to ``pattern``, else the names that match it as a glob.
-
-    Raises:
-        KeyError: there are none; the message lists the names.
-    """
-    found = [name for name in names if name == pattern]
-    found = found or [name for name in names if fnmatch.fnmatchcase(name, str(pattern))]
-    if not found:
-        raise unknown_name(kind, pattern, tuple(names))
-    return found
 
 
 def _checked(field: str, value: Any, shape: tuple[int, ...], dtype: Any, what: str) -> Numbers:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar, cast
@@ -202,13 +202,15 @@ class KinematicTree:
     @cached_property
     def qpos_address(self) -> dict[int, int]:
         """Return the index in q of each independent joint."""
-        widths = [QPOS_WIDTH[self.joint_types[j]] for j in self.independent]
-        return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
+        return self._addresses(QPOS_WIDTH)
 
     @cached_property
     def dof_address(self) -> dict[int, int]:
         """Return the index in v of each independent joint."""
-        widths = [DOF_WIDTH[self.joint_types[j]] for j in self.independent]
+        return self._addresses(DOF_WIDTH)
+
+    def _addresses(self, width: Mapping[int, int]) -> dict[int, int]:
+        widths = [width[self.joint_types[j]] for j in self.independent]
         return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
 
     @cached_property

@@ -18,6 +18,7 @@ from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, no_limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ..tasks import AdaptiveGain, SupportPolygon, Task
+from ..tasks._repr import ROW_NAMES
 from ._collision import collision_arguments, collision_data
 
 Data = dict[str, Any]
@@ -25,7 +26,6 @@ Data = dict[str, Any]
 
 _CLASSES = (Task, Limit, Scheme, AdaptiveGain, SupportPolygon)
 _NO_LIMITS = "no_limits"
-_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
 
 
 def encode_parts(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> Data:
@@ -146,7 +146,7 @@ def _argument(part: Any, robot: Robot, name: str, where: str) -> Any:
     """Return the constructor's argument that makes this part of the object, as plain data."""
     names = robot.tree.joint_names
     if name == "rows":
-        return _ROWS.get(part.kept, list(part.kept))
+        return ROW_NAMES.get(part.kept, list(part.kept))
     if name == "joint":
         return names[part.joint]
     if name == "joints":

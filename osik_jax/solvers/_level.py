@@ -101,10 +101,31 @@ class Level(eqx.Module):
         lower, upper, unordered = ordered_bounds(self.lower, jnp.where(known, self.lower, self.upper))
         return Level(self.matrix, lower, upper, self.weight, self.equalities), unordered
 
+    def padded(self, rows: int) -> Level:
+        """Return the level of weight 1 with rows of zeros up to a count; these are unbounded, so met everywhere."""
+        more = rows - len(self.lower)
+        return Level(
+            jnp.pad(self.matrix, ((0, more), (0, 0))),
+            jnp.pad(self.lower, (0, more), constant_values=-jnp.inf),
+            jnp.pad(self.upper, (0, more), constant_values=jnp.inf),
+        )
+
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Return A x minus the nearest point of its interval: the slack, 0 where the row holds, (m,)."""
         value = apply(self.matrix, x)
         return value - jnp.clip(value, self.lower, self.upper)
+
+
+def bounds_exist(lower: Array, upper: Array) -> Bool[Array, ""]:
+    """Check that no bound is NaN, and none infinite on the wrong side."""
+    return ((lower < jnp.inf) & (upper > -jnp.inf)).all()
+
+
+def are_finite(levels: Sequence[Level]) -> list[Bool[Array, ""]]:
+    """Check that there is no NaN in levels, and no infinity except in bounds that do not exist."""
+    checks = [jnp.isfinite(level.matrix).all() for level in levels]
+    checks += [bounds_exist(level.lower, level.upper) for level in levels]
+    return checks + [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
 
 
 def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -18,11 +18,11 @@ from ..numerics._host import on_host, to_jax
 from ..robot import Robot
 from ._com import check_axes
 from ._leaves import as_bounds, as_scalar, as_vector, as_weight, check_bounds
-from ._stay import StayTask
-from ._task import Task, TaskRows, check_priority
+from ._stay import MotionTask
+from ._task import TaskRows, check_priority
 
 
-class AngularMomentumTask(Task):
+class AngularMomentumTask(MotionTask):
     """Task on the robot's angular momentum about its centre of mass: at a value or within bounds.
 
     With A the angular rows of ``centroidal_momentum_matrix`` along the chosen axes of the world:
@@ -94,16 +94,6 @@ class AngularMomentumTask(Task):
     def error_bounds(self) -> tuple[Any, Any] | None:
         """Return None: the bounds are on the momentum, and the error is 0."""
         return None
-
-    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
-        """Return a task for little turning of mass from q0."""
-        del robot
-        return StayTask(self, q0)
-
-    @property
-    def replaceable(self) -> tuple[str, ...]:
-        """Return the names that ``replace`` accepts."""
-        return tuple(name for name in super().replaceable if name != "gain")
 
     @property
     def _weight_rows(self) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar
@@ -146,33 +146,21 @@ class ComTask(Task):
         point, jacobian = moving_center(robot, kinematics, self.subtree)
         bound = partial(jacobian_curvature, jacobian=jnp.where(robot.tree.turning, jacobian, 0.0))
         if self.polygon is not None:
-            return self._polygon_rows(self.polygon, point, jacobian, bound)
-        axes = axis_numbers(self.axes)
-        # own minus wanted: the error's Jacobian is then that of the centre of mass, without a sign
-        value = point[axes] if self.target is None else point[axes] - self.target
-        return TaskRows.of(
-            value,
-            jacobian[axes],
-            gain=self.gain,
-            weight=jnp.broadcast_to(self.weight, value.shape),
-            lower=self.lower,
-            upper=self.upper,
-            feedforward=self.target_velocity,
-            curvature=bound,
-        )
-
-    def _polygon_rows(
-        self, polygon: SupportPolygon, point: Array, jacobian: Array, bound: Callable[[Array], Array]
-    ) -> TaskRows:
-        value = jnp.matmul(polygon.normals, point[:2], precision="highest")
-        return TaskRows.of(
-            value,
-            jnp.matmul(polygon.normals, jacobian[:2], precision="highest"),
+            value, rows = (jnp.matmul(self.polygon.normals, a[:2], precision="highest") for a in (point, jacobian))
             # normals point outward, so an edge binds on its upper side alone
-            lower=jnp.full_like(value, -jnp.inf),
-            upper=polygon.offsets,
+            lower, upper = jnp.full_like(value, -jnp.inf), self.polygon.offsets
+        else:
+            axes, lower, upper = axis_numbers(self.axes), self.lower, self.upper
+            # own minus wanted: the error's Jacobian is then that of the centre of mass, without a sign
+            value, rows = point[axes] if self.target is None else point[axes] - self.target, jacobian[axes]
+        return TaskRows.of(
+            value,
+            rows,
             gain=self.gain,
             weight=jnp.broadcast_to(self.weight, value.shape),
+            lower=lower,
+            upper=upper,
+            feedforward=self.target_velocity,
             curvature=bound,
         )
 

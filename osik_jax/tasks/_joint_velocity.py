@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self
 
@@ -18,15 +17,14 @@ from ..robot import Robot
 from ..robot._joint_selection import dofs_of, select_all
 from ._background import background_weight
 from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
-from ._stay import StayTask
-from ._task import Task, TaskRows, check_priority
+from ._stay import MotionTask
+from ._task import TaskRows, check_priority
 
 
-class VelocityTask(Task):
+class VelocityTask(MotionTask):
     """Base of tasks on the velocity of dofs: rows of the identity, ``v_i = wanted_i``.
 
-    There is no error that could decay: it is 0, and there is no gain. In ``inverse_kinematics`` the rows ask for no
-    motion from ``q0``.
+    There is no error that could decay: it is 0, and there is no gain.
     """
 
     units: ClassVar[Mapping[str, str]] = {"": "rad/s or m/s"}
@@ -41,9 +39,9 @@ class VelocityTask(Task):
         self.weight = as_joint_weight(robot, weight, dofs)
         self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
 
-    @abc.abstractmethod
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Return the wanted velocities of the chosen dofs [rad/s or m/s]."""
+        """Return the wanted velocities of the chosen dofs [rad/s or m/s]: 0 unless a subclass says otherwise."""
+        return jnp.zeros(len(dofs), self.weight.dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per dof of the chosen joints, in the order of v."""
@@ -61,19 +59,9 @@ class VelocityTask(Task):
             is_equality=True,
         )
 
-    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
-        """Return a task for joints that stay where they are at q0."""
-        del robot
-        return StayTask(self, q0)
-
     def counted_dofs(self, robot: Robot) -> tuple[int, ...]:
         """Return the entries of v of the chosen joints."""
         return tuple(dofs_of(robot, self.joints))
-
-    @property
-    def replaceable(self) -> tuple[str, ...]:
-        """Return the names that ``replace`` accepts."""
-        return tuple(name for name in super().replaceable if name != "gain")
 
     @property
     def _weight_rows(self) -> int:
@@ -115,10 +103,6 @@ class DampingTask(VelocityTask):
         weight = background_weight(robot) if weight is None else weight
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
 
-    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Return 0 for each dof."""
-        return jnp.zeros(len(dofs), self.weight.dtype)
-
 
 class FreezeTask(VelocityTask):
     """Task that keeps joints at rest while the rest of the robot moves: ``v_i = 0``.
@@ -153,10 +137,6 @@ class FreezeTask(VelocityTask):
         super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
         if not self.joints:
             raise OsikValueError("a FreezeTask needs at least one joint")
-
-    def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
-        """Return 0 for each dof."""
-        return jnp.zeros(len(dofs), self.weight.dtype)
 
 
 class JointVelocityTask(VelocityTask):

@@ -12,11 +12,11 @@ from ..kinematics._forward import body_masses
 from ..numerics._constants import INERTIA_ROUNDOFF
 from ..robot import Robot
 from ._leaves import as_scalar
-from ._stay import StayTask
-from ._task import Task, TaskRows, check_priority
+from ._stay import MotionTask
+from ._task import TaskRows, check_priority
 
 
-class KineticEnergyTask(Task):
+class KineticEnergyTask(MotionTask):
     """Task for low kinetic energy: among motions that serve other tasks, it prefers those that move little mass.
 
     With M = L L' the ``mass_matrix``, asks for ``L' v = 0``. In a weighted problem that adds ``weight v' M v / 2``,
@@ -50,16 +50,6 @@ class KineticEnergyTask(Task):
         # |U v|^2 = v' M v is twice the energy, and schemes halve squared rows: weight 1 counts the energy once
         zero = jnp.zeros(robot.nv, root.dtype)
         return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
-
-    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
-        """Return a task for little motion of mass from q0."""
-        del robot
-        return StayTask(self, q0)
-
-    @property
-    def replaceable(self) -> tuple[str, ...]:
-        """Return the names that ``replace`` accepts."""
-        return tuple(name for name in super().replaceable if name != "gain")
 
 
 def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:

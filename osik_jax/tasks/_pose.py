@@ -23,6 +23,7 @@ from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
 from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
+from ._repr import ROWS
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._task import POSE, CoreCard, TaskRows, check_priority
 from ._twist import pose_log, seen_from
@@ -31,11 +32,6 @@ RADIAN = 0.1
 """Length [m] that an error of one radian counts as in pose tasks by default, and in ``inverse_kinematics``: a hand that
 turns by a radian about its wrist moves its fingertips by about this.
 """
-_ROWS = {
-    "pose": (True,) * 6,
-    "position": (True,) * 3 + (False,) * 3,
-    "orientation": (False,) * 3 + (True,) * 3,
-}
 _Parts = tuple[Float[Array, "3"], Float[Array, "3 nv"], Float[Array, "3"]]
 _Blocks = list[tuple[Sequence[bool], tuple[Array, Array, Array, Array]]]
 """Blocks of a pose task's rows: mask of the chosen rows, error, Jacobian, feedforward and weight."""
@@ -323,9 +319,9 @@ def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
         ValueError: no such name, not six, or none of them is true.
     """
     if isinstance(rows, str):
-        if rows not in _ROWS:
-            raise OsikValueError(unknown_name("row set", rows, tuple(_ROWS)).args[0])
-        return _ROWS[rows]
+        if rows not in ROWS:
+            raise OsikValueError(unknown_name("row set", rows, tuple(ROWS)).args[0])
+        return ROWS[rows]
     mask = tuple(bool(row) for row in rows)
     if len(mask) != 6 or not any(mask):
         raise OsikValueError(f"rows has six booleans (x, y, z, rotation about x, y, z), at least one true; got {rows}")

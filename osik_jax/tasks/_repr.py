@@ -21,7 +21,9 @@ def short_repr(task: Any) -> str:
     return f"{type(task).__name__}({', '.join(parts)})"
 
 
-_ROWS = {(True,) * 6: "pose", (True,) * 3 + (False,) * 3: "position", (False,) * 3 + (True,) * 3: "orientation"}
+ROWS = {"pose": (True,) * 6, "position": (True,) * 3 + (False,) * 3, "orientation": (False,) * 3 + (True,) * 3}
+"""Masks of a pose's rows that have a name."""
+ROW_NAMES = {mask: name for name, mask in ROWS.items()}
 _SILENT = ("row_count", "orientation_jacobian", "made_for")
 """Fields that are left out, because they follow from others or rarely change."""
 
@@ -36,7 +38,7 @@ def _options(task: Any) -> dict[str, str]:
         if name in ("joints", "dofs"):
             found[name] = f"{name}=<{len(value)}>"
         elif name == "kept":
-            found[name] = f"rows={_ROWS.get(value, value)!r}"
+            found[name] = f"rows={ROW_NAMES.get(value, value)!r}"
         elif isinstance(value, (str, bool, int)) or _is_short(value):
             found[name] = f"{name}={value!r}"
     return found

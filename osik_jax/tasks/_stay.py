@@ -1,4 +1,4 @@
-"""Task on velocities as inverse kinematics reads it."""
+"""Tasks on motions, and how inverse kinematics reads them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,23 @@ from ..robot import Robot
 from ._curvature import no_curvature
 from ._gain import as_gain
 from ._task import Task, TaskRows
+
+
+class MotionTask(Task):
+    """Base of tasks on a motion: no error that could decay, and no gain.
+
+    In ``inverse_kinematics`` they ask for no motion from ``q0`` along their rows.
+    """
+
+    def sought(self, robot: Robot, q0: Float[Array, " nq"]) -> Task:
+        """Return a task for no motion from q0."""
+        del robot
+        return StayTask(self, q0)
+
+    @property
+    def replaceable(self) -> tuple[str, ...]:
+        """Return the names that ``replace`` accepts."""
+        return tuple(name for name in super().replaceable if name != "gain")
 
 
 class StayTask(Task):

@@ -52,11 +52,16 @@ def number(value: Any, what: str) -> float:
 
 def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
     """Return the joints named ``pattern``, else those that match it as a glob; raise KeyError if there are none."""
+    return match_names("joint", pattern, names)
+
+
+def match_names(kind: str, pattern: str, names: tuple[str, ...]) -> list[int]:
+    """Return the places of a name, else of those that match it as a glob; raise KeyError if there are none."""
     if pattern in names:
         return [names.index(pattern)]
-    found = [j for j, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
+    found = [k for k, name in enumerate(names) if fnmatch.fnmatchcase(name, str(pattern))]
     if not found:
-        raise unknown_name("joint", pattern, names)
+        raise unknown_name(kind, pattern, names)
     return found
 
 

@@ -130,7 +130,7 @@ def pad_hierarchy(
     row_counts = tuple(level.matrix.shape[0] for level in levels)
     layout = Layout(n, len(levels), m, row_counts, tuple(level_of_hard), tuple(hard_of_row))
     hierarchy = PaddedHierarchy(
-        levels=jax.tree.map(lambda *a: jnp.stack(a), *(_pad_level(level, m) for level in levels)),
+        levels=jax.tree.map(lambda *a: jnp.stack(a), *(level.padded(m) for level in levels)),
         damping=damping,
         is_equality=jnp.stack([jnp.pad(rows, (0, m - len(rows))) for rows in is_equality]),
         hard=jnp.concatenate([jnp.eye(n, dtype=lower.dtype), *(level.matrix for level in mixed)]),
@@ -142,12 +142,3 @@ def pad_hierarchy(
         hard_level=jnp.array(level_of_hard, jnp.int32),
     )
     return layout, hierarchy
-
-
-def _pad_level(level: Level, rows: int) -> Level:
-    more = rows - level.matrix.shape[0]
-    return Level(
-        jnp.pad(level.matrix, ((0, more), (0, 0))),
-        jnp.pad(level.lower, (0, more), constant_values=-jnp.inf),
-        jnp.pad(level.upper, (0, more), constant_values=jnp.inf),
-    )

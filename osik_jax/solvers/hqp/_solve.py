@@ -14,7 +14,7 @@ from ...execution._backends import Backend, check_backend
 from ...numerics._constants import HIERARCHY_RANK, SINGULAR_TOL, ZERO_PIVOT
 from .._box import clip_roundoff, ordered_bounds
 from .._damping import Damping, per_level
-from .._level import Level
+from .._level import Level, are_finite, bounds_exist
 from .._status import Status
 from ._cascade import CascadeResult
 from ._dispatch import hierarchy_solver
@@ -70,7 +70,7 @@ def solve_hqp(
     tolerances = Tolerances(rank=HIERARCHY_RANK[dtype]) if tolerances is None else tolerances
     dampings = per_level(damping, len(levels), len(lower), dtype)
     damping_is_valid = jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in dampings]).all()
-    is_finite = _is_finite(levels, lower, upper) & damping_is_valid
+    is_finite = jnp.stack([*are_finite(levels), bounds_exist(lower, upper), damping_is_valid]).all()
     # where the data are not finite, a placeholder is solved: equalities of zeros in a box of ones
     is_equality = [level.equal | ~is_finite for level in levels]
     levels, unordered = zip(*(level.ordered() for level in levels), strict=True) if levels else ((), ())
@@ -100,15 +100,6 @@ def _append(a: Array, last: float) -> Array:
 
 def _no_rows(n: int, dtype: jnp.dtype) -> Level:
     return Level(jnp.zeros((0, n), dtype), jnp.zeros(0, dtype))
-
-
-def _is_finite(levels: Sequence[Level], lower: Array, upper: Array) -> Bool[Array, ""]:
-    """Check that there is no NaN, and no infinity except in bounds that do not exist."""
-    checks = [jnp.isfinite(level.matrix).all() for level in levels]
-    bounds = [(lower, upper), *((level.lower, level.upper) for level in levels)]
-    checks += [(low < jnp.inf).all() & (high > -jnp.inf).all() for low, high in bounds]
-    checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
-    return jnp.stack(checks).all()
 
 
 def _solution(

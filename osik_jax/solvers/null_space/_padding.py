@@ -82,14 +82,9 @@ def pad_levels(
 
 
 def _pad(level: Level, count: int) -> PaddedLevel:
-    more = count - len(level.lower)
-    return PaddedLevel(
-        jnp.pad(level.matrix, ((0, more), (0, 0))),
-        # rows that pad are unbounded: they are met everywhere
-        jnp.pad(level.lower, (0, more), constant_values=-jnp.inf),
-        jnp.pad(level.upper, (0, more), constant_values=jnp.inf),
-        jnp.pad(level.equal, (0, more)),
-    )
+    padded = level.padded(count)
+    equal = jnp.pad(level.equal, (0, count - len(level.lower)))
+    return PaddedLevel(padded.matrix, padded.lower, padded.upper, equal)
 
 
 def without_roundoff(problem: Problem) -> Problem:

@@ -1,14 +1,13 @@
-"""Common parts of the methods: answer, residual of a level, and data checks."""
+"""Common parts of the methods: answer, and residual of a level."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ...numerics._dense import apply
 from ..hqp import Level
@@ -59,11 +58,3 @@ class ActiveTask(NamedTuple):
         is_active = equal | (error != 0.0)
         rows = jnp.where(is_active[:, None], level.matrix, 0.0)
         return cls(rows, error, rank_tol * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
-
-
-def is_finite(levels: Sequence[Level], *more: Array) -> Bool[Array, ""]:
-    """Check that there is no NaN, and no infinity except in bounds that do not exist."""
-    checks = [jnp.isfinite(level.matrix).all() for level in levels]
-    checks += [((level.lower < jnp.inf) & (level.upper > -jnp.inf)).all() for level in levels]
-    checks += [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
-    return jnp.stack([*checks, *(jnp.isfinite(array).all() for array in more)]).all()

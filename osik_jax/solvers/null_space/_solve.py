@@ -8,17 +8,18 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..._errors import OsikValueError
 from ...execution._backends import Backend, check_backend
 from ...numerics._constants import NULL_SPACE_RANK
 from .._box import clip_to_box, ordered_bounds
 from .._damping import Damping, per_level
+from .._level import are_finite, bounds_exist
 from .._status import Status
 from ..hqp import Level
 from ._dispatch import project
-from ._problem import NullSpaceSolution, is_finite
+from ._problem import NullSpaceSolution
 from ._reverse import solve_reverse
 from ._saturation import BoundedAnswer, solve_saturated
 
@@ -88,7 +89,8 @@ def solve_nullspace(
     bounds_are_ordered = ~jnp.stack(unordered).any()
     dampings = per_level(damping, len(levels), n, dtype)
     # where the data are not finite, a placeholder of zeros is solved, in a box of ones
-    is_valid = is_finite(levels, motion, *dampings) & (True if box is None else _exist(*box))
+    numbers = [jnp.isfinite(a).all() for a in (motion, *dampings)]
+    is_valid = jnp.stack([*are_finite(levels), *numbers, *([] if box is None else [bounds_exist(*box)])]).all()
     valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
     scaled = [level.scaled() for level in valid]
     rank_tol = NULL_SPACE_RANK[dtype] if rank_tolerance is None else rank_tolerance
@@ -123,11 +125,6 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
         if bound.shape != (n,):
             raise OsikValueError(f"{name} has shape {bound.shape}; the levels ask for {(n,)}")
     return low, high
-
-
-def _exist(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> Bool[Array, ""]:
-    """Check that no bound is NaN, and none infinite on the wrong side."""
-    return ((lower < jnp.inf) & (upper > -jnp.inf)).all()
 
 
 def _unbounded(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> BoundedAnswer:
