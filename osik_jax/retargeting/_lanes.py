@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ..execution._platform import cpu_is_default
@@ -83,10 +82,8 @@ def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
     XLA programs release Python's lock, so threads run in parallel. ``shared``: the arguments of ``solve_lane`` after
     the lane.
     """
-    if not cpu_is_default() and len(jax.devices()) > 1:
-        return _over_devices(len(shared))(lanes, *shared)
-    if not cpu_is_default() or isinstance(jax.tree.leaves(lanes)[0], Tracer):
-        return solve_lanes(lanes, *shared)
+    if not cpu_is_default():
+        return _over_devices(len(shared))(lanes, *shared) if len(jax.devices()) > 1 else solve_lanes(lanes, *shared)
 
     def one(i: int) -> Solved:
         return jax.tree.map(np.asarray, solve_lane(jax.tree.map(lambda leaf: leaf[i], lanes), *shared))
@@ -113,13 +110,7 @@ def solve_lane(
 
 @jax.jit
 def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
-    def one(lane: _Lane) -> Solved:
-        return solve_lane(lane, *shared)
-
-    if cpu_is_default():
-        # one after another: side by side they would wait for the slowest, and leave the cache in between
-        return jax.lax.map(one, lanes)
-    return jax.vmap(one)(lanes)
+    return jax.vmap(lambda lane: solve_lane(lane, *shared))(lanes)
 
 
 @cache
