@@ -1,4 +1,4 @@
-"""The command line: ``osik demo``, ``ik``, ``reach``, ``retarget``, ``ros2``, ``view`` and ``info``."""
+"""The command line: ``osik demo``, ``ik``, ``follow``, ``reach``, ``retarget``, ``ros2``, ``view`` and ``info``."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import tyro
 
 from ._demo import Demo
+from ._follow import Follow
 from ._ik import Ik
 from ._info import Info
 from ._messages import CommandError, notes
@@ -19,7 +20,7 @@ from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Demo | Ik | Reach | Retarget | Ros2 | View | Info
+_Command = Demo | Follow | Ik | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +34,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"osik-jax {importlib.metadata.version('osik-jax')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {"demo": Demo, "ik": Ik, "reach": Reach, "retarget": Retarget, "ros2": Ros2, "view": View, "info": Info},
+        {
+            "demo": Demo,
+            "ik": Ik,
+            "follow": Follow,
+            "reach": Reach,
+            "retarget": Retarget,
+            "ros2": Ros2,
+            "view": View,
+            "info": Info,
+        },
         prog="osik",
         description=_DESCRIPTION,
         args=arguments or ["--help"],

@@ -123,7 +123,7 @@ def _values(square: Float[Array, " K2"], width: Array) -> Float[Array, "P 3"]:
 
 
 def _stencils(width: Array) -> Float[Array, "4 3 3"]:
-    return _STENCILS.astype(width.dtype) / width ** jnp.arange(3)[:, None]
+    return jnp.asarray(_STENCILS, width.dtype) / width ** jnp.arange(3)[:, None]
 
 
 def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Array]:
@@ -165,10 +165,10 @@ def _newton(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array
     curvature = weight * jnp.einsum("kmc,kmd->kcd", scaled, scaled)
     curvature = curvature.at[:, 0, 0].add(0.75 * share * b**-2.5).reshape(-1, len(PLACES), 3, 3)
     curvature = jnp.einsum("ecs,kecd,edt->kst", stencils, curvature, stencils)
-    diagonal, *beside = _bands(curvature)
+    diagonal, one, two = _bands(curvature)
     ends = 1.0 / square, -1.0 / (_MOST - square)
     diagonal = diagonal + weight * (ends[0] ** 2 + ends[1] ** 2)
-    move = _solve_banded(diagonal, *beside, _added(down) + weight * (ends[0] + ends[1]))
+    move = _solve_banded(diagonal, one, two, _added(down) + weight * (ends[0] + ends[1]))
     taken = jnp.max(-jnp.einsum("kmc,kc->km", scaled, _values(move, width)))
     most = jnp.maximum(taken, jnp.maximum(jnp.max(-move * ends[0]), jnp.max(-move * ends[1])))
     return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(most, 1e-9))

@@ -1,6 +1,7 @@
 """Least time along paths, beside dense samples in NumPy, closed forms and central differences."""
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ from osik_jax.motion import retime
 VELOCITY = np.array([2.175, 2.0, 2.61])
 ACCELERATION = np.array([15.0, 7.5, 20.0])
 JERK = np.array([300.0, 100.0, 500.0])
-LIMITS = {"velocity": VELOCITY, "acceleration": ACCELERATION}
+LIMITS: dict[str, Any] = {"velocity": VELOCITY, "acceleration": ACCELERATION}
 POINTS = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
 CELLS = 120
 
@@ -25,7 +26,9 @@ def timed(points, velocity, acceleration, jerk, smooth=False):
     return retime(points, velocity=velocity, acceleration=acceleration, cells=CELLS, **more)
 
 
-def run(points=POINTS, velocity=VELOCITY, acceleration=ACCELERATION, jerk=JERK, smooth=False):
+def run(
+    points: Any = POINTS, velocity: Any = VELOCITY, acceleration: Any = ACCELERATION, jerk: Any = JERK, smooth=False
+):
     return timed(points, velocity, acceleration, jerk, smooth=smooth)
 
 
@@ -59,8 +62,7 @@ def test_the_path_is_the_not_a_knot_spline() -> None:
 def test_a_straight_line_takes_the_time_of_the_closed_form() -> None:
     line = np.array([[0.0, 0.0, 0.0], [0.5, 1.0, 0.2]])
     v, a = 2.0, 7.5  # of the second joint, which limits the line
-    cells = {"cells": CELLS}
-    np.testing.assert_allclose(retime(line, **LIMITS, **cells).duration, 1.0 / v + v / a, rtol=1e-3)
+    np.testing.assert_allclose(retime(line, **LIMITS, cells=CELLS).duration, 1.0 / v + v / a, rtol=1e-3)
     smooth = retime(line, **LIMITS, jerk=JERK).duration
     assert 1.0 <= smooth / (1.0 / v + v / a + a / JERK[1]) < 1.02
 
@@ -114,7 +116,7 @@ def test_many_paths_in_one_call() -> None:
 def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     arm = osik.load_robot("arm7")
     points = np.asarray(arm.q0) + np.linspace(0.0, 1.0, 5)[:, None] * np.array([0.8, 0.3, 0.2, 0.4, 0.0, 0.2, 0.0])
-    given = {"robot": arm, "frame": "hand", "acceleration": 5.0, "cells": CELLS}
+    given: dict[str, Any] = {"robot": arm, "frame": "hand", "acceleration": 5.0, "cells": CELLS}
     timing = retime(points, speed=0.2, **given)
     time = np.linspace(0.0, float(timing.duration), 512)
     q = np.asarray(timing.at(jnp.asarray(time)))[0]
