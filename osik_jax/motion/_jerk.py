@@ -22,7 +22,8 @@ from ._cells import Cells, timed
 
 _STEPS = 50
 _SHRINK = 0.75  # of the barrier's weight in a step
-_LEAST_GAP = 1e-5  # of the duration
+_LEAST_GAP = {"float32": 1e-3, "float64": 1e-5}
+"""Least weight of the barrier, as a share of the duration: the rounding of margins bounds it from below."""
 _MOST = 4.0
 """Largest squared rate, a bound on b where the reference stands still: it is hardly slower than the optimum."""
 PLACES = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
@@ -134,15 +135,15 @@ def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Arr
 
 def _optimum(width: Array, fixed: Array, jerk: Array) -> tuple[Float[Array, " K2"], Float[Array, ""]]:
     """Return the coefficients of b, and the last weight of the barrier."""
-    rows = Rows(fixed, jerk)
+    rows, least = Rows(fixed, jerk), _LEAST_GAP[str(width.dtype)]
     scale = width / len(PLACES) / (fixed.shape[1] + 2 * jerk.shape[1])
 
     def step(square: Array, power: Array) -> tuple[Array, None]:
-        weight = scale * jnp.maximum(_SHRINK**power, _LEAST_GAP)
+        weight = scale * jnp.maximum(_SHRINK**power, least)
         return _newton(square, width, rows, weight), None
 
     square = jax.lax.scan(step, _slow(width, rows), jnp.arange(_STEPS, dtype=width.dtype))[0]
-    return square, scale * _LEAST_GAP
+    return square, scale * least
 
 
 def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:

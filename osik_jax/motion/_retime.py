@@ -25,7 +25,7 @@ from ._timing import Timing, by_progress
 Limit = Float[ArrayLike, " n"] | Mapping[str, float] | float | None
 _CELLS, _FEWEST = 400, 4
 _TINY = 1e-30
-_CHECKED = 5, 17
+_CHECKED = 5, 33
 """Places in each cell where limits are checked: the cells of the smooth motion may have knots inside."""
 
 

@@ -1,5 +1,7 @@
 """Least time along paths, beside dense samples in NumPy, closed forms and central differences."""
 
+import subprocess
+import sys
 from functools import partial
 from typing import Any
 
@@ -103,6 +105,23 @@ def test_with_jerk_derivatives_are_those_of_the_least_time(kind) -> None:
     """Of the duration before its stretch, whose grid changes with the arguments in the second order of its width."""
     found, wanted = slopes(lambda timing: timing.duration / timing.stretch, kind, smooth=True)
     np.testing.assert_allclose(found, wanted, rtol=1e-2)
+
+
+SINGLE = """
+import numpy as np
+from osik_jax.motion import retime
+points = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
+found = retime(points, velocity=[2.175, 2.0, 2.61], acceleration=[15.0, 7.5, 20.0], jerk=[300.0, 100.0, 500.0],
+    cells=120)
+assert found.duration.dtype == np.float32
+print(found.duration)
+"""
+
+
+@pytest.mark.slow
+def test_in_single_precision_the_time_is_nearly_the_same() -> None:
+    found = subprocess.run([sys.executable, "-c", SINGLE], capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(float(found.stdout), run(smooth=True).duration, rtol=2e-3)
 
 
 def test_many_paths_in_one_call() -> None:
