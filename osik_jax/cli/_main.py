@@ -1,4 +1,4 @@
-"""The command line: ``osik demo``, ``ik``, ``reach``, ``calibrate``, ``retarget``, ``ros2``, ``view`` and ``info``."""
+"""The command line: ``osik demo``, ``ik``, ``follow``, ``reach``, ``calibrate``, ``retarget``, ``view`` and so on."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import tyro
 
 from ._calibrate import Calibrate
 from ._demo import Demo
+from ._follow import Follow
 from ._ik import Ik
 from ._info import Info
 from ._messages import CommandError, notes
@@ -20,7 +21,7 @@ from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Calibrate | Demo | Ik | Reach | Retarget | Ros2 | View | Info
+_Command = Calibrate | Demo | Follow | Ik | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,6 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         {
             "demo": Demo,
             "ik": Ik,
+            "follow": Follow,
             "reach": Reach,
             "calibrate": Calibrate,
             "retarget": Retarget,

@@ -3,6 +3,7 @@
 from ._follow import Followed as Followed
 from ._follow import follow as follow
 from ._motion import Motion as Motion
+from ._motion import draw_motion as draw_motion
 from ._motion import load_motion as load_motion
 from ._retime import retime as retime
 from ._timing import SlowPart as SlowPart

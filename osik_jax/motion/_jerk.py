@@ -22,7 +22,8 @@ from ._cells import Cells, timed
 
 _STEPS = 50
 _SHRINK = 0.75  # of the barrier's weight in a step
-_LEAST_GAP = 1e-5  # of the duration
+_LEAST_GAP = {"float32": 1e-3, "float64": 1e-5}
+"""Least weight of the barrier, as a share of the duration: the rounding of margins bounds it from below."""
 _MOST = 4.0
 """Largest squared rate, a bound on b where the reference stands still: it is hardly slower than the optimum."""
 PLACES = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
@@ -123,7 +124,7 @@ def _values(square: Float[Array, " K2"], width: Array) -> Float[Array, "P 3"]:
 
 
 def _stencils(width: Array) -> Float[Array, "4 3 3"]:
-    return _STENCILS.astype(width.dtype) / width ** jnp.arange(3)[:, None]
+    return jnp.asarray(_STENCILS, width.dtype) / width ** jnp.arange(3)[:, None]
 
 
 def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Array]:
@@ -134,15 +135,15 @@ def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Arr
 
 def _optimum(width: Array, fixed: Array, jerk: Array) -> tuple[Float[Array, " K2"], Float[Array, ""]]:
     """Return the coefficients of b, and the last weight of the barrier."""
-    rows = Rows(fixed, jerk)
+    rows, least = Rows(fixed, jerk), _LEAST_GAP[str(width.dtype)]
     scale = width / len(PLACES) / (fixed.shape[1] + 2 * jerk.shape[1])
 
     def step(square: Array, power: Array) -> tuple[Array, None]:
-        weight = scale * jnp.maximum(_SHRINK**power, _LEAST_GAP)
+        weight = scale * jnp.maximum(_SHRINK**power, least)
         return _newton(square, width, rows, weight), None
 
     square = jax.lax.scan(step, _slow(width, rows), jnp.arange(_STEPS, dtype=width.dtype))[0]
-    return square, scale * _LEAST_GAP
+    return square, scale * least
 
 
 def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:
@@ -165,10 +166,10 @@ def _newton(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array
     curvature = weight * jnp.einsum("kmc,kmd->kcd", scaled, scaled)
     curvature = curvature.at[:, 0, 0].add(0.75 * share * b**-2.5).reshape(-1, len(PLACES), 3, 3)
     curvature = jnp.einsum("ecs,kecd,edt->kst", stencils, curvature, stencils)
-    diagonal, *beside = _bands(curvature)
+    diagonal, one, two = _bands(curvature)
     ends = 1.0 / square, -1.0 / (_MOST - square)
     diagonal = diagonal + weight * (ends[0] ** 2 + ends[1] ** 2)
-    move = _solve_banded(diagonal, *beside, _added(down) + weight * (ends[0] + ends[1]))
+    move = _solve_banded(diagonal, one, two, _added(down) + weight * (ends[0] + ends[1]))
     taken = jnp.max(-jnp.einsum("kmc,kc->km", scaled, _values(move, width)))
     most = jnp.maximum(taken, jnp.maximum(jnp.max(-move * ends[0]), jnp.max(-move * ends[1])))
     return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(most, 1e-9))

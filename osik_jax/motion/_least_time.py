@@ -9,7 +9,7 @@ new approach to time-optimal path parameterization based on reachability analysi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ def _backward(width: Array, rows: _Rows, largest: Float[Array, " K"]) -> Float[A
         here = jnp.minimum(most, _bound(p - twice * r, p * ahead + twice * a).min())
         return here, here
 
-    inputs = 2.0 * width, rows, largest
+    inputs: Any = 2.0 * width, rows, largest
     end = jnp.zeros((), largest.dtype)
     return jnp.append(jax.lax.scan(step, end, inputs, reverse=True)[1], end)
 
@@ -101,5 +101,5 @@ def _forward(width: Array, rows: _Rows, reachable: Float[Array, " K1"]) -> Float
         return b, b
 
     start = jnp.zeros((), reachable.dtype)
-    inputs = 2.0 * width, rows, reachable[1:]
+    inputs: Any = 2.0 * width, rows, reachable[1:]
     return jnp.concatenate([start[None], jax.lax.scan(step, start, inputs)[1]])

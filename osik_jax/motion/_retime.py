@@ -25,7 +25,7 @@ from ._timing import Timing, by_progress
 Limit = Float[ArrayLike, " n"] | Mapping[str, float] | float | None
 _CELLS, _FEWEST = 400, 4
 _TINY = 1e-30
-_CHECKED = 5, 17
+_CHECKED = 5, 33
 """Places in each cell where limits are checked: the cells of the smooth motion may have knots inside."""
 
 
@@ -153,11 +153,12 @@ def _limit(robot: Robot | None, kind: str, value: Any, points: Any) -> Float[Arr
             raise OsikTypeError(f"{kind} is a mapping, whose names need robot=")
         return dof_values(robot, value, getattr(robot, f"{kind}_limit", none), kind)
     own = none if robot is None else getattr(robot, f"{kind}_limit", none)
+    given: Any = own if value is None else value
     try:
-        return jnp.broadcast_to(jnp.asarray(own if value is None else value, points.dtype), none.shape)
+        return jnp.broadcast_to(jnp.asarray(given, points.dtype), none.shape)
     except ValueError as error:
         raise OsikValueError(
-            f"{kind} has shape {np.shape(value)}; it is one number, or one for each of {len(none)} joints"
+            f"{kind} has shape {np.shape(given)}; it is one number, or one for each of {len(none)} joints"
         ) from error
 
 
@@ -212,7 +213,8 @@ def _retimed(
         """Return the largest squared path speed by the wanted speed of the frame."""
         if frame is None or robot is None or wanted is None:
             return jnp.full(len(s), jnp.inf, s.dtype)
-        rate = jax.vmap(lambda q, move: jax.jvp(lambda q: _origin(robot, q, frame), (q,), (move,))[1])
+        own, name = robot, frame
+        rate = jax.vmap(lambda q, move: jax.jvp(lambda q: _origin(own, q, name), (q,), (move,))[1])
         return wanted**2 / jnp.maximum((rate(path.derivatives(s)[0], first) ** 2).sum(axis=1), _TINY)
 
     grid = _grid(path.knots, -(-count // (len(points) - 1)))

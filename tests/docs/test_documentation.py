@@ -62,7 +62,7 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
-IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration"]
+IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration", "motion"]
 AT_NIGHT = [
     "batches",
     "inverse_kinematics",

@@ -1,14 +1,18 @@
 """Timed motions along poses: tool and joints beside dense samples in NumPy, MuJoCo's kinematics as the judge."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.motion import follow
+from osik_jax import cli
+from osik_jax.motion import follow, load_motion
 
 ARM = osik.load_robot("arm7")
-LIMITS = {
+LIMITS: dict[str, Any] = {
     "velocity": np.array([2.175] * 4 + [2.61] * 3),
     "acceleration": np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0]),
     "jerk": np.array([7500.0, 3750.0, 5000.0, 6250.0, 7500.0, 10000.0, 10000.0]),
@@ -91,6 +95,20 @@ def test_a_tool_may_spin_about_a_free_axis() -> None:
 
 
 POSES = raster(1, 8)
+
+
+@pytest.mark.slow
+def test_a_command_follows_a_file(tmp_path, capsys) -> None:
+    quaternion = Rotation.from_matrix(POSES[1]).as_quat(scalar_first=True)
+    rows = np.column_stack([POSES[0], quaternion])
+    np.savetxt(tmp_path / "path.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
+    given = ["follow", str(tmp_path / "path.csv"), "--robot", "arm7", "--frame", "hand", "--dt", "0.01"]
+    assert cli.main([*given, "--out", str(tmp_path / "motion.npz")]) == 0
+    assert "off the path" in capsys.readouterr().out
+    place, _ = placed(np.asarray(load_motion(tmp_path / "motion.npz").position))
+    np.testing.assert_allclose(place[[0, -1]], POSES[0][[0, -1]], atol=1e-4)
+    np.savetxt(tmp_path / "path.csv", rows[:, :4], delimiter=",")
+    assert cli.main(given) == 2 and "a pose is" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

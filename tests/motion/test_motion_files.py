@@ -6,9 +6,11 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import osik_jax as osik
-from osik_jax.motion import Motion, load_motion, retime
+from osik_jax.interop.ros2.dds import joint_trajectory
+from osik_jax.motion import Motion, draw_motion, load_motion, retime
 
 MOTION = retime(np.array([[0.0, 0.0], [1.0, 0.5], [1.5, 2.0]]), acceleration=5.0, velocity=2.0, cells=40).sample(0.02)
 MOTION = Motion(MOTION.time, MOTION.position, MOTION.velocity, MOTION.acceleration, joints=("lift", "turn"))
@@ -78,3 +80,22 @@ def test_other_ends_of_names_are_refused(tmp_path) -> None:
     np.savez(tmp_path / "other.npz", a=jnp.zeros(2))
     with pytest.raises(osik.OsikError, match="has no time"):
         load_motion(tmp_path / "other.npz")
+
+
+def test_a_picture_has_a_line_a_joint_and_its_limits(tmp_path, monkeypatch) -> None:
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"x")))
+    draw_motion(MOTION, tmp_path / "motion.png", np.array([[2.0, 2.0], [5.0, 5.0], [np.inf, np.inf]]))
+    speeds, accelerations = figures[0].axes
+    assert (tmp_path / "motion.png").read_bytes() == b"x" and len(speeds.lines) == len(accelerations.lines) == 4
+    np.testing.assert_array_equal(speeds.lines[1].get_ydata(), np.asarray(MOTION.velocity)[:, 1] / 2.0)
+
+
+def test_a_motion_is_a_message_of_ros() -> None:
+    message = joint_trajectory(MOTION)
+    assert message.joint_names == ["lift", "turn"] and len(message.points) == len(MOTION.time)
+    times = [point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec for point in message.points]
+    np.testing.assert_allclose(times, MOTION.time, atol=1e-9)
+    for names, name in (("positions", "position"), ("velocities", "velocity"), ("accelerations", "acceleration")):
+        np.testing.assert_array_equal([getattr(point, names) for point in message.points], getattr(MOTION, name))
+    assert type(message).deserialize(message.serialize()) == message

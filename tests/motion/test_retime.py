@@ -1,6 +1,9 @@
 """Least time along paths, beside dense samples in NumPy, closed forms and central differences."""
 
+import subprocess
+import sys
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +17,7 @@ from osik_jax.motion import retime
 VELOCITY = np.array([2.175, 2.0, 2.61])
 ACCELERATION = np.array([15.0, 7.5, 20.0])
 JERK = np.array([300.0, 100.0, 500.0])
-LIMITS = {"velocity": VELOCITY, "acceleration": ACCELERATION}
+LIMITS: dict[str, Any] = {"velocity": VELOCITY, "acceleration": ACCELERATION}
 POINTS = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
 CELLS = 120
 
@@ -25,7 +28,9 @@ def timed(points, velocity, acceleration, jerk, smooth=False):
     return retime(points, velocity=velocity, acceleration=acceleration, cells=CELLS, **more)
 
 
-def run(points=POINTS, velocity=VELOCITY, acceleration=ACCELERATION, jerk=JERK, smooth=False):
+def run(
+    points: Any = POINTS, velocity: Any = VELOCITY, acceleration: Any = ACCELERATION, jerk: Any = JERK, smooth=False
+):
     return timed(points, velocity, acceleration, jerk, smooth=smooth)
 
 
@@ -59,8 +64,7 @@ def test_the_path_is_the_not_a_knot_spline() -> None:
 def test_a_straight_line_takes_the_time_of_the_closed_form() -> None:
     line = np.array([[0.0, 0.0, 0.0], [0.5, 1.0, 0.2]])
     v, a = 2.0, 7.5  # of the second joint, which limits the line
-    cells = {"cells": CELLS}
-    np.testing.assert_allclose(retime(line, **LIMITS, **cells).duration, 1.0 / v + v / a, rtol=1e-3)
+    np.testing.assert_allclose(retime(line, **LIMITS, cells=CELLS).duration, 1.0 / v + v / a, rtol=1e-3)
     smooth = retime(line, **LIMITS, jerk=JERK).duration
     assert 1.0 <= smooth / (1.0 / v + v / a + a / JERK[1]) < 1.02
 
@@ -103,6 +107,23 @@ def test_with_jerk_derivatives_are_those_of_the_least_time(kind) -> None:
     np.testing.assert_allclose(found, wanted, rtol=1e-2)
 
 
+SINGLE = """
+import numpy as np
+from osik_jax.motion import retime
+points = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
+found = retime(points, velocity=[2.175, 2.0, 2.61], acceleration=[15.0, 7.5, 20.0], jerk=[300.0, 100.0, 500.0],
+    cells=120)
+assert found.duration.dtype == np.float32
+print(found.duration)
+"""
+
+
+@pytest.mark.slow
+def test_in_single_precision_the_time_is_nearly_the_same() -> None:
+    found = subprocess.run([sys.executable, "-c", SINGLE], capture_output=True, text=True, check=True)
+    np.testing.assert_allclose(float(found.stdout), run(smooth=True).duration, rtol=2e-3)
+
+
 def test_many_paths_in_one_call() -> None:
     paths = np.cumsum(np.random.default_rng(1).normal(size=(4, 6, 3)) * 0.5, axis=1)
     many = jax.vmap(lambda points: run(points).duration)(paths)
@@ -114,7 +135,7 @@ def test_many_paths_in_one_call() -> None:
 def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     arm = osik.load_robot("arm7")
     points = np.asarray(arm.q0) + np.linspace(0.0, 1.0, 5)[:, None] * np.array([0.8, 0.3, 0.2, 0.4, 0.0, 0.2, 0.0])
-    given = {"robot": arm, "frame": "hand", "acceleration": 5.0, "cells": CELLS}
+    given: dict[str, Any] = {"robot": arm, "frame": "hand", "acceleration": 5.0, "cells": CELLS}
     timing = retime(points, speed=0.2, **given)
     time = np.linspace(0.0, float(timing.duration), 512)
     q = np.asarray(timing.at(jnp.asarray(time)))[0]

@@ -9,7 +9,8 @@ try:
     from ._bag import replay as replay
     from ._node import Endpoints as Endpoints
     from ._node import Node as Node
+    from ._trajectory import joint_trajectory as joint_trajectory
 except ImportError as missing:
     raise missing_extra("a ROS 2 topic", "cyclonedds and mcap", "ros2") from missing
 
-__all__ = ["BagWriter", "Endpoints", "Node", "Replay", "messages", "replay"]
+__all__ = ["BagWriter", "Endpoints", "Node", "Replay", "joint_trajectory", "messages", "replay"]

@@ -1,0 +1,79 @@
+"""``osik follow``."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from .._errors import OsikValueError
+from ._messages import told
+from ._robots import read_robot
+
+
+@dataclasses.dataclass(frozen=True)
+class Follow:
+    """Leads a frame of a robot along the poses of a CSV file, within limits, and writes the timed motion.
+
+    The file has a row a pose: x, y, z [m], or also a quaternion w, x, y, z. A line of column names may come first.
+    """
+
+    path: Annotated[Path, tyro.conf.Positional]
+    """The CSV file."""
+    robot: str
+    """A URDF or MJCF file, or a robot by name."""
+    frame: str
+    """The frame: a link, body, site or geom."""
+    out: Path = Path("motion.npz")
+    """File to write: .npz, .csv or .parquet."""
+    dt: float = 0.001
+    """Time between two samples [s]."""
+    speed: float | None = None
+    """Wanted speed of the frame [m/s], lowered where joints do not allow it. Default: as fast as possible."""
+    acceleration: float = 5.0
+    """Limit of all joints' accelerations [rad/s^2 or m/s^2]."""
+    jerk: float | None = None
+    """Limit of all joints' jerks [rad/s^3 or m/s^3]. Default: none."""
+    free: Literal["x", "y", "z"] | None = None
+    """Axis of the frame about which it may turn."""
+
+    def run(self) -> int:
+        """Run the command; return the exit code."""
+        from ..motion import follow
+
+        robot = read_robot(self.robot, "auto")
+        with told():
+            found = follow(
+                robot,
+                {self.frame: _poses(self.path)},
+                free=None if self.free is None else {self.frame: self.free},
+                speed=self.speed,
+                acceleration=self.acceleration,
+                jerk=self.jerk,
+            )
+            found.sample(self.dt).save(self.out)
+        print(
+            f"{found.duration:.3f} s, at most {1e3 * found.position_error:.2g} mm and "
+            f"{found.orientation_error:.2g} rad off the path; written to {self.out}"
+        )
+        for part in found.slow_parts() if self.speed is not None else ():
+            print(f"slower from {part.start:.2f} to {part.end:.2f} s: {part.joint} is near its limit of {part.limit}")
+        return 0
+
+
+def _poses(path: Path) -> tuple:
+    """Return the positions of a file, and its quaternions or None."""
+    import numpy as np
+
+    with open(path, encoding="utf-8") as file:
+        lines = [line for line in file.read().splitlines() if line.strip()]
+    has_names = bool(lines) and any(character.isalpha() and character not in "eE" for character in lines[0])
+    try:
+        rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[has_names:]])
+    except ValueError as error:
+        raise OsikValueError(f"{path} cannot be read as a table of numbers: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] not in (3, 7):
+        raise OsikValueError(f"{path} has rows of shape {rows.shape[1:]}; a pose is x, y, z or x, y, z, w, x, y, z")
+    return rows[:, :3], rows[:, 3:] if rows.shape[1] == 7 else None
