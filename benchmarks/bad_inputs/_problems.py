@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.collision import robot_shapes
 
 from ._given import (
     OK,
@@ -28,6 +29,11 @@ from ._given import (
     status_in_a_program,
     warm,
 )
+
+
+def _held_twice() -> osik.Scene:
+    held = osik.Scene({"can": osik.CollisionShape.sphere(0.1)}).attach("can", arm(), "hand")
+    return held.attach("can", arm(), "hand")
 
 
 def problems(add: Add) -> None:
@@ -176,6 +182,16 @@ def limits(add: Add) -> None:
         V,
         "neighbouring",
     )
+    ball = osik.CollisionShape.sphere(0.1)
+    add("a scene from a list", lambda: osik.Scene([ball]), T, "name to CollisionShape")
+    add("a scene beyond its capacity", lambda: osik.Scene({"a": ball, "b": ball}, capacity=1), V, "capacity is 1")
+    add("a scene of numbers", lambda: osik.Scene({"a": 1.0}), T, "CollisionShapes")
+    add("a scene with a NaN", lambda: osik.Scene({"a": osik.CollisionShape.sphere(0.1, [np.nan] * 3)}), V, "finite")
+    add("an object that is not in the scene", lambda: osik.Scene({"can": ball}).moved("cam", np.eye(4)), K, "can")
+    add("an object held twice", _held_twice, V, "detach")
+    add("a box of words", lambda: osik.CollisionShape.box("abc"), T, "half_sizes is 'abc'")
+    add("a scene of another kind of file", lambda: osik.Scene.from_file("scene.stl"), V, ".yaml")
+    add("shapes of a robot without any", lambda: robot_shapes(arm()), V, "<collision>")
 
 
 def in_programs(add: Add) -> None:

@@ -57,8 +57,6 @@ def _yaml_spheres(path: Path) -> Spheres:
         import yaml
     except ImportError as missing:
         raise missing_extra("reading a .yaml of spheres", "PyYAML", "scenes") from missing
-    if not path.is_file():
-        raise FileNotFoundError(f"no file of spheres {str(path)!r}")
     found = yaml.safe_load(path.read_text(encoding="utf-8"))
     for key in ("robot_cfg", "kinematics"):
         found = found.get(key, found) if isinstance(found, Mapping) else found
@@ -146,6 +144,6 @@ def _in_body(
 def _tell(grown: Sequence[tuple[float, str]], bare: Sequence[str]) -> None:
     told = [f"{link} by {1e3 * growth:.3g} mm" for growth, link in sorted(grown, reverse=True) if growth > _TOLERANCE]
     if told:
-        warn(f"the given spheres leave surface uncovered, so they are grown: {first_of(told)}")
+        warn(f"the given spheres are grown until they are sure to cover their shapes: {first_of(told)}")
     if bare:
         warn(f"shapes without a given sphere get spheres of their own: {first_of(list(dict.fromkeys(bare)))}")

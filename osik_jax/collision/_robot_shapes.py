@@ -12,6 +12,7 @@ from .._errors import OsikTypeError, OsikValueError, warn
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
+from ..robot._made_for import check_robot
 from ..robot._plausible import first_of
 from ..robot._size import robot_size
 from ..robot.loading._source import read_source
@@ -44,7 +45,7 @@ def robot_shapes(
         srdf: see ``Given``. Its authors allow what they hold for impossible, so no SRDF is read unless one is named.
         spheres: the user's own spheres instead of those that are made here: a ``.yaml`` of cuRobo, a URDF whose
             collision shapes are spheres, or ``{link: [{"center": (x, y, z), "radius": r}]}`` in the links' axes [m].
-            Where they leave surface uncovered they are grown.
+            They are grown until they are sure to cover their shapes.
 
     Raises:
         FileNotFoundError: no such file; a mesh is not found.
@@ -56,28 +57,44 @@ def robot_shapes(
         OsikWarning: pairs touch in every configuration, the SRDF names links that the robot lacks, or given spheres
             were grown.
     """
+    check_robot(robot, "robot_shapes(robot)")
     if is_traced(robot):
         raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)
-    rules, texts = (srdf, {}) if srdf is None or isinstance(srdf, Srdf) else (None, {"srdf": _content(srdf)})
+    if srdf is None or isinstance(srdf, Srdf):
+        rules, files = srdf, {}
+    else:
+        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
+        rules, files = None, {"srdf": srdf if is_text else _stamped(srdf, "SRDF")}
     if isinstance(spheres, str | os.PathLike):
-        changed = os.stat(spheres).st_mtime_ns
-        return _made(robot, rules, None, file=(os.fspath(spheres), changed), **texts)
-    return _made(robot, rules, spheres, **texts)
+        return _made(robot, rules, None, balls=_stamped(spheres, "spheres"), **files)
+    return _made(robot, rules, spheres, **files)
 
 
-def _content(srdf: str | os.PathLike[str]) -> str:
-    content = read_source(srdf, "SRDF").content
-    return content if isinstance(content, str) else content.decode("utf-8", "replace")
+def _stamped(path: Any, kind: str) -> tuple[str, int]:
+    """Return the path of a file and when it was changed, so that it is read once.
+
+    Raises:
+        FileNotFoundError: no such file; the message lists those that are there.
+        TypeError: no path.
+    """
+    if not isinstance(path, str | os.PathLike) or not os.path.isfile(path):
+        read_source(path, kind)
+    return os.fspath(path), os.stat(path).st_mtime_ns
 
 
 @remembered
 def _made(
-    robot: Robot, rules: Srdf | None, spheres: Any, *, srdf: str | None = None, file: tuple[str, int] | None = None
+    robot: Robot,
+    rules: Srdf | None,
+    spheres: Any,
+    *,
+    srdf: str | tuple[str, int] | None = None,
+    balls: tuple[str, int] | None = None,
 ) -> RobotShapes:
-    rules = rules if srdf is None else read_srdf(srdf)
-    spheres = spheres if file is None else read_spheres(file[0])
+    rules = rules if srdf is None else read_srdf(srdf if isinstance(srdf, str) else srdf[0])
+    spheres = spheres if balls is None else read_spheres(balls[0])
     found = members(robot, {})
     solid = [k for k, member in enumerate(found) if member.solid]
     parts = [found[k] for k in solid]
@@ -91,7 +108,7 @@ def _made(
         _warn_of_touching([f"{parts[i].name}-{parts[j].name}" for i, j in touching])
     kept = [pair for pair in kept if pair not in set(touching)]
     links, size = tuple(part.aliases[0] for part in parts), float(robot_size(robot))
-    owner, balls = cover(shapes, size) if spheres is None else cover_by_given(robot, spheres, links, shapes, size)
+    owner, covering = cover(shapes, size) if spheres is None else cover_by_given(robot, spheres, links, shapes, size)
     return RobotShapes(
         names=tuple(part.name for part in parts),
         links=links,
@@ -100,9 +117,9 @@ def _made(
         pairs=np.array(kept, np.int32).reshape(-1, 2),
         world=np.array(moves(robot, parts), bool),
         sphere_shape=owner,
-        sphere_center=balls.center,
-        sphere_radius=balls.radius,
-        sphere_overshoot=balls.overshoot,
+        sphere_center=covering.center,
+        sphere_radius=covering.radius,
+        sphere_overshoot=covering.overshoot,
         touching=tuple((parts[i].name, parts[j].name) for i, j in touching),
     )
 

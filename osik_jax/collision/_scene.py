@@ -290,7 +290,7 @@ class Scene(eqx.Module):
         self._check_single(what)
         rows = self._matching(pattern)
         if not len(rows):
-            raise unknown_name("object or shape", pattern, tuple(dict.fromkeys((*self.labels.objects, *self.names))))
+            raise unknown_name("shape", pattern, tuple(dict.fromkeys((*self.labels.objects, *self.names))))
         return rows
 
     def _poses(self, rows: np.ndarray) -> Pose:

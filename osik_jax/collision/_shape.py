@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikValueError
+from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import as_floats, concrete
-from ..numerics._host import Numbers, is_traced, module_of, tree_to_jax
+from ..numerics._host import Numbers, is_traced, module_of, to_host, tree_to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._geometry import Kind, UnitCore, convex_hull
 from ._mesh_parts import convex_parts, triangles
@@ -186,11 +186,20 @@ def _along(radius: Any, start: Any, end: Any, what: str) -> tuple[Numbers, Numbe
 
 
 def _vector(value: Any, what: str) -> Float[Numbers, "3"]:
-    """Return three numbers; those that are not traced are the host's, for which nothing is compiled."""
-    out = as_floats(value) if is_traced(value) else np.asarray(value, float)
+    out = _numbers(value, what)
     if out.shape != (3,):
         raise OsikValueError(f"{what} has shape {out.shape}, expected (3,)")
     return out
+
+
+def _numbers(value: Any, what: str) -> Numbers:
+    """Return an array; numbers that are not traced are the host's, for which nothing is compiled."""
+    if is_traced(value):
+        return as_floats(value)
+    try:
+        return to_host(value, float)
+    except (TypeError, ValueError):
+        raise OsikTypeError(f"{what} is {repr(value)[:80]}; it is an array of numbers") from None
 
 
 def _sizes(*sizes: Any) -> Float[Numbers, "3"]:
@@ -215,7 +224,7 @@ def _check_positive(value: Any, what: str) -> None:
 def _rotation(value: Any) -> Float[Numbers, "3 3"]:
     if value is None:
         return np.eye(3)
-    out = as_floats(value) if is_traced(value) else np.asarray(value, float)
+    out = _numbers(value, "rotation")
     if out.shape == (4,):
         return rotation_matrix(exact_quaternion(out, "rotation"))
     if out.shape != (3, 3):

@@ -41,7 +41,7 @@ _VERTICES = 48
 _EXTENT = 0.2
 """Weight of a cell's extent beside its overshoot where a cut is chosen."""
 
-_CELLS, _THIN = 200, 1e-5
+_CELLS, _THIN = 120, 1e-5
 """Number of cells that a user's balls have to hold, and the radius [m] of the prism along a capsule's axis."""
 
 _STEPS = 40
@@ -158,11 +158,13 @@ def overshoots(
 def _partition(corners: Float[np.ndarray, "v 3"]) -> list[Float[np.ndarray, "n 3"]]:
     """Return the corners of ``_CELLS`` convex cells of a polytope; the longest one is cut in its middle."""
     axes = np.linalg.svd(corners - corners.mean(0), full_matrices=False)[2]
+    extents = [np.ptp(corners @ axes.T, axis=0)]
     cells = [corners]
-    for _ in range(_CELLS - 1):
-        extents = [np.ptp(cell @ axes.T, axis=0).max() for cell in cells]
-        longest = cells.pop(int(np.argmax(extents)))
-        cells += _halves(longest, axes[np.ptp(longest @ axes.T, axis=0).argmax()])
+    while len(cells) < _CELLS:
+        place = max(range(len(cells)), key=lambda k: extents[k].max())
+        halves = _halves(cells.pop(place), axes[extents.pop(place).argmax()])
+        cells += halves
+        extents += [np.ptp(half @ axes.T, axis=0) for half in halves]
     return cells
 
 

@@ -144,13 +144,13 @@ def test_balls_are_kept_in_the_cache_folder(tmp_path, monkeypatch: pytest.Monkey
     assert first.sphere_overshoot.min() >= 0.0 and robot_size(robot) * LEAST > 0.005
 
 
-def given_for_panda(panda: osik.Robot):
+def given_for(robot: osik.Robot):
     """The spheres that this package makes, in the axes of the links."""
-    shapes = robot_shapes(panda)
+    shapes = robot_shapes(robot)
     found: dict[str, list] = {}
     for row, center, radius in zip(shapes.sphere_shape, shapes.sphere_center, shapes.sphere_radius, strict=True):
-        at = panda.frame_names.index(shapes.links[row])
-        turn, place = np.asarray(panda.frame_rotation[at], float), np.asarray(panda.frame_position[at], float)
+        at = robot.frame_names.index(shapes.links[row])
+        turn, place = np.asarray(robot.frame_rotation[at], float), np.asarray(robot.frame_position[at], float)
         found.setdefault(shapes.links[row], []).append(
             {"center": ((center - place) @ turn).tolist(), "radius": float(radius)}
         )
@@ -164,15 +164,15 @@ def as_collision(ball: dict) -> str:
 
 def test_given_spheres_cover_after_they_are_grown(tmp_path):
     """Those of cuRobo's files, of spherized URDFs and of dictionaries."""
-    panda = osik.load_robot("panda")
-    own, given = given_for_panda(panda)
+    ur5 = osik.load_robot("ur5")
+    own, given = given_for(ur5)
     smaller = {link: [{**one, "radius": 0.8 * one["radius"]} for one in some] for link, some in given.items()}
-    del smaller["panda_link3"]
+    del smaller["wrist_1_link"]
     with pytest.warns(osik.OsikWarning) as told:
-        found = robot_shapes(panda, spheres=smaller)
+        found = robot_shapes(ur5, spheres=smaller)
     texts = [str(one.message) for one in told]
-    assert any("leave surface uncovered, so they are grown: panda_link0 by" in text for text in texts)
-    assert any("shapes without a given sphere get spheres of their own: panda_link3" in text for text in texts)
+    assert any("are grown until they are sure to cover their shapes: upper_arm_link by" in text for text in texts)
+    assert any("shapes without a given sphere get spheres of their own: wrist_1_link" in text for text in texts)
     for row in range(len(found.names)):
         count, first = found.table.count[row], found.table.first[row]
         if count:
@@ -186,18 +186,18 @@ def test_given_spheres_cover_after_they_are_grown(tmp_path):
         assert beyond <= found.sphere_overshoot[k] + 1e-9
     text = "".join(f'<link name="{link}">{"".join(map(as_collision, some))}</link>' for link, some in given.items())
     joints = "".join(
-        f'<joint name="{link}" type="fixed"><parent link="panda_link0"/><child link="{link}"/></joint>'
+        f'<joint name="{link}" type="fixed"><parent link="base_link"/><child link="{link}"/></joint>'
         for link in given
-        if link != "panda_link0"
+        if link != "base_link"
     )
     (tmp_path / "balls.urdf").write_text(f'<robot name="r">{text}{joints}</robot>')
     yaml = {"robot_cfg": {"kinematics": {"collision_spheres": "spheres.yml"}}}
     (tmp_path / "robot.yml").write_text(str(yaml))
     (tmp_path / "spheres.yml").write_text(str({"collision_spheres": given}))
     for name in ("balls.urdf", "robot.yml"):
-        read = robot_shapes(panda, spheres=tmp_path / name)
+        read = robot_shapes(ur5, spheres=tmp_path / name)
         assert len(read.sphere_radius) == len(own.sphere_radius)
-        assert robot_shapes(panda, spheres=tmp_path / name) is read
+        assert robot_shapes(ur5, spheres=tmp_path / name) is read
 
 
 def test_spheres_that_are_none_are_refused(tmp_path):
@@ -206,7 +206,7 @@ def test_spheres_that_are_none_are_refused(tmp_path):
     refuses(KeyError, "no link with a collision shape 'hand'", robot_shapes, panda, spheres={"hand": []})
     wrong = {"panda_hand": [{"radius": 1.0}]}
     refuses(ValueError, "the spheres of 'panda_hand' are not", robot_shapes, panda, spheres=wrong)
-    refuses(FileNotFoundError, "lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
+    refuses(FileNotFoundError, "no spheres file .*lost.yml", robot_shapes, panda, spheres=tmp_path / "lost.yml")
     (tmp_path / "a.yml").write_text("joints: 3")
     refuses(ValueError, "it has no collision_spheres", robot_shapes, panda, spheres=tmp_path / "a.yml")
     urdf = example_file("panda_description/urdf/panda.urdf")

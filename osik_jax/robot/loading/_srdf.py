@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -63,6 +64,7 @@ def read_srdf(given: str | os.PathLike[str]) -> Srdf:
         raise OsikValueError(f"{source.label}: {error}") from None
 
 
+@cache
 def srdf_beside(urdf: Path | None) -> Path:
     """Return the SRDF of a URDF file, in its folder or in ``srdf`` beside that; its name begins like the URDF's.
 
