@@ -1,4 +1,4 @@
-"""Panda at a shelf: which of 48 grips of a can have a configuration that touches nothing, and what is in the way."""
+"""Panda at a shelf: for which of 48 grips of a can nothing touches, and what is in the way of the others."""
 
 from collections import Counter
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..execution._computed import in_shared_lanes
@@ -57,7 +57,7 @@ class Clearance(eqx.Module):
         return shape_names(own, rows, np.asarray(self.pair).reshape(-1, 2)[index], index)
 
 
-def clearance(robot: Robot, q: Float[Array, "*n nq"], scene: Scene, *, srdf: Given = None) -> Clearance:
+def clearance(robot: Robot, q: Float[ArrayLike, "*n nq"], scene: Scene, *, srdf: Given = None) -> Clearance:
     """Return the signed distance of the nearest pair of shapes, of the robot with itself and with a scene.
 
     The derivative of ``distance`` is that of the nearest points, with respect to q and to the scene's poses. A depth of
@@ -82,7 +82,7 @@ def clearance(robot: Robot, q: Float[Array, "*n nq"], scene: Scene, *, srdf: Giv
 
 def is_free(
     robot: Robot,
-    q: Float[Array, "*n nq"],
+    q: Float[ArrayLike, "*n nq"],
     scene: Scene,
     clearance: Float[Array, ""] | float = 0.0,
     *,

@@ -149,7 +149,8 @@ template <class Real> class Collision {
   // Less than the distance of a pair; of half spaces, no bound.
   Real lower_bound(Pair p) const {
     if (local[p.i].kind == HALF_SPACE) return world[p.i].beyond(center[p.j], center[p.i], bound[p.i]) - bound[p.j];
-    return world[p.j].beyond(center[p.i], center[p.j], bound[p.j]) - bound[p.i];
+    return std::max(world[p.j].beyond(center[p.i], center[p.j], bound[p.j]) - bound[p.i],
+                    world[p.i].beyond(center[p.j], center[p.i], bound[p.i]) - bound[p.j]);
   }
   template <class F> bool any_pair(F f) const {
     for (const Pair p : pairs)

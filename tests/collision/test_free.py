@@ -1,5 +1,7 @@
 """Configurations in which nothing touches: searches, checks and clearances, judged by Pinocchio and coal."""
 
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportOptionalOperand=false
+# pyright: reportOptionalSubscript=false, reportOperatorIssue=false, reportCallIssue=false
 from functools import partial
 
 import coal
@@ -133,10 +135,12 @@ def test_a_batch_has_the_answers_of_a_loop(panda, problems):
 def test_another_scene_of_the_same_capacity_compiles_nothing(panda, problems):
     (first, second), start = problems[:2], np.asarray(panda.q0)
     osik.inverse_kinematics(panda, {"panda_hand": first[1:]}, scene=first[0])
-    osik.is_free(panda, panda.q0, first[0]), osik.clearance(panda, panda.q0, first[0])
+    osik.is_free(panda, start, first[0])
+    osik.clearance(panda, start, first[0])
     with Compilations() as compiled:
         osik.inverse_kinematics(panda, {"panda_hand": second[1:]}, scene=second[0], clearance=0.001)
-        osik.is_free(panda, start + 0.1, second[0], 0.01), osik.clearance(panda, panda.q0, second[0])
+        osik.is_free(panda, start + 0.1, second[0], 0.01)
+        osik.clearance(panda, start, second[0])
     assert not compiled.names
 
 
