@@ -38,7 +38,7 @@ def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: 
         wide = over_lanes(partial(plain, **options))
 
         def everywhere(*args: Any) -> Any:
-            calls = {"core": _library.call}
+            calls: dict[str, Callable[..., Any]] = {"core": _library.call}
             if on_gpu and cuda_is_default() and _cuda.installed():
                 calls["core-cuda"] = _cuda.call_lanes
             kernels = {name: partial(kernel, call, **options) for name, call in calls.items()}

@@ -87,8 +87,8 @@ def test_jit_vmap_and_grad_without_compiling_again(arm: Robot):
     for length, found in zip(lengths, tips, strict=True):
         np.testing.assert_allclose(found, tip(length), atol=1e-12)
     step = 1e-6
-    numeric = (tip(0.02 + step) - tip(jnp.array(0.02 - step))) / (2 * step)
-    np.testing.assert_allclose(jax.jacfwd(tip)(0.02), numeric, atol=1e-8)
+    numeric = (tip(jnp.array(0.02 + step)) - tip(jnp.array(0.02 - step))) / (2 * step)
+    np.testing.assert_allclose(jax.jacfwd(tip)(jnp.array(0.02)), numeric, atol=1e-8)
 
 
 @pytest.mark.parametrize(
