@@ -10,10 +10,10 @@
 //
 // and backwards x[t] = V[t]^T (y[t] - near[t+1]^T x[t+1] - V[t] (second[t+2] x[t+2])). Thread (a, b) of 4 x 8 has the
 // entries (a + 4 r, b + 8 c) of each block in registers. Constants from retargeting/_banded.py: N dofs, M rows.
-extern "C" __global__ void __launch_bounds__(32) osik_kernel(
-    const float* square, const float* alone, const float* rows, const float* weight, const float* first,
-    const float* second, const float* right, const int* frame_count, float* solution, float* near, float* inverse,
-    int problems) {
+extern "C" __global__ void __launch_bounds__(32)
+    osik_kernel(const float* square, const float* alone, const float* rows, const float* weight, const float* first,
+                const float* second, const float* right, const int* frame_count, float* solution, float* near,
+                float* inverse, int problems) {
   constexpr int ROWS = (N + 3) / 4, COLUMNS = (N + 7) / 8;
   constexpr int LD = N | 1;                     // lengths of rows: an odd number meets every bank
   constexpr int BLOCK = N * N;
@@ -46,7 +46,9 @@ extern "C" __global__ void __launch_bounds__(32) osik_kernel(
 #pragma unroll
       for (int c = 0; c < COLUMNS; ++c) tile[r][c] = 0.f;
   };
-  struct Strides { int row, k; };
+  struct Strides {
+    int row, k;
+  };
   const Strides upright{LD, 1}, transposed{1, LD}, flat{1, N};
   auto add_product = [&](const float* left, Strides at, const float* right, Strides to, int count) {
     for (int k = 0; k < count; ++k) {           // tile += sum over k of left[i][k] right[j][k]

@@ -12,14 +12,12 @@ namespace osik {
 // Gauss-Newton's system of a clip of F frames.
 struct ClipSystem {
   static constexpr int POINTS = 8;  // rows of standing points in a frame
-  double *blocks;    // [F, N, N] upper triangles of J'J, with -J'residual in column n
-  double *moving;    // [F, POINTS, N] Jacobians of the standing points
-  double *weight;    // [F, POINTS] of what standing points move from the last frame to this one
-  double *gradient;  // [F, n]
+  double* blocks;    // [F, N, N] upper triangles of J'J, with -J'residual in column n
+  double* moving;    // [F, POINTS, N] Jacobians of the standing points
+  double* weight;    // [F, POINTS] of what standing points move from the last frame to this one
+  double* gradient;  // [F, n]
   double *alone, *first, *second;  // [F, n] diagonals: of the frame, one frame back, two frames back
-  static size_t doubles(int frames, int n, int N) {
-    return size_t(frames) * (N * N + POINTS * N + POINTS + 4 * n);
-  }
+  static size_t doubles(int frames, int n, int N) { return size_t(frames) * (N * N + POINTS * N + POINTS + 4 * n); }
   double* place(double* next, int frames, int n, int N) {
     blocks = next, moving = blocks + size_t(frames) * N * N, weight = moving + frames * POINTS * N;
     gradient = weight + frames * POINTS, alone = gradient + frames * n, first = alone + frames * n;
@@ -33,7 +31,7 @@ template <class Team> struct Banded {
   Team t;
   int n, N;              // dofs, stride of rows: a multiple of TILE above n
   double *upper, *near;  // [F, N, N] U_t and N_t
-  double *G;             // [N, N]
+  double* G;             // [N, N]
   double *scaled, *plain;  // [POINTS, N]
   double *v, *z;         // [N]
 

@@ -46,8 +46,7 @@ inline Nearest nearest(const Capsule& first, const Capsule& second) {
   s = inside(quotient(ab * at - ao, aa));
   const V on_a = first.start + s * a, on_b = second.start + at * b, between = on_b - on_a;
   const double gap = inner(between, between);
-  const V normal = gap <= TINY ? across(a, b, second.start - first.start + 0.5 * (b - a))
-                               : (1.0 / std::sqrt(gap)) * between;
+  const V normal = gap <= TINY ? across(a, b, second.start - first.start + 0.5 * (b - a)) : (1.0 / std::sqrt(gap)) * between;
   return {std::sqrt(gap) - first.radius - second.radius, on_a + first.radius * normal, on_b - second.radius * normal,
           normal};
 }

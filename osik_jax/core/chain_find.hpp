@@ -58,15 +58,18 @@ class ChainFinder {
         gram(n * n), pack_space(space.size()), pack_here(n), search(call.in<int>(3) + 1, n, frames, space.data()),
         pack(call.in<int>(3) + 1, n, frames, pack_space.data()), freedom(freedom) {
     Reader<const int*> options{call.in<int>(4) + 1};
-    longest = *options.take(1), check = *options.take(1), trial = *options.take(1), last = *options.take(1), seeds = *options.take(1);
+    longest = *options.take(1), check = *options.take(1), trial = *options.take(1), last = *options.take(1),
+    seeds = *options.take(1);
     nq = *options.take(1), nv = *options.take(1);
     is_warm = *options.take(1), is_near = *options.take(1), is_every = *options.take(1), is_single = *options.take(1);
-    shift = options.take(n), increment = options.take(n), turns = options.take(n), entry = options.take(n), dof = options.take(n);
+    shift = options.take(n), increment = options.take(n), turns = options.take(n), entry = options.take(n),
+    dof = options.take(n);
     search.read(call.in<double>(2)), pack.read(call.in<double>(2));
     search.near = false, search.pull = 0;
     Reader<In> more{search.numbers + 6};
     low = more.take(n), high = more.take(n), home = more.take(nq);
-    progress = *more.take(1), settled = *more.take(1), isolated = *more.take(1), stopped = *more.take(1), still = *more.take(1);
+    progress = *more.take(1), settled = *more.take(1), isolated = *more.take(1), stopped = *more.take(1),
+    still = *more.take(1);
   }
 
   void solve(const xla::Call& call, int target) {
@@ -206,7 +209,8 @@ class ChainFinder {
     for (int j = 0; j < n; ++j) {
       const double lower = search.lower[j], upper = search.upper[j];
       const double fewest = std::ceil((lower - here[j]) / TURN), most = std::floor((upper - here[j]) / TURN);
-      const double number = turns[j] ? std::min(std::max(std::nearbyint((search.start[j] - here[j]) / TURN), fewest), most) : 0;
+      const double number = turns[j] ? std::min(std::max(std::nearbyint((search.start[j] - here[j]) / TURN), fewest), most)
+                                     : 0;
       x[j] = number == 0 ? here[j] : std::min(std::max(here[j] + TURN * number, lower), upper);
     }
   }
@@ -260,7 +264,8 @@ class ChainFinder {
       const double* column = search.J + j * search.rows;
       for (int a = 0; a < search.rows; ++a) gradient += column[a] * search.e[a], squares += column[a] * column[a];
       if (!(std::abs(gradient) > stopped * std::sqrt(squares * errors.cost))) continue;
-      labels[3 + dof[j]] = (search.x[j] >= search.upper[j] && gradient < 0) - (search.x[j] <= search.lower[j] && gradient > 0);
+      labels[3 + dof[j]] = (search.x[j] >= search.upper[j] && gradient < 0) -
+                           (search.x[j] <= search.lower[j] && gradient > 0);
     }
   }
 };

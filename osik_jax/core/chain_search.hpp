@@ -29,8 +29,8 @@ template <class Call> struct ChainSearch {
                                                                   // [frames, 12], [joints]
   In lower, upper, start, numbers;                 // [n] thrice; length, tolerances, enough, share and least of damping
   Real pull, enough;                               // 1 where it goes there, else 0; score at which a search ends, else
-  Real *pose, *turned, *point, *e, *gram;          // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
-  Real *tips, *J, *x, *home;                       // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
+  Real *pose, *turned, *point, *e, *gram;  // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
+  Real *tips, *J, *x, *home;  // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
 
   ChainSearch(const int* sizes, int n, int frames, Real* next) : n(n), frames(frames), m(6 * frames) {
     Reader<const int*> integers{sizes};
@@ -46,7 +46,8 @@ template <class Call> struct ChainSearch {
     Reader<In> at{given};
     constant = at.take(12 * joints), first = at.take(12 * joints), second = at.take(12 * joints);
     offset = at.take(joints), axis = at.take(3 * joints), anchor = at.take(3 * joints), tip = at.take(12 * frames);
-    factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at, enough = numbers[3];
+    factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at,
+    enough = numbers[3];
   }
 
   // Rotation and position of a pose [3, 4].
@@ -63,8 +64,7 @@ template <class Call> struct ChainSearch {
       const Real f = hinge[j] ? Real(2) * s * c : angle, g = hinge[j] ? Real(2) * s * s : Real(0);
       Real local[12];
       OSIK_UNROLL
-      for (int i = 0; i < 12; ++i)
-        local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
+      for (int i = 0; i < 12; ++i) local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
       const M before = turn_of_joint(parent[j]), turn = before * turn_of(local + 0);
       const V at = before * place_of(local + 0) + place_of_joint(parent[j]);
       Real* to = pose + 12 * j;

@@ -25,8 +25,29 @@ struct ClipRobot {
   const double *factors, *points, *turns, *home, *reach, *rise, *radii;  // [reaches] and [corners] lengths
   const double *lower, *upper, *rest, *step, *change, *mass, *center;
   enum Weight {
-    LIMB, PELVIS, TORSO, ROOT_X, ROOT_Y, ROOT_Z, FOOT, POSTURE, STANCE, APART, LIMIT, MARGIN, STIFFNESS, CLEARANCE,
-    SWINGING, SHORTEST, TIED, SMOOTH, SMOOTH_BASE, SPEED, BALANCE, INSIDE, WEIGHTS
+    LIMB,
+    PELVIS,
+    TORSO,
+    ROOT_X,
+    ROOT_Y,
+    ROOT_Z,
+    FOOT,
+    POSTURE,
+    STANCE,
+    APART,
+    LIMIT,
+    MARGIN,
+    STIFFNESS,
+    CLEARANCE,
+    SWINGING,
+    SHORTEST,
+    TIED,
+    SMOOTH,
+    SMOOTH_BASE,
+    SPEED,
+    BALANCE,
+    INSIDE,
+    WEIGHTS
   };
   double weight[WEIGHTS];
 
@@ -35,7 +56,8 @@ struct ClipRobot {
     __builtin_memcpy(&c, take(sizeof c / sizeof(int)), sizeof c);
     parents = take(c.bodies), types = take(c.joints), owners = take(c.joints), source = take(c.values);
     columns = take(c.full), places = take(c.places), joints = take(c.dofs), limbs = take(2 * c.limbs);
-    roots = take(c.roots), above = take(c.above), pairs = take(2 * c.pairs), moves = take(c.bodies * c.full), scalar = take(2 * c.scalars);
+    roots = take(c.roots), above = take(c.above), pairs = take(2 * c.pairs), moves = take(c.bodies * c.full),
+    scalar = take(2 * c.scalars);
     quaternion = take(2 * c.quaternions);
   }
   void read(const double* at) {
@@ -86,12 +108,11 @@ template <class Team> struct ClipFrames {
   static int most_of(const R::Counts& c) { return ROWS + 3 * c.limbs + 2 * c.above + c.most_pairs; }
   static size_t doubles(const R::Counts& c, int N) {
     const int wide = wide_of(c);
-    return c.values + 12 * c.bodies + 9 * c.full + (7 + c.bodies) * wide + 3 * c.places + 36 + 2 * c.pairs +
-           4 * c.capsules + 2 * most_of(c) * N;
+    return c.values + 12 * c.bodies + 9 * c.full + (7 + c.bodies) * wide + 3 * c.places + 36 + 2 * c.pairs + 4 * c.capsules +
+           2 * most_of(c) * N;
   }
   ClipFrames(R& robot, const ClipGoals& goals, int N, double* next)
-      : robot(robot), goals(goals), w(robot.weight), n(robot.c.dofs), N(N), wide(wide_of(robot.c)),
-        most(most_of(robot.c)) {
+      : robot(robot), goals(goals), w(robot.weight), n(robot.c.dofs), N(N), wide(wide_of(robot.c)), most(most_of(robot.c)) {
     const R::Counts& c = robot.c;
     auto take = [&](int size) { return next += size, next - size; };
     value = take(c.values), position = take(3 * c.bodies), rotation = take(9 * c.bodies), linear = take(3 * c.full);
@@ -114,8 +135,17 @@ template <class Team> struct ClipFrames {
   void place(const double* q) {
     const R::Counts& c = robot.c;
     for (int i = 0; i < c.values; ++i) value[i] = robot.coefficient[i] * q[robot.source[i]] + robot.offset[i];
-    const Tree<const double*> tree{c.bodies, c.joints, c.full, robot.parents, robot.types, robot.owners, robot.reference,
-                            robot.body_position, robot.body_quaternion, robot.joint_position, robot.joint_axis};
+    const Tree<const double*> tree{c.bodies,
+                                   c.joints,
+                                   c.full,
+                                   robot.parents,
+                                   robot.types,
+                                   robot.owners,
+                                   robot.reference,
+                                   robot.body_position,
+                                   robot.body_quaternion,
+                                   robot.joint_position,
+                                   robot.joint_axis};
     place_bodies(tree, value, Placed<double*>{position, rotation, linear, angular, anchor});
     for (int dof = 0; dof < c.full; ++dof) {
       const V turn = V::of(angular + 3 * dof);
@@ -376,7 +406,9 @@ template <class Team> struct ClipFrames {
     row = 0;
     Cost cost;
     auto turned = [&](int i) { return robot.c.turned >> i & 1; };
-    cost.soft += ask_limbs(goals.directions + size_t(3) * robot.c.limbs * frame, goals.held + size_t(robot.c.reaches) * frame) + ask_root(goals.root + 3 * frame);
+    cost.soft += ask_limbs(goals.directions + size_t(3) * robot.c.limbs * frame,
+                           goals.held + size_t(robot.c.reaches) * frame) +
+                 ask_root(goals.root + 3 * frame);
     if (turned(0)) cost.soft += ask_rotation(0, goals.pelvis + 9 * frame, w[R::PELVIS]);
     for (int i = 0; i < 2; ++i)
       if (turned(2 + i)) cost.soft += ask_rotation(2 + i, goals.feet + 18 * frame + 9 * i, w[R::FOOT]);

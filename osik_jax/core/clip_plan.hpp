@@ -25,13 +25,12 @@ template <class Team> struct ClipPlan {
 
   static size_t doubles(const ClipRobot& robot, int frames) {
     const int n = robot.c.dofs, N = Banded<Team>::stride(n);
-    return Banded<Team>::doubles(frames, N) + ClipFrames<Team>::doubles(robot.c, N) +
-           2 * ClipSystem::doubles(frames, n, N) + 2 * n + frames * (1 + 2 * n) + Banded<Team>::TILE;
+    return Banded<Team>::doubles(frames, N) + ClipFrames<Team>::doubles(robot.c, N) + 2 * ClipSystem::doubles(frames, n, N) +
+           2 * n + frames * (1 + 2 * n) + Banded<Team>::TILE;
   }
   ClipPlan(ClipRobot& robot, const ClipGoals& goals, const ClipMethod& method, int frames, int nq, double* next)
-      : robot(robot), goals(goals), method(method), frames(frames), nq(nq), n(robot.c.dofs),
-        N(Banded<Team>::stride(n)), banded(n, frames, next),
-        clip(robot, goals, N, next + Banded<Team>::doubles(frames, N)),
+      : robot(robot), goals(goals), method(method), frames(frames), nq(nq), n(robot.c.dofs), N(Banded<Team>::stride(n)),
+        banded(n, frames, next), clip(robot, goals, N, next + Banded<Team>::doubles(frames, N)),
         manifold{robot.c.scalars, robot.c.quaternions, robot.scalar, robot.quaternion} {
     next += Banded<Team>::doubles(frames, N) + ClipFrames<Team>::doubles(robot.c, N);
     next = there.place(here.place(next, frames, n, N), frames, n, N);
@@ -63,7 +62,8 @@ template <class Team> struct ClipPlan {
       const double smooth = present * (robot.joints[j] >= 0 ? w[ClipRobot::SMOOTH] : w[ClipRobot::SMOOTH_BASE]);
       const double over = value - ClipFrames<Team>::inside(value, -bound, bound);
       const double beyond = over != 0.0 ? w[ClipRobot::SPEED] / (bound * bound) : 0.0;
-      const double c = smooth + w[ClipRobot::STIFFNESS] * beyond, a = smooth * value + w[ClipRobot::STIFFNESS] * beyond * over;
+      const double c = smooth + w[ClipRobot::STIFFNESS] * beyond,
+                   a = smooth * value + w[ClipRobot::STIFFNESS] * beyond * over;
       const int at = f * n + j, next = at + n, last = next + n;
       cost += {0.5 * smooth * value * value, 0.5 * beyond * over * over};
       out.alone[at] += c, out.alone[next] += 4.0 * c, out.alone[last] += c;

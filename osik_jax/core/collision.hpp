@@ -17,18 +17,19 @@ template <class Real> struct ShapedRobot {
   using In = const Real*;
   int bodies, joints, dofs, full, shapes, pairs, vertices;
   const int *parents, *types, *owners, *source;          // [bodies], [joints] twice, [full]
-  const int *moves, *group;                              // [bodies] whether the search moves it; its rigid group, 0 if not
-  const int *kind, *body, *first, *count, *world;        // [shapes] each
-  const int* pair;                                       // [pairs, 2]
+  const int *moves, *group;  // [bodies] whether the search moves it; its rigid group, 0 if not
+  const int *kind, *body, *first, *count, *world;  // [shapes] each
+  const int* pair;  // [pairs, 2]
   In factor, offset, reference, position, quaternion, joint_position, joint_axis;
-  In size, place, turn, center, bound, points;           // [shapes, 3] twice, [shapes, 9], centre [shapes, 3] and radius of
-                                                         // a sphere in the body's axes, [vertices, 3]
+  In size, place, turn, center, bound, points;  // [shapes, 3] twice, [shapes, 9], centre [shapes, 3] and radius of
+  // a sphere in the body's axes, [vertices, 3]
   ShapedRobot(const int* integers, In numbers) {
     Reader<const int*> i{integers};
     bodies = *i.take(1), joints = *i.take(1), dofs = *i.take(1), full = *i.take(1);
     shapes = *i.take(1), pairs = *i.take(1), vertices = *i.take(1);
     parents = i.take(bodies), types = i.take(joints), owners = i.take(joints), source = i.take(full);
-    moves = i.take(bodies), group = i.take(bodies), kind = i.take(shapes), body = i.take(shapes), first = i.take(shapes), count = i.take(shapes);
+    moves = i.take(bodies), group = i.take(bodies), kind = i.take(shapes), body = i.take(shapes), first = i.take(shapes),
+    count = i.take(shapes);
     world = i.take(shapes), pair = i.take(2 * pairs);
     Reader<In> r{numbers};
     factor = r.take(full), offset = r.take(full), reference = r.take(full), position = r.take(3 * bodies);
@@ -44,8 +45,8 @@ template <class Real> struct ShapedRobot {
 // A scene, likewise: fields of ShapeTable, the body that carries each row (-1: none), contacts that are allowed.
 template <class Real> struct SceneRows {
   int rows;
-  const int *kind, *first, *count, *body;    // [rows] each
-  const int *contacts, *among;               // [rows, shapes of the robot], [rows, rows] flags
+  const int *kind, *first, *count, *body;  // [rows] each
+  const int *contacts, *among;  // [rows, shapes of the robot], [rows, rows] flags
   const Real *size, *place, *turn, *points;  // [rows, 3] twice, [rows, 9], [vertices, 3]
   SceneRows(const int* integers, const Real* numbers, int shapes) {
     Reader<const int*> i{integers};
@@ -71,11 +72,11 @@ template <class Real> class Collision {
   const ShapedRobot<Real>& robot;
   List turns, positions, unused, points;  // of bodies, [bodies, 9] and [bodies, 3]; [dofs, 9]; vertices of the scene
   std::vector<Convex<Real>> local, world;  // shapes in their bodies, and where they are
-  std::vector<V> local_center, center;     // of their bounding spheres
+  std::vector<V> local_center, center;  // of their bounding spheres
   List bound;
-  std::vector<int> carrier;                // body of each shape
-  std::vector<Pair> pairs;                 // those that are kept apart
-  int fixed = 0;                           // the first ones, whose distance no search changes
+  std::vector<int> carrier;  // body of each shape
+  std::vector<Pair> pairs;  // those that are kept apart
+  int fixed = 0;  // the first ones, whose distance no search changes
 
  public:
   struct Nearest {
@@ -86,8 +87,8 @@ template <class Real> class Collision {
   explicit Collision(const ShapedRobot<Real>& robot)
       : robot(robot), turns(9 * robot.bodies), positions(3 * robot.bodies), unused(9 * robot.dofs) {
     for (int k = 0; k < robot.shapes; ++k)
-      add({robot.kind[k], robot.count[k], V::of(robot.size + 3 * k), V::of(robot.place + 3 * k),
-           M::of(robot.turn + 9 * k), robot.points + 3 * robot.first[k]},
+      add({robot.kind[k], robot.count[k], V::of(robot.size + 3 * k), V::of(robot.place + 3 * k), M::of(robot.turn + 9 * k),
+           robot.points + 3 * robot.first[k]},
           robot.body[k], V::of(robot.center + 3 * k), robot.bound[k]);
   }
 
@@ -159,9 +160,7 @@ template <class Real> class Collision {
   }
   Gap<Real> gap_of(int i, int j) const { return gap_between(world[i], world[j]); }
   // Distance from a point to the farthest point of a shape, or more.
-  Real reach(int shape, V from) const {
-    return sqrt(inner(center[shape] - from, center[shape] - from)) + bound[shape];
-  }
+  Real reach(int shape, V from) const { return sqrt(inner(center[shape] - from, center[shape] - from)) + bound[shape]; }
 
  private:
   static int padded(int count) { return (count + HULL_PACK - 1) / HULL_PACK * HULL_PACK; }
@@ -182,8 +181,8 @@ template <class Real> class Collision {
     const Real *from = scene.points + 3 * scene.first[r], *at = points.data() + points.size();
     for (int axis = 0; axis < 3; ++axis)
       for (int k = 0; k < wide; ++k) points.push_back(from[3 * std::min(k, count - 1) + axis]);
-    const Convex<Real> shape{scene.kind[r], wide, V::of(scene.size + 3 * r), V::of(scene.place + 3 * r),
-                             M::of(scene.turn + 9 * r), at};
+    const Convex<Real> shape{
+        scene.kind[r], wide, V::of(scene.size + 3 * r), V::of(scene.place + 3 * r), M::of(scene.turn + 9 * r), at};
     V middle{0, 0, 0};
     for (int k = 0; k < count; ++k) middle = middle + Real(1) / count * shape.vertex(k);
     add(shape, scene.body[r], shape.rotation * middle + shape.position, radius_around(shape, middle));

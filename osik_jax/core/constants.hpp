@@ -28,8 +28,8 @@ constexpr double VALUE_TOL = 30.0, SIGN_TOL = 2.0, GRADIENT_TOL = 4.0, ROW_MULTI
                  MAX_RESIDUAL = 10.0;
 
 // tasks of a step
-constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-6, UNHELD_PART = 0.04,
-                 NEAR_ERROR = 0.06, NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
+constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-6, UNHELD_PART = 0.04, NEAR_ERROR = 0.06,
+                 NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
 
 // rotations, collision
 constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, PARALLEL = 1e-6;
@@ -40,9 +40,8 @@ constexpr double NARROW_RANGE = 1e4;
 // saturation
 constexpr int STRAIGHT = 1, PART = 2, WHOLE = 3;
 constexpr int PATH_SEARCHES = 6;
-constexpr double NEGLIGIBLE_STEP = 1e-11, FULL_STEP = 0.999999999, PATH_STEP = 1e-9, PATH_END = 1e-6,
-                 BLOCKING_RANK = 1e-6, BOUND_DISTANCE = 1e-9, SATURATION_RESIDUAL = 2e-9, SATURATION_ROUNDOFF = 1e-11,
-                 NEGLIGIBLE_ENTRY = 1e-7;
+constexpr double NEGLIGIBLE_STEP = 1e-11, FULL_STEP = 0.999999999, PATH_STEP = 1e-9, PATH_END = 1e-6, BLOCKING_RANK = 1e-6,
+                 BOUND_DISTANCE = 1e-9, SATURATION_RESIDUAL = 2e-9, SATURATION_ROUNDOFF = 1e-11, NEGLIGIBLE_ENTRY = 1e-7;
 
 // ---- of kernels alone
 

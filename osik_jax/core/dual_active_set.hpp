@@ -89,15 +89,16 @@ template <class Team> struct DualActiveSet {
   // The constraint whose activation raises the dual objective most, -1 for none. A full step raises it by half of
   // gap^2 / |J2'n|^2. Equalities come first; those that the active constraints imply are passed over.
   OSIK_CALL int most_violated(const Int* label, const Int* implied) {
-    return t.best(Real(0), 0, N, [&](int i) {
-              if (label[i] != INACTIVE || implied[i]) return Real(0);
-              if (c.lower[i] == c.upper[i]) return Real(INFINITE);
-              const Real off = gap(i);
-              if (!(off > c.roundoff[i])) return Real(0);
-              Real outside = 0;
-              for (int k = count; k < N; ++k) outside += square(own_along_normal(i, k));
-              return off * off / larger(outside, Team::SMALLEST_PIVOT);
-            }).which;
+    return t
+        .best(Real(0), 0, N, [&](int i) {
+      if (label[i] != INACTIVE || implied[i]) return Real(0);
+      if (c.lower[i] == c.upper[i]) return Real(INFINITE);
+      const Real off = gap(i);
+      if (!(off > c.roundoff[i])) return Real(0);
+      Real outside = 0;
+      for (int k = count; k < N; ++k) outside += square(own_along_normal(i, k));
+      return off * off / larger(outside, Team::SMALLEST_PIVOT);
+    }).which;
   }
   OSIK_CALL void add(Real* d) {  // a Householder reflection of the columns of J2 turns d2 into one number
     Real* w = REFLECTED;

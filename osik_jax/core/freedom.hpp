@@ -137,8 +137,12 @@ inline void find_gaps(const xla::Call& call) {
     for (int k = 0; k < 2; ++k) {
       const int* integers = call.in<int>(0) + 6 * pair + 3 * k;
       const double* numbers = call.in<double>(1) + 30 * pair + 15 * k;
-      shape[k] = {integers[0], integers[2], Vec3<double>::of(numbers), Vec3<double>::of(numbers + 3),
-                  Mat3<double>::of(numbers + 6), call.in<double>(2) + 3 * integers[1]};
+      shape[k] = {integers[0],
+                  integers[2],
+                  Vec3<double>::of(numbers),
+                  Vec3<double>::of(numbers + 3),
+                  Mat3<double>::of(numbers + 6),
+                  call.in<double>(2) + 3 * integers[1]};
     }
     const Gap<double> gap = gap_between(shape[0], shape[1]);
     double* to = call.out<double>(0) + 10 * pair;

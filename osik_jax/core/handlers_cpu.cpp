@@ -18,11 +18,11 @@ void solve_hierarchies(const xla::Call& call) {
   const Sizes s{L, m, n, h, call.in<int>(16)[0], call.in<int>(13), call.in<int>(14), call.in<int>(15)};
   auto numbers = [&](int k) { return call.in<double>(k); };
   auto integers = [&](int k) { return call.in<int>(k); };
-  Problem p{numbers(0), numbers(1), numbers(2), numbers(3), numbers(4),   numbers(5),   numbers(6), numbers(7),
-            numbers(8), integers(9), integers(10), integers(11), integers(12), n, 1, false};
-  Answer a{call.out<double>(0), call.out<double>(1), call.out<double>(2), call.out<double>(3), call.out<double>(4),
-           call.out<int>(5),    call.out<int>(6),    call.out<int>(7),    call.out<int>(8),    call.out<int>(9),
-           call.out<int>(10),   call.out<int>(11)};
+  Problem p{numbers(0), numbers(1),  numbers(2),   numbers(3),   numbers(4),   numbers(5), numbers(6), numbers(7),
+            numbers(8), integers(9), integers(10), integers(11), integers(12), n,          1,          false};
+  Answer a{call.out<double>(0), call.out<double>(1), call.out<double>(2), call.out<double>(3),
+           call.out<double>(4), call.out<int>(5),    call.out<int>(6),    call.out<int>(7),
+           call.out<int>(8),    call.out<int>(9),    call.out<int>(10),   call.out<int>(11)};
   using Method = Hierarchy<Team>;
   std::vector<char> space(Method::bytes(s));
   Method method(s, space.data());

@@ -186,8 +186,8 @@ std::string launch(xla::CallFrame* frame) {
     pointers.push_back(&problems);
     if (shared > SHARED_WITHOUT_ASKING) c.set_attribute(function, DYNAMIC_SHARED, shared);
     if (problems > 0)
-      if (int code = c.launch(function, (problems + per_block - 1) / per_block, 1, 1, threads, 1, 1, shared,
-                              stream.stream, pointers.data(), nullptr))
+      if (int code = c.launch(function, (problems + per_block - 1) / per_block, 1, 1, threads, 1, 1, shared, stream.stream,
+                              pointers.data(), nullptr))
         error = code_of("cuLaunchKernel", code);
   }
   c.pop(&popped);

@@ -21,9 +21,9 @@ namespace osik {
 // Sizes of all problems of a call.
 struct Sizes {
   int L, m, n, h, max_iterations;  // levels, rows of the longest level, variables, hard rows
-  const int *row_counts;           // [L] rows of each level
-  const int *level_of_hard;        // [h] level of each hard row, -1 for the box
-  const int *row_of_hard;          // [h - n] index of each hard row among the rows of its level
+  const int* row_counts;           // [L] rows of each level
+  const int* level_of_hard;        // [h] level of each hard row, -1 for the box
+  const int* row_of_hard;          // [h - n] index of each hard row among the rows of its level
 };
 
 // The data of one problem. Entry i of row a of level k is at matrix[(first + a) row + i column], where `first` is k m,
@@ -162,8 +162,8 @@ template <class Team> struct Hierarchy {
 
   template <class... Arrays> OSIK_FN void place(char* space, Arrays&... arrays) { (arrays.place(space, size), ...); }
   OSIK_FN Hierarchy(const Sizes& s, char* space)
-      : size(s), n(s.n), m(s.m), h(s.h), ld(Team::stride(Team::variables(n))),
-        lm(Team::stride(Team::level_rows(m))), row(ld), column(1) {
+      : size(s), n(s.n), m(s.m), h(s.h), ld(Team::stride(Team::variables(n))), lm(Team::stride(Team::level_rows(m))),
+        row(ld), column(1) {
     place(space, Z, R, hard, copied, V, S, X, START, STEP, WORK, DOWNHILL, CURVATURE, HARD_LOWER, HARD_UPPER, HARD_NORM,
           MULTIPLIER, LOWER, UPPER, ROW_NORM, VALUE, SLACK, RATE, RIGHT, SCALE, INVERSE, DIAGONAL, ACTIVE, ACTIVE_ABOVE,
           FROZEN, PENDING, FREEZES, EQUALITY, IN_COST, OWN, PIVOT, NONZERO, NONZERO_END, ACTIVE_BOUND, ACTIVE_ROW);
@@ -175,7 +175,9 @@ template <class Team> struct Hierarchy {
   }
   OSIK_FN double target(int a, double value) const { return EQUALITY[a] ? LOWER[a] : clip(value, LOWER[a], UPPER[a]); }
   OSIK_FN bool may_block(int q) const { return !FROZEN[q] && size.level_of_hard[q] < level; }
-  OSIK_FN double row_value(int a, const double* d) const { return t.own_row(A + a * row, d, NONZERO[a], NONZERO_END[a], n, column); }
+  OSIK_FN double row_value(int a, const double* d) const {
+    return t.own_row(A + a * row, d, NONZERO[a], NONZERO_END[a], n, column);
+  }
   OSIK_FN void copy(const double* a, double* b, int count) { Algebra::copy(t, a, b, count); }
   OSIK_FN void copy(const Int* a, Int* b, int count) { Algebra::copy(t, a, b, count); }
 
@@ -359,9 +361,7 @@ template <class Team> struct Hierarchy {
 
   // ---- the working set of the warm start, improved at once a few times
   OSIK_FN void working_set_slack() {
-    t.each(0, rows, [&](int a) {
-      SLACK[a] = IN_COST[a] ? row_value(a, X) - (OWN[a] == 1 ? UPPER[a] : LOWER[a]) : 0.0;
-    });
+    t.each(0, rows, [&](int a) { SLACK[a] = IN_COST[a] ? row_value(a, X) - (OWN[a] == 1 ? UPPER[a] : LOWER[a]) : 0.0; });
   }
   OSIK_METHOD void solve_on_working_set() {
     copy(START, X, n);
@@ -440,8 +440,7 @@ template <class Team> struct Hierarchy {
       }
       changes += now.changes;
     }
-    if (feasible)
-      largest = larger(largest, x_max);
+    if (feasible) largest = larger(largest, x_max);
     else {
       copy(START, X, n);
       copy(ACTIVE_ABOVE, ACTIVE, h);
@@ -657,8 +656,7 @@ template <class Team> struct Hierarchy {
     if constexpr (Team::COPIES) {
       A = copied;
       for (int a = 0; a < rows; ++a) copy(p.matrix + (at + a) * n, copied + a * ld, n);
-    } else
-      A = p.matrix + (p.packed ? first_row : at) * p.row, row = p.row, column = p.column;
+    } else A = p.matrix + (p.packed ? first_row : at) * p.row, row = p.row, column = p.column;
     t.nonzero(A, row, column, rows, n, NONZERO, NONZERO_END);
     t.each(0, rows, [&](int a) {
       const double square = t.own_square(A + a * row, NONZERO[a], NONZERO_END[a], column);
@@ -701,8 +699,7 @@ template <class Team> struct Hierarchy {
     t.each(0, h, [&](int q) {
       const int active = to.active[hard_at + q];
       to.frozen[hard_at + q] = FREEZES[q] || tie ? active : 0;
-      if (q < n)
-        ACTIVE_BOUND[q] = active ? active : FROZEN[q] ? ACTIVE_BOUND[q] : 0;
+      if (q < n) ACTIVE_BOUND[q] = active ? active : FROZEN[q] ? ACTIVE_BOUND[q] : 0;
       else if (size.level_of_hard[q] == level) {  // levels below may not make a row of this one worse than it is
         const double value = hard_value(q, X);
         HARD_LOWER[q] = value < HARD_LOWER[q] ? value : HARD_LOWER[q], HARD_UPPER[q] = larger(HARD_UPPER[q], value);

@@ -99,8 +99,9 @@ template <class Call> void move_centers(const Call& call) {
 
 // Results of rows of tasks: error, rows, wanted velocity, curvature, pull, levers, squared lengths of the rows.
 template <class Call> Rows<typename Call::Out> rows_of(const Call& call, int lane) {
-  return {call.out(0, lane), call.out(1, lane), call.out(2, lane), call.out(3, lane),
-          call.out(4, lane), call.out(5, lane), {},                call.out(6, lane)};
+  return {
+      call.out(0, lane), call.out(1, lane), call.out(2, lane), call.out(3, lane), call.out(4, lane), call.out(5, lane), {},
+      call.out(6, lane)};
 }
 
 // Arguments as in tasks/_com.py.

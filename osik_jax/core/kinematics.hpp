@@ -25,8 +25,7 @@ template <class Out> struct Placed {
 };
 
 // Place the bodies at configuration q: [full nq].
-template <class In, class Q, class Out>
-void place_bodies(const Tree<In>& tree, Q q, const Placed<Out>& to) {
+template <class In, class Q, class Out> void place_bodies(const Tree<In>& tree, Q q, const Placed<Out>& to) {
   using Real = NumberAt<Out>;
   using V = Vec3<Real>;
   using Turn = Quaternion<Real>;
@@ -104,8 +103,7 @@ template <class Real> struct Twist {
 };
 
 // The motion of a point at `at` for a unit velocity of a full dof that carries it, times a factor.
-template <class From, class Real>
-Twist<Real> motion_of(const Placed<From>& placed, int dof, Vec3<Real> at, Real factor) {
+template <class From, class Real> Twist<Real> motion_of(const Placed<From>& placed, int dof, Vec3<Real> at, Real factor) {
   using V = Vec3<Real>;
   const V axis = V::of(placed.angular + 3 * dof);
   const V speed = V::of(placed.linear + 3 * dof) + cross(axis, at - V::of(placed.anchor + 3 * dof));
@@ -122,9 +120,9 @@ Vec3<NumberAt<From>> place_frame(const Placed<From>& placed, int body, In offset
   return at;
 }
 // The same, and the Jacobian J [6, nv] of its point: rows [linear; angular]. moved: [dofs] flags
-template <class In, class From, class Out>
-void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body, In offset, In turn, const int* moved,
-                Out position, Out rotation, Out J) {
+template <class In, class From, class Out> void move_frame(const DofColumns<In>& d, const Placed<From>& placed, int body,
+                                                           In offset, In turn, const int* moved, Out position, Out rotation,
+                                                           Out J) {
   using Real = NumberAt<Out>;
   const Vec3<Real> at = place_frame(placed, body, offset, turn, position, rotation);
   const bool alone = d.alone();
@@ -167,15 +165,14 @@ CenterColumns<In, From> find_center(const DofColumns<In>& d, const Placed<From>&
                                     const int* owner, Mass mass, In center, NumberAt<From>* below, Out point) {
   using Real = NumberAt<From>;
   using V = Vec3<Real>;
-OSIK_UNROLL_4
+  OSIK_UNROLL_4
   for (int body = 0; body < bodies; ++body) {
     const V at = V::of(placed.position + 3 * body) + Mat3<Real>::of(placed.rotation + 9 * body) * V::of(center + 3 * body);
     below[4 * body] = mass[body], (mass[body] * at).put(below + 4 * body + 1);
   }
-  for (int body = bodies - 1; body > 0; --body)
-OSIK_UNROLL_4
-    for (int i = 0; i < 4; ++i) below[4 * parents[body] + i] += below[4 * body + i];
-OSIK_UNROLL_4
+  for (int body = bodies - 1; body > 0; --body) OSIK_UNROLL_4
+  for (int i = 0; i < 4; ++i) below[4 * parents[body] + i] += below[4 * body + i];
+  OSIK_UNROLL_4
   for (int i = 0; i < 3; ++i) point[i] = below[1 + i] / below[0];
   return {placed, d, owner, below};
 }

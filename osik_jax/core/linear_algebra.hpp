@@ -29,7 +29,7 @@ template <class Team> struct LinearAlgebra {
     t.are_shared(M, v, out);
     t.columns(start, n, [&](auto c) {
       auto total = typename decltype(c)::P(0);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < n; ++i) total.fma(v[i], c.load(M + i * ld));
       c.store(out, total);
     });
@@ -45,8 +45,8 @@ OSIK_UNROLL_4
 
   // The Gram matrix of `count` rows over the columns [start, n): its diagonal goes to `diagonal`, the rest to the upper
   // triangle of S, or to the lower one.
-  OSIK_CALL static void gram(Team t, const Real* rows, Real* S, Real* diagonal, int ld, int ld_gram, int count,
-                             int start, int n, bool lower) {
+  OSIK_CALL static void gram(Team t, const Real* rows, Real* S, Real* diagonal, int ld, int ld_gram, int count, int start,
+                             int n, bool lower) {
     t.are_shared(rows, S, diagonal);
     const int of_a = lower ? 1 : ld_gram, of_b = lower ? ld_gram : 1;
     t.pairs(count, [&](int a, int b) {
@@ -114,7 +114,7 @@ OSIK_UNROLL_4
     t.each(0, count, [&](int i) { work[i] *= inverse[i]; });
     t.columns(0, count, [&](auto c) {
       auto total = typename decltype(c)::P(0);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = c.at; i < count; ++i) total.fma(work[i], c.load(M + i * ld));
       c.store(b, total);
     });
@@ -124,9 +124,9 @@ OSIK_UNROLL_4
   // while it is longer than `least`; the longest remaining column is taken first.
   // V: [rank, ld_V] reflections, scale: [rank], pivot: [rank] columns, squares: [n] squared lengths of the columns.
   // Returns the rank. OUTSIDE: V is in global memory, and the reflection at work in `near` [rows] too.
-  template <bool OUTSIDE = false>
-  OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* near, Real* squares, Real* scales, Int* pivot, int ld,
-                                  int ld_V, int rows, int first, int n, Real least) {
+  template <bool OUTSIDE = false> OSIK_CALL static int pivoted_qr(Team t, Real* R, Real* V, Real* near, Real* squares,
+                                                                  Real* scales, Int* pivot, int ld, int ld_V, int rows,
+                                                                  int first, int n, Real least) {
     t.are_shared(R, squares, scales, pivot);
     int rank = 0;
     if (rows > 0)
@@ -174,7 +174,7 @@ OSIK_UNROLL_4
   template <class C> OSIK_FN static auto weighted_sum(C c, const Real* v, const Real* M, int ld, int start, int stop) {
     typename C::P even(0), odd(0);
     int a = start;
-OSIK_UNROLL_4
+    OSIK_UNROLL_4
     for (; a + 1 < stop; a += 2) even.fma(v[a], c.load(M + a * ld)), odd.fma(v[a + 1], c.load(M + (a + 1) * ld));
     if (a < stop) even.fma(v[a], c.load(M + a * ld));
     return even += odd;
@@ -195,7 +195,7 @@ OSIK_UNROLL_4
     t.are_shared(out);
     if constexpr (Team::SPARES_SPACE) {
       t.each(0, rows, [&](int a) {
-OSIK_UNROLL_4
+        OSIK_UNROLL_4
         for (int i = 0; i < n; ++i) t.fetch_one(out + i * ld + a, A + a * row + i * column);
       });
       t.arrive();
@@ -204,7 +204,7 @@ OSIK_UNROLL_4
         const Real* r[4];
         for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
         t.each(0, n, [&](int i) {
-OSIK_UNROLL
+          OSIK_UNROLL
           for (int b = 0; b < 4; ++b)
             if (first + b < rows) out[i * ld + first + b] = r[b][i * column];
         });
@@ -214,9 +214,9 @@ OSIK_UNROLL
 
   // M <- Q'M of the first `count` rows and n columns of M, with the reflections of pivoted_qr, two at a time.
   // OUTSIDE: V is in global memory, and the reflections at work in `near` [2, ld_near] too.
-  template <bool OUTSIDE = false>
-  OSIK_CALL static void apply_reflections(Team t, const Real* V, Real* near, const Real* scales, Real* M, int ld_V,
-                                          int ld_near, int ld, int rank, int count, int n) {
+  template <bool OUTSIDE = false> OSIK_CALL static void apply_reflections(Team t, const Real* V, Real* near,
+                                                                          const Real* scales, Real* M, int ld_V, int ld_near,
+                                                                          int ld, int rank, int count, int n) {
     t.are_shared(scales, M);
     for (int k = 0; k < rank; k += 2) {
       const bool two = k + 1 < rank;
@@ -231,7 +231,7 @@ OSIK_UNROLL
         using P = typename decltype(c)::P;
         P along_v(0), along_w(0), head = c.load(M + k * ld);
         along_v.fma(v[k], head);
-OSIK_UNROLL_4
+        OSIK_UNROLL_4
         for (int a = k + 1; a < count; ++a) {
           const P x = c.load(M + a * ld);
           along_v.fma(v[a], x), along_w.fma(w[a], x);
@@ -262,19 +262,19 @@ OSIK_UNROLL_4
   // out[b, j] = factor_b sum_i r_b[i column] Z[i, j] over from <= i < to, for start <= j < n and the first `rows` of
   // four rows, so that each entry of Z is read once for four. `add`: added to what out has; `lower`: Z is lower
   // triangular, and the sums begin at the first column of a pack.
-  OSIK_FN static void four_rows(const Team& t, const Real* const (&r)[4], const Real (&factor)[4], int column,
-                                const Real* Z, Real* out, int ld, int ld_out, int rows, int from, int to, int start,
-                                int n, bool add = false, bool lower = false) {
+  OSIK_FN static void four_rows(const Team& t, const Real* const (&r)[4], const Real (&factor)[4], int column, const Real* Z,
+                                Real* out, int ld, int ld_out, int rows, int from, int to, int start, int n,
+                                bool add = false, bool lower = false) {
     t.narrow_columns(start, n, [&](auto c) {
       using P = typename decltype(c)::P;
       P total[4] = {P(0), P(0), P(0), P(0)};
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = lower && c.at > from ? c.at : from; i < to; ++i) {
         const P z = c.load(Z + i * ld);
-OSIK_UNROLL
+        OSIK_UNROLL
         for (int b = 0; b < 4; ++b) total[b].fma(r[b][i * column], z);
       }
-OSIK_UNROLL
+      OSIK_UNROLL
       for (int b = 0; b < 4; ++b)
         if (b < rows) {
           P out_b = add ? c.load(out + b * ld_out) : P(0);
@@ -291,8 +291,7 @@ OSIK_UNROLL
     for (int first = 0; first < rows; first += 4) {
       const Real* r[4];
       for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
-      four_rows(t, r, factor, column, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner, upper ? first : 0,
-                n);
+      four_rows(t, r, factor, column, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner, upper ? first : 0, n);
     }
   }
 
@@ -304,16 +303,16 @@ OSIK_UNROLL
     for (int first = 0; first < rows; first += 4) {
       const Real* r[4];
       for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first);
-      four_rows(t, r, factor, ld, M, S + first * ld, ld, ld, rows - first, 0, inner, upper ? first / 8 * 8 : from, to,
-                true, lower);
+      four_rows(t, r, factor, ld, M, S + first * ld, ld, ld, rows - first, 0, inner, upper ? first / 8 * 8 : from, to, true,
+                lower);
     }
   }
 
   // The product of a level's rows with the basis Z: R[a, j] = sum_i A[a, i] Z[i, j] for start <= j < n, or 0 where
   // in_cost[a] is 0. Entry i of row a is A[a row + i column]; it is 0 outside of [nonzero[a], nonzero_end[a]).
   OSIK_CALL static void rows_times_basis(Team t, const Real* A, int row, int column, const Real* Z, Real* R, int ld,
-                                         const Int* in_cost, const Int* nonzero, const Int* nonzero_end, int rows,
-                                         int start, int n) {
+                                         const Int* in_cost, const Int* nonzero, const Int* nonzero_end, int rows, int start,
+                                         int n) {
     t.are_shared(Z, R, in_cost, nonzero, nonzero_end);
     for (int first = 0; first < rows; first += 4) {
       const Real* r[4];

@@ -23,7 +23,8 @@ struct Manifold {
       const bool small = square < SMALL_TURN_SQUARED;
       const double cosine = small ? 1.0 - square / 8.0 + square * square / 384.0 : std::cos(0.5 * angle);
       const double factor = small ? 0.5 - square / 48.0 + square * square / 3840.0 : std::sin(0.5 * angle) / angle;
-      const Quaternion<double> turned = unit(q + at) * Quaternion<double>{cosine, factor * w[0], factor * w[1], factor * w[2]};
+      const Quaternion<double> turned = unit(q + at) *
+                                        Quaternion<double>{cosine, factor * w[0], factor * w[1], factor * w[2]};
       const double numbers[4] = {turned.w, turned.x, turned.y, turned.z};
       const Quaternion<double> end = unit(numbers);
       out[at] = end.w, out[at + 1] = end.x, out[at + 2] = end.y, out[at + 3] = end.z;
@@ -38,9 +39,8 @@ struct Manifold {
       from = {from.w, -from.x, -from.y, -from.z};
       const Quaternion<double> turn = from * unit(b + at);
       const double w = turn.w, square = inner(turn.vector(), turn.vector()), sine = std::sqrt(square);
-      const double factor = square < SMALL_TURN_SQUARED
-                                ? (2.0 - 2.0 / 3.0 * square / (w * w)) / w
-                                : 2.0 * std::atan2(w >= 0.0 ? sine : -sine, std::fabs(w)) / sine;
+      const double factor = square < SMALL_TURN_SQUARED ? (2.0 - 2.0 / 3.0 * square / (w * w)) / w
+                                                        : 2.0 * std::atan2(w >= 0.0 ? sine : -sine, std::fabs(w)) / sine;
       (factor * turn.vector()).put(out + quaternion[quaternions + k]);
     }
   }

@@ -37,15 +37,26 @@ struct StepLayout {
   };
   // the leaves of the step and those of the robot, in the order of the layout; the last three are NullSpace's
   enum { Q, DT, DAMPING, CURVATURE_DAMPING, BOX, BOX_END, POTENTIAL_GAIN, MARGIN, RANK_TOLERANCE, STEP_LEAVES };
-  enum { OFFSET, REFERENCE, POSITION, QUATERNION, ANCHOR, AXIS, MASS, CENTER_OF_MASS, FRAME_POSITION, FRAME_ROTATION,
-         ROBOT_LEAVES };
+  enum {
+    OFFSET,
+    REFERENCE,
+    POSITION,
+    QUATERNION,
+    ANCHOR,
+    AXIS,
+    MASS,
+    CENTER_OF_MASS,
+    FRAME_POSITION,
+    FRAME_ROTATION,
+    ROBOT_LEAVES
+  };
   StepSizes s;
   std::vector<int> numbers;
   std::vector<Task> tasks;
   const Place* places;
   const int *of_step, *of_robot;                 // leaves, those of the box -1 for none
   const int *source, *owner, *turning, *scalar;  // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
-  const int *limits;                             // [limits, 5] kind and leaves of each
+  const int* limits;                             // [limits, 5] kind and leaves of each
   const int *parents, *types, *owners, *column;  // those of Tree and DofColumns
   const int *row_counts, *level_of_hard, *row_of_hard;
 
@@ -148,8 +159,13 @@ template <class Real> class MovingRows {
       interval.upper = leaf(task.leaves[4]).at;
     }
     auto out = [&](size_t first, size_t i) { return numbers<Out>(rows + first + i, at.end); };
-    const Rows<Out> to{out(at.error, task.first), out(at.J, task.first * s.nv), out(at.low, task.first), out(at.curvature, k),
-                       out(at.pull, task.first), out(at.levers, k * s.nv), task.bounded ? out(at.high, task.first) : Out{},
+    const Rows<Out> to{out(at.error, task.first),
+                       out(at.J, task.first * s.nv),
+                       out(at.low, task.first),
+                       out(at.curvature, k),
+                       out(at.pull, task.first),
+                       out(at.levers, k * s.nv),
+                       task.bounded ? out(at.high, task.first) : Out{},
                        out(at.square, task.first)};
     if (task.kind == POSE) add_pose(task, interval, &gain, to);
     else add_center(task, interval, &gain, to);
@@ -165,8 +181,8 @@ template <class Real> class MovingRows {
   }
   void add_pose(const StepLayout::Task& task, const Bounds<In>& interval, const Real* gain, const Rows<Out>& to) {
     const int *options = task.options, *leaves = task.leaves, nv = s.nv, count = options[8];
-    const PoseGoal<In, const Real*> goal{leaf(leaves[5]).at, leaf(leaves[6]).at, velocity(task), weights.data(), gain,
-                                         options + 2, options[0] != 0, options[1] != 0, interval};
+    const PoseGoal<In, const Real*> goal{leaf(leaves[5]).at, leaf(leaves[6]).at, velocity(task),  weights.data(), gain,
+                                         options + 2,        options[0] != 0,    options[1] != 0, interval};
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) weights[row] = leaf(leaves[1])[row] * leaf(leaves[7 + i / 3])[i % 3], ++row;
     Real *position = frames.data(), *turn = position + 6, *jacobian = position + 24;

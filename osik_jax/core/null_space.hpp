@@ -47,8 +47,8 @@ template <class Team> struct NullSpace {
     static constexpr OSIK_HOST int of(const Sizes& s) {
       const int n = Team::variables(s.n), m = Team::level_rows(s.m), least = smaller(n, m), most = greater(n, m);
       const int of_b = Team::stride(greater(n, m + least)), of_s = Team::stride(least);
-      const int size[] = {n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s,
-                          Team::stride(most)};
+      const int size[] = {
+          n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s, Team::stride(most)};
       return size[K];
     }
   };
@@ -64,8 +64,8 @@ template <class Team> struct NullSpace {
   static constexpr OSIK_HOST int numbers_before(int which, const Sizes& s) {
     const int n = Team::variables(s.n), of_b = SizeAt<4>::of(s), apart = Team::SPARES_SPACE ? 0 : 1;
     const int of_f = apart * smaller(n, Team::level_rows(s.m)) * SizeAt<5>::of(s);
-    const int size[] = {of_b, n * SizeAt<2>::of(s), (n + 1) * of_b, apart * n * SizeAt<3>::of(s), of_f, of_f,
-                        apart * numbers_outside(s)};
+    const int size[] = {of_b, n * SizeAt<2>::of(s),      (n + 1) * of_b, apart * n * SizeAt<3>::of(s), of_f,
+                        of_f, apart * numbers_outside(s)};
     int count = VECTORS * SizeAt<7>::of(s);
     for (int i = 0; i < which; ++i) count += size[i];
     return count;
@@ -97,14 +97,14 @@ template <class Team> struct NullSpace {
   template <int K> using InPlaceAt = MatrixAt<Team::SPARES_SPACE ? 2 : K, Team::SPARES_SPACE>;
   Matrix<MatrixAt<0>> WORK;  // as long as a row of B
   Matrix<MatrixAt<1>> Z;     // [n, ld] the basis
-  Matrix<MatrixAt<2>> B;     // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
-  Matrix<MatrixAt<3>> AT;    // [n, lm] the level's matrix, transposed; not for a team that spares space
+  Matrix<MatrixAt<2>> B;  // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
+  Matrix<MatrixAt<3>> AT;  // [n, lm] the level's matrix, transposed; not for a team that spares space
   // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: if the team spares space, both are in the
   // columns of B from m on, until the level is solved in its row space
   Matrix<InPlaceAt<4>> F;
   Matrix<InPlaceAt<5>> M;
-  double *V;  // [max(m, n), ld] reflections; before these, on a CPU, rows in the cost in the free coordinates
-  double *S;  // [min(m, n), ls] a Gram matrix
+  double* V;  // [max(m, n), ld] reflections; before these, on a CPU, rows in the cost in the free coordinates
+  double* S;  // [min(m, n), ls] a Gram matrix
   // vectors, as long as the longer of m and n
   Numbers<0> X;
   Numbers<1> LOW;
@@ -131,10 +131,9 @@ template <class Team> struct NullSpace {
     (arrays.place(space, s), ...);
   }
   // outside: space of V and S, if the team spares space
-  OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr)
-      : n(s), m(s), ld(s), lm(s), lb(s), ls(s), lf(s) {
-    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE,
-          BASE_VALUE, BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
+  OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr) : n(s), m(s), ld(s), lm(s), lb(s), ls(s), lf(s) {
+    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE, BASE_VALUE,
+          BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
     V = Team::SPARES_SPACE ? outside : reinterpret_cast<double*>(space) + numbers_before(6, s);
     S = V + greater(m, n) * ld;
   }
@@ -167,7 +166,7 @@ template <class Team> struct NullSpace {
     Algebra::transpose(t, level.matrix, level.row, level.column, turned, apart, level.rows, n);
     t.columns(0, level.rows, [&](auto c) {
       auto total = typename decltype(c)::P(0.0);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < n; ++i) total.square(c.load(turned + i * apart));
       c.store(SQUARE, total);
     });
@@ -208,7 +207,7 @@ OSIK_UNROLL_4
     } else if constexpr (Team::SPARES_SPACE) {
       t.pairs(free(), [&](int j, int k) {
         double total = 0.0;
-OSIK_UNROLL_4
+        OSIK_UNROLL_4
         for (int a = 0; a < rows; ++a) total += in_cost[a] ? free_rows()[j * lb + a] * free_rows()[k * lb + a] : 0.0;
         S[j * ls + k] = total;
         if (j == k) DIAGONAL[j] = total;
@@ -225,7 +224,7 @@ OSIK_UNROLL_4
   OSIK_FN bool factor(double ridge) {  // false where a pivot is not positive
     const int count = by_rows ? rows : free();
     t.columns(0, count, [&](auto c) {
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int k = 0; k < count; ++k) c.store(F + k * lf, c.load(S + k * ls));
     });
     t.each(0, count, [&](int k) { F[k * lf + k] = DIAGONAL[k] + ridge; });
@@ -333,8 +332,8 @@ OSIK_UNROLL_4
                                                             0, columns, cutoff);
   }
   OSIK_METHOD void reflect_basis() {
-    Algebra::template apply_reflections<Team::SPARES_SPACE>(t, V, RIGHT, SCALE, free_basis(), ld, DIAGONAL - RIGHT, ld,
-                                                            rank, free(), n);
+    Algebra::template apply_reflections<Team::SPARES_SPACE>(t, V, RIGHT, SCALE, free_basis(), ld, DIAGONAL - RIGHT, ld, rank,
+                                                            free(), n);
   }
   // MOTION = the motion that the level asks for; the rows of Z that it determines follow those before `first`
   OSIK_METHOD void find_motion() {
@@ -366,9 +365,7 @@ OSIK_UNROLL_4
   // the box of the levels below: what they may spend of what a level out of reach has gained
   OSIK_METHOD void narrow_box() {
     const double least = NEGLIGIBLE_DAMPING * longest_square, demand = level.demand > 0.0 ? level.demand : 1.0;
-    t.each(0, n, [&](int i) {
-      CURVATURE[i] = larger(CURVATURE[i], level.bends[i] / (frobenius > 0.0 ? frobenius : 1.0));
-    });
+    t.each(0, n, [&](int i) { CURVATURE[i] = larger(CURVATURE[i], level.bends[i] / (frobenius > 0.0 ? frobenius : 1.0)); });
     if (!(level.unmet > least)) return;
     evaluate(X, VALUE);
     t.each(0, rows, [&](int a) { MISSING[a] = 0.0; });

@@ -12,9 +12,7 @@ extern "C" {
 void* osik_plain_new(const int* layout, int count) {
   try {
     return new Step(layout, count);
-  } catch (const std::bad_alloc&) {
-    return nullptr;
-  }
+  } catch (const std::bad_alloc&) { return nullptr; }
 }
 void osik_plain_free(void* step) { delete static_cast<Step*>(step); }
 

@@ -66,15 +66,16 @@ template <class Team> class QPCertificate {
       const auto found = check(e, d.lower, d.upper, active, at, at, e(INVERSE_ROOT), decltype(at)(1), multiplier,
                                Real(ROW_MULTIPLIER) * e(ROW_TERMS), Method::RELEASE * roundoff);
       const auto beyond = select(found.inactive, free, found.sign), small = Real(GRADIENT_TOL) * roundoff;
-      holds &= !any(!(found.holds & ((free <= Real(VALUE_TOL) * tolerance * found.force) | (free <= small) | !found.inactive)));
+      holds &= !any(
+          !(found.holds & ((free <= Real(VALUE_TOL) * tolerance * found.force) | (free <= small) | !found.inactive)));
       exact &= !any(!(e.are(active, EQUALITY) | (beyond <= small)));
       terms.most(size), dual.most(select(found.one_side | found.inactive, beyond, decltype(at)(0)));
     });
     t.each(0, p, [&](int q) {
       const Real* row = d.rows + q * ld;
       const Real value = sums(row, x, n).value, curved = sums(row, INVERSE_ROOT, n).size, length = sums(row, ONES, n).size;
-      const auto found = check(EntryOf<Team>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q], curved,
-                               length, y[q], Real(0), Real(0));
+      const auto found = check(EntryOf<Team>{size_t(n + q)}, d.lower, d.upper, active, value, value + d.compliance[q] * y[q],
+                               curved, length, y[q], Real(0), Real(0));
       holds = holds && found.holds && (!found.inactive || y[q] == 0) && is_finite(y[q]);
       Real longest = 0;
       for (int j = 0; j < n && found.one_side && found.sign > 0; ++j) {
@@ -83,7 +84,8 @@ template <class Team> class QPCertificate {
         holds = holds && (Method::IS_SINGLE || !(found.sign * fabs(row[j]) > roundoff));
       }
       dual.most(found.one_side ? found.sign * longest : Real(0));
-      primal.most(larger(larger(found.gap, Real(0)), y[q] != 0 ? found.off : Real(0)) / (found.scale > 0 ? found.scale : Real(1)));
+      primal.most(larger(larger(found.gap, Real(0)), y[q] != 0 ? found.off : Real(0)) /
+                  (found.scale > 0 ? found.scale : Real(1)));
     });
     const Real total = terms.largest(), residual = larger(dual.largest() / (total > 0 ? total : Real(1)), primal.largest());
     return {t.all(holds) && residual <= kkt_tol, residual, t.all(exact)};
@@ -103,7 +105,7 @@ template <class Team> class QPCertificate {
     each_entry(t, n, [&](auto e) {
       const auto damping = e(d.damping), center = e(d.center), one = decltype(damping)(1);
       auto gradient = damping * (e(x) - center), scale = damping * (e(SIZE) + fabs(center)), curvature = damping;
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < m; ++i) {
         const auto entry = e(d.matrix + i * ld);
         gradient += entry * FORCE[i], scale += fabs(entry) * TERMS[i], curvature += d.weight[i] * (entry * entry);
@@ -130,16 +132,19 @@ OSIK_UNROLL_4
   };
   // What all constraints have to be, and what is asked of their multipliers. release: a multiplier of
   // the wrong sign up to this is none.
-  template <class E, class Number>
-  OSIK_FN Checked<Number> check(E e, const Real* lower, const Real* upper, const Int* active, Number value, Number compliant,
-                                Number per_curvature, Number per_unit, Number multiplier, Number force_of_rows,
-                                Number release) const {
+  template <class E, class Number> OSIK_FN Checked<Number> check(E e, const Real* lower, const Real* upper,
+                                                                 const Int* active, Number value, Number compliant,
+                                                                 Number per_curvature, Number per_unit, Number multiplier,
+                                                                 Number force_of_rows, Number release) const {
     using Which = typename Checked<Number>::Which;
     const Which at_lower = e.are(active, AT_LOWER), at_upper = e.are(active, AT_UPPER), redundant = e.are(active, REDUNDANT);
-    const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper, inactive = e.are(active, INACTIVE) | redundant;
-    const Number low = e(lower), high = e(upper), from = fabs(low), to = fabs(high), nearest = select(from < to, from, to), zero = 0;
+    const Which equality = e.are(active, EQUALITY), one_side = at_lower | at_upper,
+                inactive = e.are(active, INACTIVE) | redundant;
+    const Number low = e(lower), high = e(upper), from = fabs(low), to = fabs(high), nearest = select(from < to, from, to),
+                 zero = 0;
     const Number scaled_reach = scaled * per_curvature, reach = plain * per_unit;
-    const Number scale = select(scaled_reach < reach, scaled_reach, reach) + fabs(value) + select(nearest < Real(INFINITE), nearest, zero);
+    const Number scale = select(scaled_reach < reach, scaled_reach, reach) + fabs(value) +
+                         select(nearest < Real(INFINITE), nearest, zero);
     const Number curved = select(per_curvature < SMALLEST, Number(SMALLEST), per_curvature);
     const Number force = scale / (curved * curved) + force_of_rows, sign = select(at_lower, -multiplier, multiplier);
     const Number off = select(inactive, zero, fabs(compliant - select(at_upper, high, low)));

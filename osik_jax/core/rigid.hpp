@@ -7,7 +7,9 @@
 
 namespace osik {
 
-template <class Real> OSIK_FN void sine_and_cosine(Real angle, Real& sine, Real& cosine) { sine = sin(angle), cosine = cos(angle); }
+template <class Real> OSIK_FN void sine_and_cosine(Real angle, Real& sine, Real& cosine) {
+  sine = sin(angle), cosine = cos(angle);
+}
 
 template <class Real> struct Vec3 {
   Real x, y, z;

@@ -14,18 +14,17 @@ template <class Team> struct RowFactors {
   using Algebra = LinearAlgebra<Team>;
   Team t;
   int m, n, lm, ln, lc;  // rows and columns of A; strides of REST, of BASIS, of COLUMNS
-  double *REST;          // [n, lm] what is left of A, transposed
-  double *BASIS;         // [m, ln] orthonormal rows
-  double *COLUMNS;       // [m, lc] columns of `orthonormal`, 2 m long
+  double* REST;          // [n, lm] what is left of A, transposed
+  double* BASIS;         // [m, ln] orthonormal rows
+  double* COLUMNS;       // [m, lc] columns of `orthonormal`, 2 m long
   double *ROW, *COEFFICIENTS, *SQUARES;  // [ln], [lm], [lm]
 
   static constexpr OSIK_HOST int doubles(int m, int n) {
     return n * Team::stride(m) + m * (Team::stride(n) + Team::stride(2 * m)) + Team::stride(n) + 2 * Team::stride(m);
   }
   OSIK_FN RowFactors(int m, int n, double* next)
-      : m(m), n(n), lm(Team::stride(m)), ln(Team::stride(n)), lc(Team::stride(2 * m)), REST(next),
-        BASIS(REST + n * lm), COLUMNS(BASIS + m * ln), ROW(COLUMNS + m * lc), COEFFICIENTS(ROW + ln),
-        SQUARES(COEFFICIENTS + lm) {}
+      : m(m), n(n), lm(Team::stride(m)), ln(Team::stride(n)), lc(Team::stride(2 * m)), REST(next), BASIS(REST + n * lm),
+        COLUMNS(BASIS + m * ln), ROW(COLUMNS + m * lc), COEFFICIENTS(ROW + ln), SQUARES(COEFFICIENTS + lm) {}
 
   // v <- v - sum_a (rows_a . given) rows_a over the first k rows, of which `length` numbers count. COEFFICIENTS gets
   // minus the products.

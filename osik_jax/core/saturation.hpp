@@ -48,10 +48,10 @@ struct SaturationAnswer {
 
 template <class Team> struct Saturation : NullSpace<Team> {
   using Base = NullSpace<Team>;
-  using typename Base::Algebra, typename Base::Int;
   using Base::t, Base::n, Base::ld, Base::lb, Base::first, Base::rows, Base::damping, Base::free;
-  using Base::Z, Base::B, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED,
-      Base::IN_COST, Base::MISSING;
+  using Base::Z, Base::B, Base::X, Base::LOW, Base::HIGH, Base::MOTION, Base::COORDINATES, Base::WANTED, Base::IN_COST,
+      Base::MISSING;
+  using typename Base::Algebra, typename Base::Int;
   enum Step { CHOOSE, REPLACE, STOP };  // a joint leaves or enters; one enters in place of another; one stops the motion
   template <int K> using Numbers = typename Base::template Numbers<K>;
   template <int K> using Labels = typename Base::template Labels<K>;
@@ -106,9 +106,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_FN double bound(int i) const { return SIDE[i] > 0 ? HIGH[i] : LOW[i]; }
   OSIK_FN double bound_passed(int i) const { return PASSED[i] < 0 ? LOW[i] : HIGH[i]; }
   // the dual of a saturated joint times a vector of coordinates
-  OSIK_FN double dual_times(int a, const double* v) const {
-    return t.own_dot(DUALS + a * lb + first, v + first, 0, count);
-  }
+  OSIK_FN double dual_times(int a, const double* v) const { return t.own_dot(DUALS + a * lb + first, v + first, 0, count); }
   // out = Z'v over the rows [start, stop) of Z
   OSIK_FN void from_basis(const double* v, int start, int stop, double* out, bool add = false) {
     Algebra::combine(t, Z + start * ld, v + start, out, ld, stop - start, 0, n, add);
@@ -231,9 +229,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
   }
   // the size of the numbers that POINT is made of
   OSIK_METHOD double size_of_numbers() {
-    const double most = t.most(0.0, 0, n, [&](int i, double) {
-      return fabs(X[i]) + scale * fabs(MOTION[i]) + fabs(target[i]);
-    });
+    const double most = t.most(0.0, 0, n,
+                               [&](int i, double) { return fabs(X[i]) + scale * fabs(MOTION[i]) + fabs(target[i]); });
     return t.most(most, 0, count, [&](int a, double) { return fabs(bound(JOINT[a])); });
   }
   // the saturated joint with the largest multiplier of the wrong sign
@@ -249,7 +246,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
   }
   // the free joint that is furthest outside of its bounds
   OSIK_METHOD int most_violated(double roundoff) {
-    return t.best(roundoff, 0, n, [&](int i) {
+    return t
+        .best(roundoff, 0, n, [&](int i) {
       return SIDE[i] || PASSED[i] ? 0.0 : larger(LOW[i] - POINT[i], POINT[i] - HIGH[i]);
     }).which;
   }
@@ -265,7 +263,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
   }
   // the saturated joint among those that stop the motion which a further combination releases
   OSIK_METHOD int first_to_cross(double negligible) {
-    return t.best(0.0, 0, count, [&](int a) {
+    return t
+        .best(0.0, 0, count, [&](int a) {
       const double falls = -SIDE[JOINT[a]] * sign * RATE[a];
       return STOPS[a] && falls > negligible ? falls / fabs(NORMAL[JOINT[a]]) : 0.0;
     }).which;
@@ -502,9 +501,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
       const double forward = POINT[i] - START[i];
       return forward * forward;
     });
-    const double gain = -damping * t.sum(0, n, [&](int i) {
-      return START[i] * (POINT[i] - START[i]) - X[i] * MOTION[i];
-    }) + gain_along(MOTION, cost);
+    const double gain = -damping * t.sum(0, n, [&](int i) { return START[i] * (POINT[i] - START[i]) - X[i] * MOTION[i]; }) +
+                        gain_along(MOTION, cost);
     return cost > 0.0 ? gain / cost : 1.0;
   }
   // BLOCKING = sides of the joints that stop the motion; returns the one with the largest entry in their combination
@@ -532,8 +530,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
       most_changes = max_changes - all_changes;
       if (number == 0) most_changes = Base::smaller(most_changes, MAX_SATURATION_CHANGES * n);
       const double least = number == 0 ? SATURATION_RANK : SOFT_SATURATION_RANK;
-      const double compliance =
-          number == 0 ? 0.0 : number == 1 ? SATURATION_COMPLIANCE : STIFFER_SATURATION_COMPLIANCE;
+      const double compliance = number == 0 ? 0.0 : number == 1 ? SATURATION_COMPLIANCE : STIFFER_SATURATION_COMPLIANCE;
       const bool went_on = goes_on, done = attempt(at, least, compliance, goes_on);
       all_changes += changes;
       goes_on = done && number == 0 && count > 0;

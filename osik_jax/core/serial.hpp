@@ -306,8 +306,7 @@ template <class R> struct Serial {
     for (int i = 0; i < A; ++i) out[i] = totals_of<LANES>(t[i]);
   }
   // LANES rows from `first` on, the last one again where there are fewer; returns where the longest of them ends
-  template <class Row, class End>
-  OSIK_FN static int rows_from(Row row, End end, int first, int count, const Real** rows) {
+  template <class Row, class End> OSIK_FN static int rows_from(Row row, End end, int first, int count, const Real** rows) {
     int longest = 0;
     for (int e = 0; e < LANES; ++e) {
       const int a = first + e < count ? first + e : count - 1, own = end(a);
@@ -327,8 +326,7 @@ template <class R> struct Serial {
   }
   // S[a, b] = sum_j row(a)_j weight_j row(b)_j for a <= b < count, and any numbers up to padded(count); work: [2, ld]
   template <class Row, class End>
-  OSIK_FN void weighted_gram(Row row, End end, const Real* weight, Real* S, Real* work, int ld_S, int ld,
-                             int count) const {
+  OSIK_FN void weighted_gram(Row row, End end, const Real* weight, Real* S, Real* work, int ld_S, int ld, int count) const {
     for (int a = 0; a < count; a += 2) {
       const int next = a + 1 < count ? a + 1 : a, stop = end(a) > end(next) ? end(a) : end(next);
       const Real *scaled[2] = {work, work + ld}, *own[2] = {row(a), row(next)};
@@ -366,12 +364,18 @@ template <class R> struct Serial {
     Real* M = rows + at;
     v += at;
     switch ((n - at + LANES - 1) / LANES) {  // with all of v in registers
-      case 1: return reflect_packs<1>(M, ld, count, v, scale);
-      case 2: return reflect_packs<2>(M, ld, count, v, scale);
-      case 3: return reflect_packs<3>(M, ld, count, v, scale);
-      case 4: return reflect_packs<4>(M, ld, count, v, scale);
-      case 5: return reflect_packs<5>(M, ld, count, v, scale);
-      case 6: return reflect_packs<6>(M, ld, count, v, scale);
+      case 1:
+        return reflect_packs<1>(M, ld, count, v, scale);
+      case 2:
+        return reflect_packs<2>(M, ld, count, v, scale);
+      case 3:
+        return reflect_packs<3>(M, ld, count, v, scale);
+      case 4:
+        return reflect_packs<4>(M, ld, count, v, scale);
+      case 5:
+        return reflect_packs<5>(M, ld, count, v, scale);
+      case 6:
+        return reflect_packs<6>(M, ld, count, v, scale);
       default:
         for (int q = 0; q < count; ++q, M += ld) {
           const Real by = -scale * own_dot_on(M, v, 0, n - at);

@@ -25,13 +25,16 @@ class Step : StepRows {
     int status = NUMERICAL_ERROR;
     Certificate found{false, d.constants[s.nq + s.dofs]};
     if (valid) {
-      found = s.scheme == WEIGHTED ? solve_weighted(d, to) : s.scheme == HIERARCHICAL ? solve_hierarchy(d, to) : solve_null_space(to);
+      found = s.scheme == WEIGHTED       ? solve_weighted(d, to)
+              : s.scheme == HIERARCHICAL ? solve_hierarchy(d, to)
+                                         : solve_null_space(to);
       const bool finite = found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n);
       status = !finite ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
     }
     for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
-      to.numbers[j] = s.scheme == CLASSICAL ? 0 : nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE,
-                                                          upper[j] > -INFINITE ? upper[j] : INFINITE);
+      to.numbers[j] = s.scheme == CLASSICAL ? 0
+                                            : nearest(0, lower[j] < INFINITE ? lower[j] : -INFINITE,
+                                                      upper[j] > -INFINITE ? upper[j] : INFINITE);
     to.integers[0] = status;
     report(to, status == NUMERICAL_ERROR ? d.constants[s.nq + s.dofs] : found.residual);
   }
@@ -91,11 +94,13 @@ class Step : StepRows {
     int count = 0;
     bool loops = false;
     for (const Task& task : tasks) {
-      for (int i = 0; i < task.m && task.dofs && task.level == level; ++i) force[count++] = task.weight[i] * task.rows.pull[i];
+      for (int i = 0; i < task.m && task.dofs && task.level == level; ++i)
+        force[count++] = task.weight[i] * task.rows.pull[i];
       loops |= task.level < level && task.closes_loop();
     }
     if (!level || !(count || loops)) return 0;
-    const double linear = count ? safe_norm(force, count) * bending([&](const Task& task) { return task.level < level; }) : 0;
+    const double linear = count ? safe_norm(force, count) * bending([&](const Task& task) { return task.level < level; })
+                                : 0;
     if (!loops) return linear;
     for (const Task& task : tasks) {
       if (task.dofs || task.level != level) continue;
@@ -105,7 +110,8 @@ class Step : StepRows {
       const double both[] = {curved, safe_norm(force, s.nv)};
       curved = safe_norm(both, 2);
     }
-    const double both[] = {linear, curved * bending([&](const Task& task) { return task.level < level && task.closes_loop(); })};
+    const double both[] = {linear,
+                           curved * bending([&](const Task& task) { return task.level < level && task.closes_loop(); })};
     return safe_norm(both, 2);
   }
   // VelocityProblem._bending: the curvature of tasks for a unit force in the joints
@@ -144,9 +150,17 @@ class Step : StepRows {
       qp_bounds[n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], -1) : -INFINITE;
       qp_bounds[N + n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], 1) : INFINITE;
     }
-    const QPData<double> data{J,          low,         weight,    diagonal.data(),
-                              center.data(),     J + s.m * n, compliance.data(), qp_bounds.data(),
-                              qp_bounds.data() + N, d.guess ? d.guess : no_labels.data(), tolerances[0]};
+    const QPData<double> data{J,
+                              low,
+                              weight,
+                              diagonal.data(),
+                              center.data(),
+                              J + s.m * n,
+                              compliance.data(),
+                              qp_bounds.data(),
+                              qp_bounds.data() + N,
+                              d.guess ? d.guess : no_labels.data(),
+                              tolerances[0]};
     int report[3], *active = to.integers + 3;
     qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
     to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
@@ -193,7 +207,8 @@ class Step : StepRows {
     const int n = s.nv;
     std::vector<int>& end = found_labels;  // rows of each level so far
     for (int k = 0; k < s.L; ++k) end[k] = 0;
-    for (int j = 0; j < n; ++j) hard_lower[j] = low_speed[j], hard_upper[j] = high_speed[j], pinned[j] = lower[j] >= upper[j];
+    for (int j = 0; j < n; ++j)
+      hard_lower[j] = low_speed[j], hard_upper[j] = high_speed[j], pinned[j] = lower[j] >= upper[j];
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {
         const int row = task.level * s.m + end[task.level]++;
@@ -202,7 +217,8 @@ class Step : StepRows {
         const double a = order(low, high, -1), b = order(low, high, 1);
         for (int j = 0; j < n; ++j) level_rows[row * n + j] = root * task.rows.jacobian[i * n + j];
         equality[row] = !task.bounded || (a >= b && own > 0);
-        if (own > 0) level_lower[row] = fabs(a) < INFINITE ? root * a : a, level_upper[row] = fabs(b) < INFINITE ? root * b : b;
+        if (own > 0)
+          level_lower[row] = fabs(a) < INFINITE ? root * a : a, level_upper[row] = fabs(b) < INFINITE ? root * b : b;
         else level_lower[row] = task.bounded ? -INFINITE : 0, level_upper[row] = task.bounded ? INFINITE : 0;
       }
     for (int i = n; i < s.h; ++i) {
@@ -232,7 +248,9 @@ class Step : StepRows {
   std::vector<char> hierarchy_space;
   std::vector<Hierarchy<Team>> hierarchy;
 
-  Sizes sizes() const { return {s.L, s.m, s.nv, s.h, s.max_iterations, layout.row_counts, layout.level_of_hard, layout.row_of_hard}; }
+  Sizes sizes() const {
+    return {s.L, s.m, s.nv, s.h, s.max_iterations, layout.row_counts, layout.level_of_hard, layout.row_of_hard};
+  }
   Certificate solve_hierarchy(const StepData& d, const StepResult& to) {
     const int n = s.nv, L = s.L, h = s.h, m = s.m;
     add_levels();
@@ -241,18 +259,32 @@ class Step : StepRows {
     for (const Numbers* v : {&dampings, &bends})
       for (double a : *v) valid &= a >= 0 && a <= LARGEST_DOUBLE;
     if (!valid) return {false, INFINITE};
-    const Problem p{level_rows.data(), level_lower.data(), level_upper.data(), hard.data(),     hard_lower.data(),
-                    hard_upper.data(), dampings.data(),    bends.data(),       tolerances,  equality.data(),
-                    pinned.data(),     d.guess ? d.guess : no_labels.data(), d.guess ? d.guess_own : no_labels.data(),    n, 1, false};
+    const Problem p{level_rows.data(),
+                    level_lower.data(),
+                    level_upper.data(),
+                    hard.data(),
+                    hard_lower.data(),
+                    hard_upper.data(),
+                    dampings.data(),
+                    bends.data(),
+                    tolerances,
+                    equality.data(),
+                    pinned.data(),
+                    d.guess ? d.guess : no_labels.data(),
+                    d.guess ? d.guess_own : no_labels.data(),
+                    n,
+                    1,
+                    false};
     double* f = found_numbers.data();
     int *i = found_labels.data(), *active = to.integers + 3, report[3];
-    const Answer a{to.numbers, f, f + L * h, f + L * h + L, f + L * h + 2 * L, i, active, i + n, i + n + L * h,
-                   active + L * h, i + n + L * h + L * m, report};
+    const Answer a{to.numbers, f,     f + L * h,     f + L * h + L,  f + L * h + 2 * L,     i,
+                   active,     i + n, i + n + L * h, active + L * h, i + n + L * h + L * m, report};
     hierarchy[0].solve(p, a);
     to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
     const Certificate found = judge(sizes(), p, a);
     for (int j = 0; j < n; ++j)
-      to.numbers[j] = nearest(a.active_bounds[j] ? a.active_bounds[j] < 0 ? lower[j] : upper[j] : to.numbers[j], lower[j], upper[j]);
+      to.numbers[j] = nearest(a.active_bounds[j] ? a.active_bounds[j] < 0 ? lower[j] : upper[j] : to.numbers[j], lower[j],
+                              upper[j]);
     return found;
   }
 
@@ -292,13 +324,15 @@ class Step : StepRows {
     double *x = to.numbers, *secondary = &targets[own * n];
     add_levels();
     add_dampings();
-    if (!find_descent(secondary) || !all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n)) return {false, INFINITE};
+    if (!find_descent(secondary) || !all_finite(dampings.data(), 3 * L) || !all_finite(bends.data(), L * n))
+      return {false, INFINITE};
     if (s.scheme == CLASSICAL) {
       projection[0].rank_tol = *of_step(StepLayout::RANK_TOLERANCE);
       projection[0].begin();
       for (int k = 0; k < own; ++k)
-        projection[0].solve_level({&level_rows[k * m * n], &level_lower[k * m], &level_upper[k * m], &bends[k * n], &equality[k * m],
-                                   dampings[3 * k], dampings[3 * k + 1], dampings[3 * k + 2], layout.row_counts[k], n, 1});
+        projection[0].solve_level({&level_rows[k * m * n], &level_lower[k * m], &level_upper[k * m], &bends[k * n],
+                                   &equality[k * m], dampings[3 * k], dampings[3 * k + 1], dampings[3 * k + 2],
+                                   layout.row_counts[k], n, 1});
       projection[0].end(secondary, x, nullptr);
       return {true, first_residual(x, x, 1)};
     }
@@ -306,9 +340,23 @@ class Step : StepRows {
     remove_roundoff();
     const double* each = separate.data();
     int *sides = found_labels.data(), report[2];
-    const SaturationProblem p{level_rows.data(), level_lower.data(), level_upper.data(), each, each + L, each + 2 * L, bends.data(),
-                              targets.data(), low_speed.data(), high_speed.data(), equality.data(),
-                              *of_step(StepLayout::RANK_TOLERANCE), s.max_iterations, L, m, n, 1};
+    const SaturationProblem p{level_rows.data(),
+                              level_lower.data(),
+                              level_upper.data(),
+                              each,
+                              each + L,
+                              each + 2 * L,
+                              bends.data(),
+                              targets.data(),
+                              low_speed.data(),
+                              high_speed.data(),
+                              equality.data(),
+                              *of_step(StepLayout::RANK_TOLERANCE),
+                              s.max_iterations,
+                              L,
+                              m,
+                              n,
+                              1};
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];
@@ -333,7 +381,8 @@ class Step : StepRows {
     for (const Task& task : tasks)
       for (int i = 0; i < task.m && task.level == 0; ++i) {
         const double *row = task.rows.jacobian + i * n, begun = Team::own_dot(row, start, 0, n);
-        const double off = begun - nearest(begun, task.rows.lower[i], task.bounded ? task.rows.upper[i] : task.rows.lower[i]);
+        const double off = begun -
+                           nearest(begun, task.rows.lower[i], task.bounded ? task.rows.upper[i] : task.rows.lower[i]);
         const double missed = larger(task.weight[i], 0.0) * (Team::own_dot(row, x, 0, n) - begun + scale * off);
         for (int j = 0; j < n; ++j) gradient[j] += missed * row[j];
       }

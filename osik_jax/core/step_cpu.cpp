@@ -29,7 +29,8 @@ void take_steps(const xla::Call& call) {
   };
   auto begin_at = [&](int lane) {
     for (int k = 0; k < given; ++k) arrays[k] = call.in<double>(FIRST + k) + strides[k] * lane;
-    return StepData{call.in<double>(FIRST + given), arrays.data(), strides.data(), given, guess(GUESS, lane), guess(GUESS + 1, lane)};
+    return StepData{call.in<double>(FIRST + given), arrays.data(), strides.data(), given, guess(GUESS, lane),
+                    guess(GUESS + 1, lane)};
   };
   // The last pack of a batch has robots of the one before it. A robot alone, and batches of fewer robots, need no pack.
   constexpr int PACK = Lanes<double>::COUNT;

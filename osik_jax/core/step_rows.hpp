@@ -132,8 +132,9 @@ class StepRows {
       task.valid = is_placed;
       const int* spoils = task.options + LEAVES;
       if (task.kind == GIVEN) task.valid = is_placed && (clean || !spoiled(spoils[0], spoils[1], d.count));
-      else for (int i = 0; i < 9 && !clean; ++i)
-        task.valid = task.valid && !(task.leaves[i] >= 0 && spoiled(task.leaves[i], task.leaves[i] + 1, d.count));
+      else
+        for (int i = 0; i < 9 && !clean; ++i)
+          task.valid = task.valid && !(task.leaves[i] >= 0 && spoiled(task.leaves[i], task.leaves[i] + 1, d.count));
       if (task.valid) valid = add_task(k, given, robot < 0) && valid;
       valid = valid && task.valid;
     }
@@ -147,8 +148,14 @@ class StepRows {
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];
       const size_t i = task.first;
-      task.rows = {at + place.error + i, J + i * s.nv, low + i, curvature + k, at + place.pull + i, levers + k * s.nv,
-                   task.bounded ? high + i : nullptr, at + place.square + i};
+      task.rows = {at + place.error + i,
+                   J + i * s.nv,
+                   low + i,
+                   curvature + k,
+                   at + place.pull + i,
+                   levers + k * s.nv,
+                   task.bounded ? high + i : nullptr,
+                   at + place.square + i};
       task.weight = weight + i;
     }
   }
@@ -175,8 +182,7 @@ class StepRows {
     }
     each_entry(nv, [&](auto e) {
       const auto from = e(a), to = e(b);
-      if (s.scheme != CLASSICAL)
-        valid &= !any(!((from < INFINITE) & (to > -INFINITE))), ordered &= !any(!(from <= to));
+      if (s.scheme != CLASSICAL) valid &= !any(!((from < INFINITE) & (to > -INFINITE))), ordered &= !any(!(from <= to));
       e.put(order(from, to, -1), low_speed.data()), e.put(order(from, to, 1), high_speed.data());
     });
     return valid;
@@ -252,11 +258,12 @@ class StepRows {
     for (int k = 0; k < 8; ++k)
       if (leaves[k] >= 0) std::copy_n(leaf(leaves[k]).at, sizes[k], places[k]);
     if (task.dofs) put_dofs(task);
-    bool takes = all_finite(task.weight, m) && all_finite(to.error, m) && all_finite(to.pull, m) && all_finite(to.levers, nv) &&
-                 all_finite(to.curvature, 1);
+    bool takes = all_finite(task.weight, m) && all_finite(to.error, m) && all_finite(to.pull, m) &&
+                 all_finite(to.levers, nv) && all_finite(to.curvature, 1);
     for (int i = 0; i < m; ++i) {
       if (!task.dofs) to.squares[i] = Team::own_dot(&to.jacobian[i * nv], &to.jacobian[i * nv], 0, nv);
-      takes &= !task.bounded || (s.scheme == WEIGHTED && task.weight[i] == 0) || (to.lower[i] < INFINITE && to.upper[i] > -INFINITE);
+      takes &= !task.bounded || (s.scheme == WEIGHTED && task.weight[i] == 0) ||
+               (to.lower[i] < INFINITE && to.upper[i] > -INFINITE);
     }
     return takes && are_taken(task);
   }

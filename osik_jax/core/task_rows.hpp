@@ -106,13 +106,13 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
   const Real forward[6] = {linear.x, linear.y, linear.z, angular.x, angular.y, angular.z};
   Real squares[6] = {};
   Products<Real> axes, arms;  // of the columns that turn the frame
-OSIK_UNROLL_4
+  OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [moves, axis] = J[j];
     const V v = goal.in_frame ? own * (moves + cross(offset, axis)) : moves, w = factor * axis;
     const Real column[6] = {v.x, v.y, v.z, w.x, w.y, w.z};
     Real lever = 0;
-OSIK_UNROLL
+    OSIK_UNROLL
     for (int i = 0, row = 0; i < 6; ++i) {
       const Real square = column[i] * column[i];
       squares[i] += square;
@@ -125,7 +125,7 @@ OSIK_UNROLL
     axes.add(axis.x, axis.y, axis.z), arms.add(arm(moves.x), arm(moves.y), arm(moves.z));
   }
   Real pull[6] = {};
-OSIK_UNROLL
+  OSIK_UNROLL
   for (int i = 0, row = 0; i < 6; ++i)
     if (goal.kept[i]) {
       ask(to, goal.bounds, row, error[i], forward[i], goal.gain[0]);
@@ -158,11 +158,11 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& col
     return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
   };
   Real turning = 0, largest = 0, square = 0, xx = 0, xy = 0, yy = 0, zz = 0;
-OSIK_UNROLL_4
+  OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [x, y, z] = columns[j];
     Real lever = 0;
-OSIK_UNROLL_4
+    OSIK_UNROLL_4
     for (int i = 0; i < goal.m; ++i) {
       const Real entry = along(i, x, y, z);
       to.jacobian[i * nv + j] = entry, lever += goal.weight[i] * entry * entry;
@@ -177,7 +177,8 @@ OSIK_UNROLL_4
     const Real pull = fabs(goal.weight[i] * to.pull[i]);
     largest = select((pull > largest) | (pull != pull), pull, largest);
     if (!to.squares) continue;
-    const Real length = goal.normals ? along(i, along(i, xx, xy, Real(0)), along(i, xy, yy, Real(0)), Real(0)) : along(i, xx, yy, zz);
+    const Real length = goal.normals ? along(i, along(i, xx, xy, Real(0)), along(i, xy, yy, Real(0)), Real(0))
+                                     : along(i, xx, yy, zz);
     to.squares[i] = select(length < Real(0), Real(0), length);  // which roundoff may make it
   }
   // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something

@@ -14,14 +14,24 @@ template <class Real, int SLOTS> struct ColumnsOf {
       each([&](int s) { v[s] = a; });
     }
     template <class F> OSIK_FN static void each(F f) {
-OSIK_UNROLL
+      OSIK_UNROLL
       for (int s = 0; s < SLOTS; ++s) f(s);
     }
-    OSIK_FN P& operator+=(const P& o) { return each([&](int s) { v[s] += o.v[s]; }), *this; }
-    OSIK_FN P& operator-=(const P& o) { return each([&](int s) { v[s] -= o.v[s]; }), *this; }
-    OSIK_FN P& operator*=(const P& o) { return each([&](int s) { v[s] *= o.v[s]; }), *this; }
-    OSIK_FN P& fma(Real a, const P& o) { return each([&](int s) { v[s] += a * o.v[s]; }), *this; }
-    OSIK_FN P& square(const P& o) { return each([&](int s) { v[s] += o.v[s] * o.v[s]; }), *this; }
+    OSIK_FN P& operator+=(const P& o) {
+      return each([&](int s) { v[s] += o.v[s]; }), *this;
+    }
+    OSIK_FN P& operator-=(const P& o) {
+      return each([&](int s) { v[s] -= o.v[s]; }), *this;
+    }
+    OSIK_FN P& operator*=(const P& o) {
+      return each([&](int s) { v[s] *= o.v[s]; }), *this;
+    }
+    OSIK_FN P& fma(Real a, const P& o) {
+      return each([&](int s) { v[s] += a * o.v[s]; }), *this;
+    }
+    OSIK_FN P& square(const P& o) {
+      return each([&](int s) { v[s] += o.v[s] * o.v[s]; }), *this;
+    }
     OSIK_FN P inverse() const {
       P p;
       return each([&](int s) { p.v[s] = Real(1) / v[s]; }), p;
@@ -194,7 +204,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
       const Real v = fabs(a[j] * b[j]);
       most = v > most ? v : most;
     }
-    if constexpr (sizeof(R) == 4) return __uint_as_float(__reduce_max_sync(ALL, __float_as_uint(most)));  // as they are not negative
+    if constexpr (sizeof(R) == 4)
+      return __uint_as_float(__reduce_max_sync(ALL, __float_as_uint(most)));  // as they are not negative
     return all_most(most);
   }
 
@@ -229,9 +240,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   OSIK_FN static Real own_size_on(const Real* a, const Real* b, int n) {
     Real even = 0, odd = 0;
     if constexpr (sizeof(R) == 4)
-      own_fours(a, b, n, [&](Real x, Real y, Real z, Real w) {
-        even += fabs(x), odd += fabs(y), even += fabs(z), odd += fabs(w);
-      });
+      own_fours(a, b, n,
+                [&](Real x, Real y, Real z, Real w) { even += fabs(x), odd += fabs(y), even += fabs(z), odd += fabs(w); });
     else
       for (int j = 0; j < n; ++j) even += fabs(a[j] * b[j]);
     return even + odd;
@@ -268,8 +278,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   // Numbers that begin to arrive in shared memory while the threads go on; zeros where there are none.
   OSIK_FN static void fetch_one(Real* to, const Real* from, bool there = true) {
     are_global(from);
-    asm volatile("cp.async.ca.shared.global [%0], [%1], %2, %3;"
-                 ::"r"(unsigned(__cvta_generic_to_shared(to))), "l"(from), "n"(sizeof(R)), "r"(there ? int(sizeof(R)) : 0));
+    asm volatile("cp.async.ca.shared.global [%0], [%1], %2, %3;" ::"r"(unsigned(__cvta_generic_to_shared(to))), "l"(from),
+                 "n"(sizeof(R)), "r"(there ? int(sizeof(R)) : 0));
   }
   OSIK_FN void fetch(Real* to, const Real* from, int count) const {
     for (int i = me(); i < count; i += 32) fetch_one(to + i, from + i);
@@ -396,7 +406,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     const int own = me() < N ? me() : N - 1, second = me() < REST ? me() + 32 : N - 1;
     const R own_unit = unit[own], second_unit = unit[second];
     are_shared(B, damping, unit, inverse, work);
-    auto fours = [&](const R* row, int first, int end, auto f) {  // f(k, row[k]) for first <= k < end; first: a multiple of 4
+    auto fours = [&](const R* row, int first, int end,
+                     auto f) {  // f(k, row[k]) for first <= k < end; first: a multiple of 4
 #pragma unroll
       for (int g = first / 4; g < (end + 3) / 4; ++g) {
         const float4 v = reinterpret_cast<const float4*>(row)[g];
@@ -426,7 +437,8 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
     // Before step j thread i >= j has column i of the Schur complement that is left of A, thread i < j column i of the
     // identity as far as the factor has been solved for. A[0] is row j: after each step the rows move up.
     bool regular = true;
-    auto steps = [&](auto first) {  // from a row of the first columns on, SOME steps; the number of the rows left is a constant
+    auto steps =
+        [&](auto first) {  // from a row of the first columns on, SOME steps; the number of the rows left is a constant
       constexpr int FROM = decltype(first)::value, TO = FROM + SOME < FIRST ? FROM + SOME : FIRST;
       for (int j = FROM; j < TO; ++j) {
         const bool is_pivot = me() == j;
@@ -459,12 +471,12 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
       regular = regular && (!is_pivot || pivot > smallest);
       if (me() + 32 > j && me() < REST) column[me() + 31 - j] = c;
       inverse[j * ld_inverse + me()] = b * scale;
-      if (me() + 32 < END) inverse[j * ld_inverse + me() + 32] = is_pivot ? by * second_scale : me() + 32 < j ? c * second_scale : R(0);
+      if (me() + 32 < END)
+        inverse[j * ld_inverse + me() + 32] = is_pivot ? by * second_scale : me() + 32 < j ? c * second_scale : R(0);
       __syncwarp();
       const R times = is_pivot ? c + by : c;
-      fours(column, 0, REST - 1, [&](int k, R entry) {
-        low[k] = low[k + 1] - entry * b, other[k] = other[k + 1] - entry * times;
-      });
+      fours(column, 0, REST - 1,
+            [&](int k, R entry) { low[k] = low[k + 1] - entry * b, other[k] = other[k + 1] - entry * times; });
     }
     __syncwarp();
     return all(regular);
@@ -477,8 +489,7 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   OSIK_FN void backward(const Real* L, int ld, const Real* inverse, Real* y, int count) const {
     substitute(L, 1, ld, inverse, y, count, -1);
   }
-  OSIK_CALL void substitute(const Real* L, int row, int column, const Real* inverse, Real* y, int count,
-                            int way) const {
+  OSIK_CALL void substitute(const Real* L, int row, int column, const Real* inverse, Real* y, int count, int way) const {
     are_shared(L, inverse, y);
     __syncwarp();
     Real low = me() < count ? y[me()] : Real(0), high = me() + 32 < count ? y[me() + 32] : Real(0);

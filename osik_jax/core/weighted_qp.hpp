@@ -86,9 +86,14 @@ template <class Team> struct WeightedQP {
     const int n = Team::variables(s.n), p = Team::hard_rows(s.p), k = Team::level_rows(s.m) + p, q = order(k, n);
     const int kept = q < k || IS_SINGLE ? p : 0;  // rows that are kept where the system is the Hessian's
     const int dual = Team::SPARES_SPACE ? 0 : DualActiveSet<Team>::doubles(n, p);
-    const int size[] = {k * Team::stride(n), kept * Team::stride(n), q * Team::stride(q),
-                        Team::SPARES_SPACE ? 0 : q * Team::stride(q), kept * Team::stride(p),
-                        Team::SPARES_SPACE ? 0 : kept * Team::stride(p), dual, Team::stride(0)};
+    const int size[] = {k * Team::stride(n),
+                        kept * Team::stride(n),
+                        q * Team::stride(q),
+                        Team::SPARES_SPACE ? 0 : q * Team::stride(q),
+                        kept * Team::stride(p),
+                        Team::SPARES_SPACE ? 0 : kept * Team::stride(p),
+                        dual,
+                        Team::stride(0)};
     int count = VECTORS * width(s);
     for (int i = 0; i < which; ++i) count += size[i];
     return count;
@@ -180,7 +185,7 @@ template <class Team> struct WeightedQP {
     t.each(n, Team::padded(n), [&](int j) { ROOT[j] = 1; });
     t.columns(0, n, [&](auto c) {
       auto total = c.load(DAMPING);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < m; ++i) total.square(c.load(B + i * ld));
       c.store(ROOT, total);
     });
@@ -214,7 +219,7 @@ OSIK_UNROLL_4
       auto total = c.load(X);
       total -= c.load(CENTER);
       total *= c.load(DAMPING);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < k; ++i) total.fma(-Z[i], c.load(B + i * ld));
       c.store(GRADIENT, total);
     });
@@ -224,7 +229,8 @@ OSIK_UNROLL_4
   OSIK_FN bool is_last(int round, Real& before) const {
     const Real moved = t.largest(STEP, ROOT, n), far = t.largest(X, ROOT, n);
     const bool is_roundoff = moved * moved <= CORRECTION * far * before;
-    const bool stalls = (round > 1 && moved >= before) || (moved > Real(MIN_DECREASE) * before && moved <= Real(SMALL_CORRECTION) * far);
+    const bool stalls = (round > 1 && moved >= before) ||
+                        (moved > Real(MIN_DECREASE) * before && moved <= Real(SMALL_CORRECTION) * far);
     const bool last = before < Real(INFINITE) && (is_roundoff || stalls);
     before = moved;
     return last;
@@ -290,8 +296,7 @@ OSIK_UNROLL_4
       t.pairs(n, [&](int a, int b) {
         Real even = 0, odd = 0;
         int i = 0;
-        for (; i + 1 < m; i += 2)
-          even += B[i * ld + a] * B[i * ld + b], odd += B[(i + 1) * ld + a] * B[(i + 1) * ld + b];
+        for (; i + 1 < m; i += 2) even += B[i * ld + a] * B[i * ld + b], odd += B[(i + 1) * ld + a] * B[(i + 1) * ld + b];
         S[a * lq + b] = i < m ? even + odd + B[i * ld + a] * B[i * ld + b] : even + odd;
       });
     else Algebra::product(t, B, 1, ld, B, ld, S, lq, n, m, n, true);
@@ -332,7 +337,7 @@ OSIK_UNROLL_4
       for (int a = 0; a < rows; ++a) t.each(0, n, [&](int i) { SOLVED[i] += PIVOT[i] * SMALL[a] * V[a * ld + i]; });
       t.columns(0, n, [&](auto c) {
         auto total = typename decltype(c)::P(0);
-OSIK_UNROLL_4
+        OSIK_UNROLL_4
         for (int i = 0; i < n; ++i) total.fma(SOLVED[i], c.load(M + i * lq));
         c.store(STEP, total);
       });
@@ -377,7 +382,7 @@ OSIK_UNROLL_4
       auto size = c.load(X).size();
       size += c.load(CENTER).size();
       size *= c.load(DAMPING);
-OSIK_UNROLL_4
+      OSIK_UNROLL_4
       for (int i = 0; i < k; ++i) size.fma(TERMS[i], c.load(B + i * ld).size());
       c.store(SOLVED, size);
     });
@@ -435,9 +440,8 @@ OSIK_UNROLL_4
       find_roundoff();
       if (times > 0 && (times == MAX_DUAL_STARTS || !leaves_out())) break;
       if (times == 0) dual.factor(B, ld, DAMPING, lower, upper, m);
-      const int steps = dual.run({B + m * ld, COMPLIANCE + m, lower, upper, VALUE_ROUNDOFF, X, Z + m, ld,
-                                  max_changes - changes},
-                                 LABEL, NEXT);
+      const int steps = dual.run(
+          {B + m * ld, COMPLIANCE + m, lower, upper, VALUE_ROUNDOFF, X, Z + m, ld, max_changes - changes}, LABEL, NEXT);
       if (steps < 0) return false;
       changes += steps;
     }
@@ -454,7 +458,9 @@ OSIK_UNROLL_4
     const Real *rows, *compliance, *lower, *upper;
     Real tolerance;
   };
-  OSIK_FN Copied copied() const { return {B, TARGET, COMPLIANCE, DAMPING, CENTER, B + m * ld, COMPLIANCE + m, lower, upper, tolerance}; }
+  OSIK_FN Copied copied() const {
+    return {B, TARGET, COMPLIANCE, DAMPING, CENTER, B + m * ld, COMPLIANCE + m, lower, upper, tolerance};
+  }
   OSIK_CALL void solve(const Data& d, const Answer& to) {
     begin(d);
     first_labels(d.guess, LABEL);

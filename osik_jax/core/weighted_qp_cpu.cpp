@@ -11,8 +11,14 @@ namespace {
 // The numbers of a problem but its matrix, one array after another; returns where they end.
 const double* read(QPData<double>& d, const double* at, const QPSizes& s) {
   const int m = s.m, n = s.n, p = s.p, N = n + p;
-  for (auto [field, count] : {std::pair{&d.target, m}, {&d.weight, m}, {&d.damping, n}, {&d.center, n}, {&d.rows, p * n},
-                              {&d.compliance, p}, {&d.lower, N}, {&d.upper, N}})
+  for (auto [field, count] : {std::pair{&d.target, m},
+                              {&d.weight, m},
+                              {&d.damping, n},
+                              {&d.center, n},
+                              {&d.rows, p * n},
+                              {&d.compliance, p},
+                              {&d.lower, N},
+                              {&d.upper, N}})
     *field = at, at += count;
   return at;
 }

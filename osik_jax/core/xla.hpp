@@ -133,7 +133,8 @@ inline int32_t number(const Attributes& a, std::string_view name) {
 struct Call {
   CallFrame* frame;
   static void require(bool holds, const char* problem) {
-    if (!holds) [[unlikely]] throw std::invalid_argument(problem);
+    if (!holds) [[unlikely]]
+      throw std::invalid_argument(problem);
   }
   static const Buffer& buffer(const List& all, int k) {
     require(k < all.size, "the core was called with too few arrays");
@@ -145,7 +146,8 @@ struct Call {
   }
   template <class T> static T* data(const Buffer& buffer) {
     constexpr int32_t INT32 = 4, FLOAT64 = 12;  // of XLA's PrimitiveType
-    require(buffer.dtype == (std::is_same_v<T, double> ? FLOAT64 : INT32), "the core was called with numbers of another type");
+    require(buffer.dtype == (std::is_same_v<T, double> ? FLOAT64 : INT32),
+            "the core was called with numbers of another type");
     return static_cast<T*>(buffer.data);
   }
   const Buffer& argument(int k) const { return buffer(frame->arguments, k); }

@@ -69,7 +69,8 @@ template <class Real> struct Parts {
     Matrix A(rows, n), M(n, n), v(1, n), out(1, n > rows ? n : rows, false), R(rows, n, false), S(rows, rows, false);
     const double tolerance = 30 * eps * (n + 1);
     Algebra::times(t, A.begin(), v.begin(), out.begin(), A.ld, 0, n, rows);
-    for (int i = 0; i < rows; ++i) NEAR(out.at(0, i), sum(0, n, [&](int j) { return A.get(i, j) * v.get(0, j); }), tolerance);
+    for (int i = 0; i < rows; ++i)
+      NEAR(out.at(0, i), sum(0, n, [&](int j) { return A.get(i, j) * v.get(0, j); }), tolerance);
     Algebra::transposed_times(t, M.begin(), v.begin(), out.begin(), M.ld, 0, n);
     for (int j = 0; j < n; ++j) NEAR(out.at(0, j), sum(0, n, [&](int i) { return M.get(i, j) * v.get(0, i); }), tolerance);
     Algebra::product(t, A.begin(), A.ld, 1, M.begin(), M.ld, R.begin(), R.ld, rows, n, n);
@@ -93,7 +94,8 @@ template <class Real> struct Parts {
 
   // L L' is the matrix with the ridge, and S^-1 b solves S x = b
   void factors(int n) {
-    Matrix A(n, n + 2), S(n, n, false), diagonal(1, n, false), inverse(1, n, false), M(n, n, false), b(1, n), work(1, n, false);
+    Matrix A(n, n + 2), S(n, n, false), diagonal(1, n, false), inverse(1, n, false), M(n, n, false), b(1, n),
+        work(1, n, false);
     const double ridge = 0.5, tolerance = 200 * eps * (n + 1) * (n + 1);
     const auto gram = [&](int i, int j) { return sum(0, n + 2, [&](int k) { return A.get(i, k) * A.get(j, k); }); };
     Algebra::gram(t, A.begin(), S.begin(), diagonal.begin(), A.ld, S.ld, n, 0, n + 2, false);
@@ -148,9 +150,9 @@ template <class Real> struct Parts {
     for (int a = 0; a < rows; ++a)
       NEAR(sum(0, columns,
                [&](int j) {
-                 return before.get(a, j) *
-                        (sum(0, rows, [&](int k) { return before.get(k, j) * M.get(rows, k); }) - before.get(rows, j));
-               }),
+        return before.get(a, j) *
+               (sum(0, rows, [&](int k) { return before.get(k, j) * M.get(rows, k); }) - before.get(rows, j));
+      }),
            0, 1e4 * eps * columns);
   }
 
@@ -188,9 +190,7 @@ static void rotations() {
 static bool is_refused(const std::string& text) {
   try {
     JsonReader(text.c_str()).value();
-  } catch (const std::runtime_error&) {
-    return true;
-  }
+  } catch (const std::runtime_error&) { return true; }
   return false;
 }
 
@@ -204,12 +204,11 @@ static void sections() {
     bool refused = false;
     try {
       JsonReader(wrong).value().numbers<int>();
-    } catch (const std::runtime_error&) {
-      refused = true;
-    }
+    } catch (const std::runtime_error&) { refused = true; }
     CHECK(refused);
   }
-  for (const char* wrong : {"", "[", "[1", "{\"a\"", "{\"a\":", "\"a", "\"\\", "\"\\u00", "\"\\u00g1\"", "[[[[[[1]]]]]]", "nan"})
+  for (const char* wrong :
+       {"", "[", "[1", "{\"a\"", "{\"a\":", "\"a", "\"\\", "\"\\u00", "\"\\u00g1\"", "[[[[[[1]]]]]]", "nan"})
     CHECK(is_refused(wrong));
   for (size_t cut = 0; cut < text.size(); ++cut) CHECK(is_refused(text.substr(0, cut)));
 }

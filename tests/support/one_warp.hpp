@@ -64,16 +64,24 @@ template <class T, class F> T reduced(int kind, T own, T start, F f) {
     return total;
   });
 }
-inline void __syncwarp() { reduced(1, 0, 0, [](int, int) { return 0; }); }
+inline void __syncwarp() {
+  reduced(1, 0, 0, [](int, int) { return 0; });
+}
 template <class T> T __shfl_sync(unsigned, T own, int from) {
   return of_all(2, own, [&](auto of) { return of(from); });
 }
 template <class T> T __shfl_xor_sync(unsigned, T own, int distance) {
   return of_all(3, own, [&, me = threadIdx.x](auto of) { return of(me ^ distance); });
 }
-inline bool __all_sync(unsigned, bool own) { return reduced(4, int(own), 1, [](int a, int b) { return a && b; }); }
-inline int __reduce_add_sync(unsigned, int own) { return reduced(5, own, 0, [](int a, int b) { return a + b; }); }
-inline unsigned __reduce_max_sync(unsigned, unsigned own) { return reduced(6, own, 0u, [](unsigned a, unsigned b) { return a > b ? a : b; }); }
+inline bool __all_sync(unsigned, bool own) {
+  return reduced(4, int(own), 1, [](int a, int b) { return a && b; });
+}
+inline int __reduce_add_sync(unsigned, int own) {
+  return reduced(5, own, 0, [](int a, int b) { return a + b; });
+}
+inline unsigned __reduce_max_sync(unsigned, unsigned own) {
+  return reduced(6, own, 0u, [](unsigned a, unsigned b) { return a > b ? a : b; });
+}
 inline unsigned __ballot_sync(unsigned, bool own) {
   return of_all(7, own, [](auto of) {
     unsigned bits = 0;

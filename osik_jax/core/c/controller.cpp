@@ -17,9 +17,10 @@ using namespace osik;
 namespace {
 constexpr size_t APART = 0;  // of the robots in a batch: there is one
 constexpr int SECTION = 2;  // VERSION in control/_packed_step.py
-constexpr char FORMAT[] = "{\n \"format\": \"osik-jax controller ", CORE[] = ",\n \"core\": ", CHECK[] = ",\n \"checksum\": ";
+constexpr char FORMAT[] = "{\n \"format\": \"osik-jax controller ",
+               CORE[] = ",\n \"core\": ", CHECK[] = ",\n \"checksum\": ";
 constexpr double ROUNDED = 0.02, EXACT = 64 * EPSILON,  // numerics/_rotations.py
-                 SHORTEST = 1e-14;                      // squared length of a quaternion that has a direction
+    SHORTEST = 1e-14;                      // squared length of a quaternion that has a direction
 
 struct Input {  // q or a target: where it is among the numbers of a step
   std::string name;
@@ -171,7 +172,8 @@ osik_status osik_step(osik_controller* c, const double* q, const double* targets
   const bool clean = c->take(q, targets ? targets : c->initial[OSIK_TARGETS].data());
   // without the last step's active set, which would save little time and make the answer depend on earlier steps: by 1e-8
   // where targets are out of reach
-  c->step->take({c->constants.data(), c->arrays, &APART, 1, nullptr, nullptr}, {c->result.data(), c->integers.data()}, clean);
+  c->step->take({c->constants.data(), c->arrays, &APART, 1, nullptr, nullptr}, {c->result.data(), c->integers.data()},
+                clean);
   std::copy_n(c->result.begin(), c->sizes.nv, velocity);
   return osik_status(c->integers[0]);
 }

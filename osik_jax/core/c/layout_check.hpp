@@ -27,7 +27,8 @@ class LayoutCheck {
  public:
   // numbers, constants: lengths of the file's arrays of these names
   LayoutCheck(const StepLayout& layout, size_t numbers, size_t constants)
-      : layout(layout), s(layout.s), by_weight(s.scheme == WEIGHTED), projects(s.scheme == CLASSICAL || s.scheme == SATURATED) {
+      : layout(layout), s(layout.s), by_weight(s.scheme == WEIGHTED),
+        projects(s.scheme == CLASSICAL || s.scheme == SATURATED) {
     check_sizes();
     const int tolerances[] = {2, 4, 1, 1};  // of each scheme
     require(constants == size_t(s.nq) + s.dofs + 1 + tolerances[s.scheme], "constants");
@@ -51,7 +52,8 @@ class LayoutCheck {
 
  private:
   void check_sizes() const {
-    require(s.scheme >= WEIGHTED && s.scheme <= SATURATED && s.bodies > 0 && s.nv > 0 && s.given > 0 && s.tasks > 0, "sizes");
+    require(s.scheme >= WEIGHTED && s.scheme <= SATURATED && s.bodies > 0 && s.nv > 0 && s.given > 0 && s.tasks > 0,
+            "sizes");
     require(s.max_iterations > 0 && s.max_iterations <= 20 * (s.nv + s.rows + 1), "limit on iterations");
     // workspaces have some thousand columns at most, so that their sizes in bytes are integers
     require(s.nv + s.dofs + s.m + s.p + s.h + s.rows <= 8192 && int64_t(s.L) * s.m * s.nv <= 1 << 24, "sizes");
@@ -69,7 +71,8 @@ class LayoutCheck {
     check_leaf(step[L::Q], s.given);
     for (int k : {L::DT, L::DAMPING, L::CURVATURE_DAMPING}) check_leaf(step[k], 1);
     require(step[L::BOX] == -1, "box");
-    for (int k : {L::POTENTIAL_GAIN, L::MARGIN, L::RANK_TOLERANCE}) projects ? check_leaf(step[k], 1) : check_optional_leaf(step[k], 1);
+    for (int k : {L::POTENTIAL_GAIN, L::MARGIN, L::RANK_TOLERANCE})
+      projects ? check_leaf(step[k], 1) : check_optional_leaf(step[k], 1);
     check_leaf(robot[L::OFFSET], s.nq), check_leaf(robot[L::REFERENCE], s.nq);
     check_leaf(robot[L::POSITION], 3 * s.bodies), check_leaf(robot[L::QUATERNION], 4 * s.bodies);
     check_leaf(robot[L::ANCHOR], 3 * s.joints), check_leaf(robot[L::AXIS], 3 * s.joints);
@@ -101,7 +104,8 @@ class LayoutCheck {
   }
   void check(const Task& task) const {
     const int *leaves = task.leaves, m = task.m, bounded = task.bounded != 0;
-    require(m >= 0 && m <= s.rows && task.first >= 0 && task.first <= s.rows - m && task.out >= 0 && task.out <= s.rows - m, "rows");
+    require(m >= 0 && m <= s.rows && task.first >= 0 && task.first <= s.rows - m && task.out >= 0 && task.out <= s.rows - m,
+            "rows");
     require(task.level >= 0 && task.level < s.tasks, "levels");
     require(task.diagonal == (by_weight && task.kind == POSTURE && !bounded), "tasks");
     check_leaf(leaves[0], 1), check_leaf(leaves[1], 1, m);
@@ -115,7 +119,8 @@ class LayoutCheck {
   void check_pose(const Task& task) const {
     const int *options = task.options, *leaves = task.leaves;
     check_leaf(leaves[5], 3), check_leaf(leaves[6], 9), check_leaf(leaves[7], 1, 3), check_leaf(leaves[8], 1, 3);
-    require(task.count >= 9 && (options[8] == 1 || options[8] == 2) && task.count == 9 + options[8] * (2 + s.dofs), "frames");
+    require(task.count >= 9 && (options[8] == 1 || options[8] == 2) && task.count == 9 + options[8] * (2 + s.dofs),
+            "frames");
     int kept = 0;
     for (int i = 2; i < 8; ++i) kept += options[i] != 0;
     require(kept == task.m, "rows");
@@ -131,7 +136,8 @@ class LayoutCheck {
   void check_posture(const Task& task) const {
     require(task.kind == POSTURE && task.count == 2 * task.m, "tasks");
     if (!task.bounded) check_leaf(task.leaves[5], s.given);
-    require_within(task.options, task.m, 0, s.given, "posture"), require_within(task.options + task.m, task.m, 0, s.nv, "posture");
+    require_within(task.options, task.m, 0, s.given, "posture"),
+        require_within(task.options + task.m, task.m, 0, s.nv, "posture");
   }
   // of_level: rows of the tasks of each level; the last level of a hierarchy has none
   void check_levels(const std::vector<int>& of_level) const {
@@ -145,7 +151,8 @@ class LayoutCheck {
     require_within(layout.level_of_hard, s.nv, -1, 0, "hard rows");
     for (int level = 0; level < s.L && hard < s.h; ++level)  // all rows of a level are hard, or none
       for (int row = 0; row < of_level[level] && hard < s.h && (row || layout.level_of_hard[hard] == level); ++row, ++hard)
-        require(layout.level_of_hard[hard] == level && layout.row_of_hard[hard - s.nv] == row && s.h - hard >= of_level[level] - row,
+        require(layout.level_of_hard[hard] == level && layout.row_of_hard[hard - s.nv] == row &&
+                    s.h - hard >= of_level[level] - row,
                 "hard rows");
     require(hard == s.h, "hard rows");
   }
