@@ -86,7 +86,7 @@ def _inertia_notes(urdf: Urdf, model: mujoco.MjModel) -> Iterator[LoadNote]:
             shown, now = (" ".join(f"{value:.4g}" for value in own) for own in (moments, used))
             done = (
                 f"the moments {shown} kg m^2 are those of no body, the largest being more than the sum of the others: "
-                f"{now} are used, {100.0 * change / moments[-1]:.2g} % of the largest away; masses are kept"
+                f"{now} are used, {change:.2g} kg m^2 away at most; masses are kept"
             )
             yield LoadNote(INERTIA, name, done)
 
