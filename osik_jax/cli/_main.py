@@ -1,4 +1,4 @@
-"""The command line: ``osik demo``, ``ik``, ``reach``, ``calibrate``, ``retarget``, ``ros2``, ``view`` and ``info``."""
+"""The command line: ``osik demo``, ``ik``, ``reach``, ``calibrate``, ``place``, ``retarget`` and others."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from ._demo import Demo
 from ._ik import Ik
 from ._info import Info
 from ._messages import CommandError, notes
+from ._place import Place
 from ._reach import Reach
 from ._retarget import Retarget
 from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Calibrate | Demo | Ik | Reach | Retarget | Ros2 | View | Info
+_Command = Calibrate | Demo | Ik | Place | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "ik": Ik,
             "reach": Reach,
             "calibrate": Calibrate,
+            "place": Place,
             "retarget": Retarget,
             "ros2": Ros2,
             "view": View,
