@@ -15,13 +15,14 @@ from ._follow import Follow
 from ._ik import Ik
 from ._info import Info
 from ._messages import CommandError, notes
+from ._place import Place
 from ._reach import Reach
 from ._retarget import Retarget
 from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Calibrate | Demo | Follow | Ik | Reach | Retarget | Ros2 | View | Info
+_Command = Calibrate | Demo | Follow | Ik | Place | Reach | Retarget | Ros2 | View | Info
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,6 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "follow": Follow,
             "reach": Reach,
             "calibrate": Calibrate,
+            "place": Place,
             "retarget": Retarget,
             "ros2": Ros2,
             "view": View,

@@ -18,7 +18,7 @@ README = ROOT / "README.md"
 NOTEBOOKS = ROOT / "docs" / "notebooks.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
-PARTS = ["viewer", "tuning", "scaling", "retargeting", "reachability", "calibration", "interop"]
+PARTS = ["viewer", "tuning", "scaling", "retargeting", "reachability", "calibration", "placement", "interop"]
 PACKAGES = [*PARTS, "runtime", "solvers", "schemes", "physics", "interop.ros2"]
 PACKAGES = ("osik_jax", *(f"osik_jax.{part}" for part in PACKAGES))
 OPTIONAL = ["matplotlib", "tyro", "rich", "torch", "pinocchio", "cyclonedds", "mink", "optax"]
@@ -62,7 +62,7 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
-IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration", "motion"]
+IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration", "motion", "placement"]
 AT_NIGHT = [
     "batches",
     "inverse_kinematics",

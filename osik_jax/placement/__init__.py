@@ -1,0 +1,4 @@
+"""Placement: where to put a robot's base so that it reaches a set of poses; import it by name."""
+
+from ._place_base import place_base as place_base
+from ._placement import Placement as Placement

@@ -1,0 +1,109 @@
+"""Base poses: targets and scenes in the axes of each base, and whether a base stands free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .._errors import OsikTypeError, OsikValueError
+from ..collision import CollisionShape, Scene
+from ..collision._convex import shape_table
+from ..collision._core import core_robot, core_scene, gaps_at
+from ..collision._robot_shapes import Given, robot_shapes
+from ..collision._scene import Labels, _convex_shapes, _with
+from ..collision._table import RobotShapes
+from ..kinematics._rigid import compose, rotate
+from ..robot import Robot
+
+AXES = ("x", "y", "yaw", "height")
+"""Coordinates of a base, in the order of the grid's axes."""
+
+
+def checked_axis(name: str, given: Any) -> Float[np.ndarray, " n"]:
+    """Return the coordinates of a grid along one axis.
+
+    Raises:
+        TypeError: no numbers.
+        ValueError: not finite, or not increasing.
+    """
+    try:
+        axis = np.atleast_1d(np.asarray(given, float))
+    except (TypeError, ValueError):
+        raise OsikTypeError(
+            f"{name} is {type(given).__name__}; it is numbers, such as np.linspace(-1, 1, 11)"
+        ) from None
+    if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
+        raise OsikValueError(f"{name} has shape {axis.shape}; it is finite numbers that increase: [0.0, 0.1]")
+    return axis
+
+
+def grid_bases(axes: Sequence[np.ndarray]) -> Float[np.ndarray, "n 4"]:
+    """Return all bases of a grid: x [m], y [m], yaw [rad], height [m]."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(AXES))
+
+
+def base_poses(bases: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+    """Return position [m] and rotation (base axes to world axes) of bases."""
+    cos, sin, zero = np.cos(bases[:, 2]), np.sin(bases[:, 2]), np.zeros(len(bases))
+    rows = (cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0)
+    return bases[:, [0, 1, 3]], np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def in_bases(bases: Float[np.ndarray, "n 4"], position: Any, rotation: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return poses in the axes of each base, from the world's.
+
+    Args:
+        bases: x, y, yaw, height. (n, 4)
+        position: [m]. (k, 3), or one set for each base (n, k, 3)
+        rotation: (k, 3, 3) or (n, k, 3, 3)
+    """
+    origin, turn = base_poses(bases)
+    inverse = np.swapaxes(turn, -1, -2)[:, None]
+    return rotate(inverse, np.asarray(position) - origin[:, None]), compose(inverse, np.asarray(rotation))
+
+
+def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
+    """Return a stack of the scene in the axes of each base; held objects stay in their hands."""
+    count, table = len(bases), scene.table
+    moved = in_bases(bases, table.position, table.rotation)
+    held = np.asarray(scene.body) >= 0
+    position = np.where(held[:, None], np.asarray(table.position), moved[0])
+    rotation = np.where(held[:, None, None], np.asarray(table.rotation), moved[1])
+    parts = table, scene.body, scene.contact, scene.among
+    table, body, contact, among = jax.tree.map(lambda a: np.broadcast_to(a, (count, *np.shape(a))), parts)
+    labels = Labels((scene.labels.names,) * count, (scene.labels.objects,) * count)
+    table = table._replace(position=position, rotation=rotation)
+    return _with(scene, table=table, body=body, contact=contact, among=among, labels=labels)
+
+
+def base_clearances(
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[CollisionShape]
+) -> Float[np.ndarray, " n"]:
+    """Return the distance from the scene to the shapes that stand with the base [m]; infinite if there are none.
+
+    These are the robot's shapes that no joint moves, and the footprint. ``Scene.allow`` says what may touch them.
+    """
+    shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
+    q = np.broadcast_to(robot.q0, (len(bases), robot.nq))
+    near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
+    return np.asarray(near.distance)
+
+
+def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[CollisionShape]) -> RobotShapes:
+    """Return the shapes so that those that no joint moves, and the footprint, meet the scene, and nothing else does."""
+    more = shape_table(_convex_shapes("footprint", footprint))
+    count, table = len(more.kind), shapes.table
+    more = more._replace(first=more.first + len(table.vertices))
+    return shapes._replace(
+        names=(*shapes.names, *(f"footprint:{k}" for k in range(count))),
+        links=(*shapes.links, *["footprint"] * count),
+        bodies=np.concatenate([shapes.bodies, np.zeros(count, np.int32)]),
+        table=jax.tree.map(lambda a, b: np.concatenate([a, b]), table, more),
+        pairs=np.zeros((0, 2), np.int32),
+        world=np.concatenate([~shapes.world, np.ones(count, bool)]),
+    )

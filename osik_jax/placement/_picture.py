@@ -1,0 +1,81 @@
+"""Picture of a placement from above."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from scipy.spatial import ConvexHull
+
+from ..collision import Scene
+from ..collision._table import ShapeKind
+from ..reachability._slices import NOTHING, cell_edges, share_colors
+
+_INK, _GREY, _BEST = "#2b2f36", "#5b636d", "#f08c3a"
+
+
+def draw_placement(found: Any) -> Figure:
+    """Return the grid of a ``Placement`` from above: the most poses reached at each x and y, over yaws and heights."""
+    figure = Figure(figsize=(7.0, 6.0), dpi=130, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    place: Axes = figure.subplots()
+    share = found.reached.max((2, 3)).T / len(found.q)
+    stands = found.stands_free.any((2, 3)).T
+    edges = cell_edges((found.x, found.y))
+    place.pcolormesh(*edges, np.ma.masked_where(~stands, np.zeros_like(share)), cmap=ListedColormap([NOTHING]))
+    reached = np.ma.masked_where(share == 0.0, 100.0 * share)
+    cells = place.pcolormesh(*edges, reached, cmap=share_colors(), vmin=0.0, vmax=100.0)
+    bar = figure.colorbar(cells, shrink=0.8)
+    bar.set_label(f"of {len(found.q)} poses reached, best yaw and height [%]", color=_INK)
+    for outline in [] if found.scene is None else _outlines(found.scene):
+        place.fill(*outline.T, facecolor="none", edgecolor=_INK, linewidth=1.2)
+    place.plot(*found.poses[:, :2].T, ".", color="#c0392b", ms=4, label="poses")
+    (x, y, yaw, height), length = found.best, 0.08 * max(np.ptp(edges[0]), np.ptp(edges[1]))
+    place.plot(x, y, "o", color=_BEST, ms=9, label=f"best base: {found.is_reached.sum()} poses, height {height:.3g} m")
+    place.annotate(
+        "",
+        (x + length * np.cos(yaw), y + length * np.sin(yaw)),
+        (x, y),
+        arrowprops=dict(arrowstyle="->", color=_BEST, lw=2),
+    )
+    place.set_aspect("equal")
+    place.set_xlabel("x [m]", color=_INK)
+    place.set_ylabel("y [m]", color=_INK)
+    place.set_title("grey: no pose reached; white: the base does not stand free", fontsize=9, color=_GREY)
+    place.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2)
+    return figure
+
+
+def _outlines(scene: Scene) -> list[Float[np.ndarray, "k 2"]]:
+    """Return the outlines of the shapes in the world from above; half spaces have none."""
+    table, held = scene.table, np.asarray(scene.body) >= 0
+    drawn = ~held & ~np.isin(table.kind, (ShapeKind.ABSENT, ShapeKind.HALF_SPACE))
+    return [_outline(scene, int(k)) for k in np.flatnonzero(drawn)]
+
+
+def _outline(scene: Scene, row: int) -> Float[np.ndarray, "k 2"]:
+    """Return the convex outline of one shape: of its vertices, or of points of its surface, in the world's x and y."""
+    table = scene.table
+    kind, size = int(table.kind[row]), np.asarray(table.size[row])
+    if kind == ShapeKind.HULL:
+        points = np.asarray(table.vertices[table.first[row] : table.first[row] + table.count[row]])
+    elif kind == ShapeKind.BOX:
+        points = size * (np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3))
+    else:  # the ends of the axis; a cylinder's discs, or balls
+        points = _disc(size[0]) if kind == ShapeKind.CYLINDER else np.zeros((1, 3))
+        end = np.array([0.0, 0.0, size[1]])
+        points = np.concatenate([points - end, points + end])
+    flat = (np.asarray(table.position[row]) + points @ np.asarray(table.rotation[row]).T)[:, :2]
+    if kind in (ShapeKind.SPHERE, ShapeKind.CAPSULE, ShapeKind.HULL) and size[0] > 0.0:
+        flat = (flat[:, None] + _disc(size[0])[:, :2]).reshape(-1, 2)
+    return flat[ConvexHull(flat).vertices]
+
+
+def _disc(radius: float) -> Float[np.ndarray, "64 3"]:
+    angle = np.linspace(0.0, 2.0 * np.pi, 64, endpoint=False)
+    return radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(64)], -1)

@@ -1,0 +1,121 @@
+"""Result of a search for a base."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..collision import Scene
+from ..inverse import InverseKinematicsSolution
+from ..robot import Robot
+from ._bases import base_poses
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Placement:
+    """The best base for a set of poses, and how well each base of the grid does.
+
+    Attributes:
+        robot: the robot.
+        scene: the obstacles, in world axes, or None.
+        clearance: smallest distance of all pairs of shapes [m].
+        poses: positions of the poses, of all frames [m]. (m, 3)
+        x: coordinates of the grid [m]. (nx,)
+        y: likewise. (ny,)
+        yaw: likewise [rad]. (nyaw,)
+        height: likewise [m]. (nh,)
+        base_clearance: signed distance from the scene to what stands with the base [m]. (nx, ny, nyaw, nh)
+        reached: number of poses reached; 0 for bases that do not stand free. (nx, ny, nyaw, nh)
+        margin: smallest distance of a joint from its limits over its range, of all poses reached: 0.5 if all joints are
+            in the middle; NaN if no pose is reached. Of the first configuration found, so a lower bound of the best.
+            (nx, ny, nyaw, nh)
+        manipulability: smallest index of Yoshikawa of the same configurations, likewise. (nx, ny, nyaw, nh)
+        best: x [m], y [m], yaw [rad] and height [m] of the best base, which is improved off the grid. (4,)
+        q: configuration with the largest margin that is found for each pose at the best base; NaN where none is.
+            (poses, nq)
+        best_margin: margin of each of these. (poses,)
+        best_manipulability: index of each of these. (poses,)
+        solution: the answers for all poses at the best base, in the base's axes: ``solution.explain(i)`` says what
+            stops the robot at pose i.
+    """
+
+    robot: Robot
+    scene: Scene | None
+    clearance: float
+    poses: Float[np.ndarray, "m 3"]
+    x: Float[np.ndarray, " nx"]
+    y: Float[np.ndarray, " ny"]
+    yaw: Float[np.ndarray, " nyaw"]
+    height: Float[np.ndarray, " nh"]
+    base_clearance: Float[np.ndarray, "nx ny nyaw nh"]
+    reached: Int[np.ndarray, "nx ny nyaw nh"]
+    margin: Float[np.ndarray, "nx ny nyaw nh"]
+    manipulability: Float[np.ndarray, "nx ny nyaw nh"]
+    best: Float[np.ndarray, "4"]
+    q: Float[np.ndarray, "poses nq"]
+    best_margin: Float[np.ndarray, " poses"]
+    best_manipulability: Float[np.ndarray, " poses"]
+    solution: InverseKinematicsSolution
+
+    def __repr__(self) -> str:
+        return f"Placement, {self._summary()}"
+
+    @property
+    def is_reached(self) -> Bool[np.ndarray, " poses"]:
+        """Return whether the best base reaches each pose."""
+        return np.asarray(np.isfinite(self.q).all(-1))
+
+    @property
+    def best_pose(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+        """Return the position [m] and rotation of the best base in world axes."""
+        position, rotation = base_poses(self.best[None])
+        return position[0], rotation[0]
+
+    @property
+    def stands_free(self) -> Bool[np.ndarray, "nx ny nyaw nh"]:
+        """Return whether the base keeps the clearance to the scene at each base of the grid."""
+        return np.asarray(self.base_clearance >= self.clearance)
+
+    @property
+    def pareto(self) -> Int[np.ndarray, "k 4"]:
+        """Return the indices of the grid's bases that no other base beats in poses reached, margin and manipulability.
+
+        The base with the most poses comes first.
+        """
+        fields = self.reached, self.margin, self.manipulability
+        scores = np.stack([np.nan_to_num(field.astype(float)).ravel() for field in fields], -1)
+        kept: list[int] = []
+        for k in np.lexsort(-scores.T[::-1]):
+            if scores[k, 0] > 0 and not any((scores[j] >= scores[k]).all() for j in kept):
+                kept.append(int(k))
+        return np.stack(np.unravel_index(np.array(kept, int), self.reached.shape), -1)
+
+    def explain(self) -> str:
+        """Return the best base, how many bases of the grid do how well, and what stops the robot, in words."""
+        count, found, lines = len(self.q), self.is_reached, [self._summary()]
+        if found.any():
+            lines.append(
+                f"smallest margin of a joint {100.0 * np.nanmin(self.best_margin):.1f} % of its range, "
+                f"smallest manipulability {np.nanmin(self.best_manipulability):.3g}"
+            )
+        full, blocked = int((self.reached == count).sum()), int((~self.stands_free).sum())
+        lines.append(f"of {self.reached.size} bases of the grid {full} reach all poses; {blocked} do not stand free")
+        lines += [f"pose {k}: {self.solution.explain(int(k))}" for k in np.flatnonzero(~found)]
+        return "\n".join(lines)
+
+    def _summary(self) -> str:
+        x, y, yaw, height = self.best
+        where = f"best base: x {x:.3f} m, y {y:.3f} m, yaw {yaw:.3f} rad, height {height:.3f} m"
+        return f"{where}; {self.is_reached.sum()} of {len(self.q)} poses reached"
+
+    def figure(self) -> Figure:
+        """Return a matplotlib figure from above: poses reached by each base, the scene, the poses and the best base."""
+        from ._picture import draw_placement  # matplotlib, an extra
+
+        return draw_placement(self)

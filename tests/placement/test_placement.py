@@ -1,0 +1,175 @@
+"""Placements judged by MuJoCo C: tips at the poses, distances to the scene, and bases that stand free."""
+
+import json
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from refusals import refuses
+
+import osik_jax as osik
+from osik_jax.cli import main
+from osik_jax.core import _library
+from osik_jax.placement import Placement, place_base
+
+pytestmark = pytest.mark.skipif(not _library.installed(), reason="no compiled core")
+
+ARM = """
+<body name="stand" pos="{pos}" euler="0 0 {yaw}">
+  <geom name="stand" type="box" size="0.08 0.12 0.1" pos="0.02 0 0.1"/>
+  <body name="upper" pos="0 0 0.3"><joint name="pan" axis="0 0 1" range="-2.5 2.5"/>
+    <joint name="lift" axis="0 1 0" range="-2 2"/>
+    <geom name="upper" type="capsule" size="0.03" fromto="0.06 0 0 0.3 0 0" mass="1"/>
+    <body name="lower" pos="0.35 0 0"><joint name="elbow" axis="0 1 0" range="-2.5 2.5"/>
+      <geom name="lower" type="capsule" size="0.03" fromto="0.04 0 0 0.2 0 0" mass="1"/>
+      <body name="hand" pos="0.25 0 0"><joint name="wrist" axis="0 1 0" range="-2 2"/>
+        <geom name="hand" type="sphere" size="0.03" pos="0.04 0 0" mass="1"/><site name="tip" pos="0.1 0 0"/>
+      </body>
+    </body>
+  </body>
+</body>"""
+BOXES = {"table": ([0.25, 0.4, 0.15], [0.6, 0.0, 0.15]), "lid": ([0.2, 0.4, 0.01], [0.65, 0.0, 0.7])}
+GRID: dict[str, Any] = dict(x=np.linspace(-0.2, 0.8, 6), y=np.linspace(-0.6, 0.6, 5), yaw=[-0.5, 0.0, 1.5])
+
+
+def mjcf(base: np.ndarray | None = None) -> str:
+    """Return the arm alone, or on a base x, y, yaw, height among the boxes."""
+    boxes = (
+        ""
+        if base is None
+        else "".join(
+            f'<geom name="{name}" type="box" size="{" ".join(map(str, size))}" pos="{" ".join(map(str, at))}"/>'
+            for name, (size, at) in BOXES.items()
+        )
+    )
+    x, y, yaw, height = np.zeros(4) if base is None else base
+    arm = ARM.format(pos=f"{x} {y} {height}", yaw=yaw)
+    return f'<mujoco><compiler angle="radian"/><worldbody>{boxes}{arm}</worldbody></mujoco>'
+
+
+def distance(model: mujoco.MjModel, data: mujoco.MjData, geoms: tuple[str, ...]) -> float:
+    """Return MuJoCo's smallest distance of some geoms from the boxes [m]."""
+    pairs = [(model.geom(a).id, model.geom(b).id) for a in geoms for b in BOXES]
+    return min(mujoco.mj_geomDistance(model, data, *pair, 2.0, None) for pair in pairs)
+
+
+@pytest.fixture(scope="module")
+def arm() -> osik.Robot:
+    return osik.Robot.from_mjcf(mjcf())
+
+
+@pytest.fixture(scope="module")
+def scene() -> osik.Scene:
+    return osik.Scene({name: osik.CollisionShape.box(*box) for name, box in BOXES.items()})
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    return np.random.default_rng(0).uniform([0.4, -0.2, 0.4], [0.6, 0.2, 0.55], (10, 3))
+
+
+@pytest.fixture(scope="module")
+def found(arm: osik.Robot, scene: osik.Scene, points: np.ndarray) -> Placement:
+    return place_base(arm, {"tip": points}, **GRID, scene=scene, clearance=0.01)
+
+
+def test_the_best_base_reaches_all_poses_and_mujoco_sees_nothing_touch(arm, found, points):
+    assert found.is_reached.all() and found.solution.converged.all()
+    model = mujoco.MjModel.from_xml_string(mjcf(found.best))
+    data = mujoco.MjData(model)
+    for q, point in zip(found.q, points, strict=True):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        assert np.linalg.norm(data.site("tip").xpos - point) < 1e-3
+        assert distance(model, data, ("stand", "upper", "lower", "hand")) > 0.01 - 1e-6
+    lower, upper = np.asarray(arm.position_lower), np.asarray(arm.position_upper)
+    margin = (np.minimum(found.q - lower, upper - found.q) / (upper - lower)).min(1)
+    assert np.allclose(found.best_margin, margin)
+    assert margin.min() > np.nanmax(found.margin[found.reached == len(points)])  # the search has improved the grid's
+
+
+def test_which_bases_stand_free_is_as_mujoco_says(found):
+    gaps = np.zeros(found.reached.shape)
+    for at in np.ndindex(gaps.shape):
+        model = mujoco.MjModel.from_xml_string(
+            mjcf(np.array([axis[k] for axis, k in zip(_axes(found), at, strict=True)]))
+        )
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        gaps[at] = distance(model, data, ("stand",))
+    apart = gaps > 0.0
+    assert apart.any() and not apart.all()  # some bases are in the table
+    assert np.allclose(found.base_clearance[apart], gaps[apart], atol=1e-6)
+    assert ((found.base_clearance < 0.0) == ~apart).all()
+    assert (found.reached[~found.stands_free] == 0).all()
+
+
+def _axes(found: Placement) -> tuple[np.ndarray, ...]:
+    return found.x, found.y, found.yaw, found.height
+
+
+def test_a_base_of_the_grid_gets_what_a_search_for_it_alone_gets(arm, found, points):
+    for at in [(1, 2, 1, 0), (0, 1, 1, 0), (2, 4, 0, 0)]:
+        (x, y, yaw, _), turn = [axis[k] for axis, k in zip(_axes(found), at, strict=True)], np.eye(3)
+        turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        boxes = {
+            n: osik.CollisionShape.box(size, np.subtract(p, [x, y, 0]) @ turn, turn.T) for n, (size, p) in BOXES.items()
+        }
+        there = (points - [x, y, 0.0]) @ turn
+        alone = osik.inverse_kinematics(arm, {"tip": there}, scene=osik.Scene(boxes), clearance=0.01)
+        assert found.stands_free[at] and found.reached[at] == alone.converged.sum()
+
+
+def test_pareto_bases_are_those_that_none_beats(found):
+    scores = np.stack([found.reached, np.nan_to_num(found.margin), np.nan_to_num(found.manipulability)], -1)
+    flat = scores.reshape(-1, 3)
+    beaten = [((flat >= own).all(1) & (flat > own).any(1)).any() for own in flat]
+    kept = {tuple(at) for at in found.pareto}
+    assert kept == {at for at, lost in zip(np.ndindex(found.reached.shape), beaten, strict=True) if not lost}
+    assert found.reached[tuple(found.pareto[0])] == found.reached.max()
+
+
+def test_a_pose_in_the_table_is_reached_by_no_base_and_the_answer_says_why(arm, scene, points):
+    poses = np.concatenate([points[:2], [[0.5, 0.0, 0.25]]])
+    found = place_base(arm, {"tip": poses}, x=[-0.1, 0.1], y=0.0, yaw=[0.0], scene=scene, refine=1)
+    assert found.reached.max() == 2 and found.is_reached.tolist() == [True, True, False]
+    assert np.isnan(found.q[2]).all() and "pose 2: not found" in found.explain() and "table" in found.explain()
+
+
+def test_a_footprint_and_what_the_base_may_touch_count(arm, scene, points):
+    wide = osik.CollisionShape.box([0.3, 0.1, 0.05], [0.0, 0.0, 0.05])
+    given: dict[str, Any] = dict(x=[0.1], y=[0.0], yaw=[0.0], refine=0)
+    found = place_base(arm, {"tip": points}, **given, scene=scene)
+    assert np.isclose(found.base_clearance, 0.15, atol=1e-6)
+    refuses(
+        ValueError,
+        "no base of the grid stands free",
+        place_base,
+        arm,
+        {"tip": points},
+        **given,
+        scene=scene,
+        footprint=wide,
+    )
+    on = place_base(arm, {"tip": points}, x=[0.6], y=[0.0], yaw=[0.0], refine=0, scene=scene.allow(("table", "stand")))
+    assert on.base_clearance > 0.0
+
+
+def test_what_is_wrong_is_told(arm, points):
+    refuses(ValueError, r"x has shape \(2,\)", place_base, arm, {"tip": points}, x=[1.0, 0.0], y=0.0)
+    refuses(TypeError, "y is str", place_base, arm, {"tip": points}, x=0.0, y="wide")
+    refuses(KeyError, "tap", place_base, arm, {"tap": points}, x=0.0, y=0.0)
+    refuses(TypeError, "scene is a dict", place_base, arm, {"tip": points}, x=0.0, y=0.0, scene={})
+    refuses(ValueError, "poses is list", place_base, arm, [points], x=0.0, y=0.0)
+
+
+def test_the_command_writes_the_base(tmp_path, monkeypatch, capsys, points):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.xml").write_text(mjcf())
+    np.savetxt("poses.csv", points[:3], delimiter=",", header="x,y,z", comments="")
+    command = "place --robot arm.xml --frame tip --poses poses.csv --x -0.2 0.2 3 --y 0 0 1 --yaw 1"
+    assert main(command.split()) == 0
+    assert "3 of 3 poses reached" in capsys.readouterr().out
+    written = json.loads((tmp_path / "osik-placement" / "placement.json").read_text())
+    assert len(written["q"]) == 3 and (tmp_path / "osik-placement" / "placement.png").stat().st_size > 10_000
