@@ -1,6 +1,7 @@
-"""Timed motion: durations and rates of ``retime`` beside toppra, and a raster on a cylinder by ``follow``.
+"""Timed motion: durations and rates of ``retime`` beside toppra, a raster by ``follow``, streams by ``chunk``.
 
 python -m benchmarks.motion [--speeds 0.1 0.3]. Needs toppra.
+python -m benchmarks.motion --chunks
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import jax
 import numpy as np
 
 import osik_jax as osik
-from osik_jax.motion import follow, retime
+from osik_jax.motion import chunk, follow, retime
 
 LIMITS: dict[str, Any] = {
     "velocity": np.array([2.175] * 4 + [2.61] * 3),
@@ -102,12 +103,54 @@ def follow_raster(speed: float) -> None:
     )
 
 
+def chunk_stream(step: float, streams: int = 10) -> None:
+    """Print how well chunks of 30 random waypoints in 1 s join and keep limits.
+
+    Args:
+        step: standard deviation of a waypoint's distance from the one before [rad].
+        streams: number of streams, of four chunks each.
+    """
+    arm = osik.load_robot("arm7")
+    limits: dict[str, Any] = {"velocity": 1.5, "acceleration": 4.0, "jerk": 40.0}
+    run = jax.jit(lambda points, times, start, begin: chunk(arm, points, times, start=start, begin=begin, **limits))
+    rng, rest = np.random.default_rng(0), np.zeros(arm.nv)
+    used, joins, kept, took = np.zeros(4), 0.0, [], []
+    for _ in range(streams):
+        begin, start, before = 0.0, (np.asarray(arm.q0), rest, rest), None
+        for _ in range(4):
+            points = np.asarray(start[0]) + np.cumsum(step * rng.normal(size=(30, arm.nv)), axis=0)
+            given = points, begin - 0.1 + np.linspace(0.0, 1.0, 30), start, begin
+            found = run(*given)
+            start_time = time.process_time()
+            jax.block_until_ready(run(*given))
+            took.append(time.process_time() - start_time)
+            q, *rates = np.asarray(found.at(np.linspace(begin, float(found.end), 1001)))
+            past = np.maximum(q - arm.position_upper, arm.position_lower - q).max()
+            used = np.maximum(used, [past, *(np.abs(a).max() / b for a, b in zip(rates, limits.values(), strict=True))])
+            kept.append(bool(found.feasible.all()))
+            if before is not None:
+                pairs = zip(before.state(begin), found.state(begin), strict=True)
+                joins = max(joins, *(float(np.abs(a - b).max()) for a, b in pairs))
+            begin, before = begin + 0.4 + 0.3 * rng.random(), found
+            start = found.state(begin)
+    print(
+        f"steps of {step} rad: joins {joins:.1g}, past a range {max(used[0], 0.0):.2g} rad, speed, acceleration, jerk "
+        f"by their limits {used[1]:.4f} {used[2]:.4f} {used[3]:.4f}; {kept.count(False)} of {len(kept)} chunks not "
+        f"feasible; processor time of a chunk {1e3 * min(took):.0f} ms at least, median {1e3 * np.median(took):.0f} ms"
+    )
+
+
 def main() -> None:
     """Run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--speeds", type=float, nargs="*", default=[0.05, 0.1, 0.3, 1.0])
+    parser.add_argument("--chunks", action="store_true", help="streams of chunks alone")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if arguments.chunks:
+        for step in (0.02, 0.12):
+            chunk_stream(step)
+        return
     for name, limits in ROBOTS.items():
         beside_toppra(name, *limits)
     for speed in arguments.speeds:

@@ -1,5 +1,7 @@
 """From poses to a timed motion: paths of joints, their least time, chunks and streams of poses."""
 
+from ._chunk import Chunk as Chunk
+from ._chunk import chunk as chunk
 from ._follow import Followed as Followed
 from ._follow import follow as follow
 from ._motion import Motion as Motion

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..numerics._guarded import positive_root
 from ._spline import cubic_derivatives
 
 
@@ -69,15 +70,9 @@ def durations(width: Float[Array, " K"], square: Float[Array, "K 3"]) -> Float[A
     the rates at both ends; the series in ``c w^2 / S^2``, which is small, holds for both signs of c.
     """
     first, slope, bend = square.T
-    mean_time = width / (root(first) + root(first + width * (slope + width * bend)))
+    mean_time = width / (positive_root(first) + positive_root(first + width * (slope + width * bend)))
     y = bend * mean_time**2
     return 2.0 * mean_time * (1.0 + y / 3.0 + y**2 / 5.0 + y**3 / 7.0 + y**4 / 9.0)
-
-
-def root(value: Array) -> Array:
-    """Return the square root; 0 with derivative 0 for numbers that are not positive."""
-    positive = value > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)
 
 
 def _position(square: Float[Array, "T 3"], elapsed: Float[Array, " T"]) -> Float[Array, " T"]:
@@ -86,7 +81,7 @@ def _position(square: Float[Array, "T 3"], elapsed: Float[Array, " T"]) -> Float
     y = bend * elapsed**2
     sinh = 1.0 + y / 6.0 * (1.0 + y / 20.0 * (1.0 + y / 42.0 * (1.0 + y / 72.0)))
     cosh = 1.0 + y / 12.0 * (1.0 + y / 30.0 * (1.0 + y / 56.0 * (1.0 + y / 90.0)))
-    return elapsed * (root(first) * sinh + slope * elapsed / 4.0 * cosh)
+    return elapsed * (positive_root(first) * sinh + slope * elapsed / 4.0 * cosh)
 
 
 def _progress(path: Float[Array, "T 4"], square: Float[Array, "T 3"], x: Float[Array, " T"]) -> Float[Array, "4 T"]:
@@ -94,6 +89,6 @@ def _progress(path: Float[Array, "T 4"], square: Float[Array, "T 3"], x: Float[A
     s, d1, d2, d3 = cubic_derivatives(path, x)
     first, slope, bend = square.T
     rate_squared = jnp.maximum(first + x * (slope + x * bend), 0.0)
-    rate, pull = root(rate_squared), slope / 2.0 + bend * x
+    rate, pull = positive_root(rate_squared), slope / 2.0 + bend * x
     jerk = rate * (d3 * rate_squared + 3.0 * d2 * pull + d1 * bend)
     return jnp.stack([s, d1 * rate, d2 * rate_squared + d1 * pull, jerk])

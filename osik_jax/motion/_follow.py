@@ -17,7 +17,7 @@ from ..inverse._inverse_kinematics import joint_box
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ._joint_path import Free, PathSearch
-from ._motion import Motion
+from ._motion import Motion, sample_times
 from ._pose_path import Poses, corners, interpolated, lengths, read_poses
 from ._retime import Limit, checked_limits, checked_speed, frame_speeds, resampled, retimed_pieces
 from ._timing import SlowPart, Timing, sampled
@@ -62,9 +62,7 @@ class Followed(NamedTuple):
 
     def sample(self, dt: float) -> Motion:
         """Return the motion at times ``dt`` apart [s], the last of which is the end or just after it."""
-        if not dt > 0.0:
-            raise OsikValueError(f"dt is {dt!r}; it is the positive time between two samples [s]")
-        time = np.arange(int(np.ceil(self.duration / dt - 1e-9)) + 1) * dt
+        time = sample_times(self.duration, dt)
         q, v, a, _ = self.at(time)
         return Motion(*map(jnp.asarray, (time, q, v, a)), joints=tuple(dof_names(self.robot)))
 

@@ -30,7 +30,7 @@ PLACES = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
 """Where limits hold in each cell, by its width."""
 _PIECES = np.array([[0.5, 0.5, 0.0], [-1.0, 1.0, 0.0], [0.5, -1.0, 0.5]])
 """Coefficients of a cell's polynomial, rising powers, by those of a uniform quadratic B-spline."""
-_CUBIC = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
+CUBIC = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0
 """The same of a uniform cubic B-spline."""
 _STENCILS = np.array([[[1.0, x, x**2], [0.0, 1.0, 2.0 * x], [0.0, 0.0, 2.0]] for x in PLACES]) @ _PIECES
 """Value, slope and second derivative of the quadratic B-spline at the places, by its coefficients."""
@@ -64,7 +64,7 @@ def reference(cells: Cells, ramp: Array, count: int) -> tuple[Float[Array, ""], 
     along = cells.at(width * (jnp.arange(count + 3) - 3.0) - 0.5 * spread)[0]
     smooth = _moving_mean(along, spread / width)
     four = jnp.stack([smooth[i : i + count] for i in range(4)], axis=1)
-    return width, (four @ _CUBIC.T.astype(width.dtype)) / width ** jnp.arange(4)
+    return width, (four @ CUBIC.T.astype(width.dtype)) / width ** jnp.arange(4)
 
 
 def _moving_mean(values: Float[Array, " K"], window: Array) -> Float[Array, " K"]:

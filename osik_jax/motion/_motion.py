@@ -102,6 +102,17 @@ class Motion(eqx.Module):
         return table.replace_schema_metadata({"joints": "\n".join(self._names())})
 
 
+def sample_times(duration: float, dt: float) -> Float[np.ndarray, " T"]:
+    """Return times from 0 that are ``dt`` apart [s], the last of which is the end or just after it.
+
+    Raises:
+        ValueError: ``dt`` is not positive.
+    """
+    if not dt > 0.0:
+        raise OsikValueError(f"dt is {dt!r}; it is the positive time between two samples [s]")
+    return np.arange(int(np.ceil(duration / dt - 1e-9)) + 1) * dt
+
+
 def load_motion(path: str | os.PathLike[str]) -> Motion:
     """Return a motion that ``Motion.save`` wrote; from CSV and Parquet of others, velocities may be missing.
 

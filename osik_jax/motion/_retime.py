@@ -135,13 +135,22 @@ def checked_speed(speed: Any) -> Float[Array, ""] | None:
 
 
 def checked_limits(
-    robot: Robot | None, velocity: Limit, acceleration: Limit, jerk: Limit, points: Array | None = None
+    robot: Robot | None,
+    velocity: Limit,
+    acceleration: Limit,
+    jerk: Limit,
+    points: Array | None = None,
+    *,
+    least_time: bool = True,
 ) -> Float[Array, "3 n"]:
-    """Return the limits of all kinds, infinite where there is none; ``points`` (N, n) without a robot."""
+    """Return the limits of all kinds, infinite where there is none; ``points`` (N, n) without a robot.
+
+    A least time needs a limit of acceleration.
+    """
     like = robot.q0[None] if points is None and robot is not None else points
     given = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
     limits = jnp.stack([_limit(robot, kind, value, like) for kind, value in given.items()])
-    _check_limits(limits, robot)
+    _check_limits(limits, robot, least_time)
     return limits
 
 
@@ -181,7 +190,7 @@ def _check_points(points: Array, robot: Robot | None) -> None:
         raise OsikValueError(f"waypoints {first} and {first + 1} are equal; a path has none twice in a row: remove one")
 
 
-def _check_limits(limits: Array, robot: Robot | None) -> None:
+def _check_limits(limits: Array, robot: Robot | None, least_time: bool) -> None:
     seen = concrete(limits)
     if seen is None:
         return
@@ -190,7 +199,7 @@ def _check_limits(limits: Array, robot: Robot | None) -> None:
         if not (row > 0.0).all():
             which = [f"{name} {value:g}" for name, value in zip(names, row, strict=True) if not value > 0.0]
             raise OsikValueError(f"limits of {kind} are positive; these are not: {', '.join(which)}")
-    if not np.isfinite(seen[1]).any():
+    if least_time and not np.isfinite(seen[1]).any():
         raise OsikValueError("there is no limit of acceleration, so no least time: give acceleration=")
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ._cells import Cells
-from ._motion import Motion
+from ._motion import Motion, sample_times
 from ._spline import Spline
 
 _KINDS = "speed", "acceleration", "jerk"
@@ -62,9 +62,7 @@ class Timing(eqx.Module):
 
     def sample(self, dt: float) -> Motion:
         """Return the motion at times ``dt`` apart [s], the last of which is the end or just after it (outside jit)."""
-        if not dt > 0.0:
-            raise OsikValueError(f"dt is {dt!r}; it is the positive time between two samples [s]")
-        time = np.arange(int(np.ceil(float(self.duration) / dt - 1e-9)) + 1) * dt
+        time = sample_times(float(self.duration), dt)
         q, v, a, _ = sampled(self, time)
         return Motion(*map(jnp.asarray, (time, q, v, a)), joints=self.joints)
 

@@ -50,6 +50,16 @@ def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Flo
     return jnp.where(is_far, far, quotient(jnp.where(is_far, 0.0, way), jnp.where(is_far, 1.0, dt)))
 
 
+def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the square root of positive entries; 0 with derivative 0 for others, NaN included.
+
+    XLA may compute an entry twice with different rounding: an entry that is 0 by cancellation is then positive for one
+    of the two conditions alone. So the number under the root of other entries is below rounding, not 1.
+    """
+    positive = a > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, jnp.finfo(a.dtype).eps ** 2)), 0.0)
+
+
 def safe_norm(vector: Float[Numbers, " m"]) -> Float[Numbers, ""]:
     """Return the Euclidean norm without overflow or underflow of squares; its gradient at 0 is 0."""
     size = largest(vector)

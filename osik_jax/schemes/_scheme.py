@@ -17,10 +17,9 @@ from ..limits import LimitRows
 from ..numerics._arguments import as_scalar
 from ..numerics._constants import BELOW_OTHERS, CONSTRAINT_TOL, STANDING_SPEED
 from ..numerics._dense import apply
-from ..numerics._guarded import greatest, quotient, safe_norm
+from ..numerics._guarded import greatest, positive_root, quotient, safe_norm
 from ..numerics._replace import Replaceable
 from ..solvers import Damping, Level, Status
-from ..solvers._level import positive_root
 from ..tasks import TaskRows
 from ..tasks._curvature import fraction_to_damp, near_part, row_sums, share_of_far
 

@@ -31,8 +31,7 @@ from ..numerics._constants import (
     TIE_ROUNDOFF,
 )
 from ..numerics._dense import apply, product
-from ..numerics._guarded import clipped, quotient, safe_norm
-from ._level import positive_root
+from ..numerics._guarded import clipped, positive_root, quotient, safe_norm
 
 
 @runtime_checkable

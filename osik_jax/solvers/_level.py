@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..numerics._arguments import as_floats
 from ..numerics._dense import apply
+from ..numerics._guarded import positive_root
 from ._box import ordered_bounds
 
 
@@ -126,12 +127,6 @@ def are_finite(levels: Sequence[Level]) -> list[Bool[Array, ""]]:
     checks = [jnp.isfinite(level.matrix).all() for level in levels]
     checks += [bounds_exist(level.lower, level.upper) for level in levels]
     return checks + [jnp.isfinite(level.weight).all() for level in levels if level.weight is not None]
-
-
-def positive_root(a: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the square root of positive entries; 0 with derivative 0 for others, NaN included."""
-    positive = a > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, a, 1.0)), 0.0)
 
 
 def _scaled_bound(bound: Float[Array, " m"], root: Float[Array, " m"], none: float) -> Float[Array, " m"]:

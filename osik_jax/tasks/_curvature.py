@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from ..execution._platform import cuda_is_default
 from ..numerics._constants import FARTHEST_ERROR, LEVER_ROUNDOFF, NEAR_ERROR, NEAR_PART, UNHELD_PART
 from ..numerics._dense import short_sum
-from ..numerics._guarded import largest, quotient, safe_norm
+from ..numerics._guarded import largest, positive_root, quotient, safe_norm
 from ._rotation import dot
 
 
@@ -72,8 +72,7 @@ def _paired(pull: Float[Array, "3"], axes: Float[Array, "3 3"], arms: Float[Arra
         (1, 2): x * z * xy - y * z * xx - x * x * yz + x * y * xz,
     }
     squared = sum((1.0 if i == j else 2.0) * entry * arms[i, j] for (i, j), entry in turned.items())
-    positive = squared > 0.0
-    return size * jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    return size * positive_root(jnp.asarray(squared))
 
 
 def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"]) -> Float[Array, ""]:
@@ -133,8 +132,7 @@ def no_curvature(pull: Float[Array, " m"]) -> Float[Array, ""]:
 def levers(weight: Float[Array, " m"], jacobian: Float[Array, "m nv"]) -> Float[Array, " nv"]:
     """Return the length of each dof's weighted column: how much the dof moves the rows; gradient 0 at 0. (nv,)."""
     squared = jnp.sum(weight[:, None] * jacobian**2, axis=0)
-    positive = squared > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    return positive_root(squared)
 
 
 def row_sums(levers: Float[Array, " nv"]) -> Float[Array, " nv"]:

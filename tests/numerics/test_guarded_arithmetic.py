@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
-from osik_jax.numerics._guarded import clipped, greatest, quotient, safe_norm
+from osik_jax.numerics._guarded import clipped, greatest, positive_root, quotient, safe_norm
 
 SIZES = [1e-30, 1e-20, 1e-12, 1.0, 1e12]
 
@@ -37,6 +37,13 @@ def test_a_norm_in_single_precision(size):
     np.testing.assert_allclose(value, 5.0 * size, rtol=1e-6)
     np.testing.assert_allclose(gradient, [0.6, 0.0, -0.8], atol=1e-6)
     np.testing.assert_array_equal(jax.grad(safe_norm)(0.0 * vector), 0.0)
+
+
+def test_a_root_is_continuous_where_its_argument_is_rounded_in_two_ways():
+    a = jnp.array([4.0, 0.0, -1.0, jnp.nan])
+    np.testing.assert_array_equal(positive_root(a), [2.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(positive_root))(a), [0.25, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(jax.vmap(jax.grad(jax.grad(positive_root)))(a), [-1.0 / 32.0, 0.0, 0.0, 0.0])
 
 
 def test_a_clip_between_equal_bounds_has_their_derivative():
