@@ -35,7 +35,7 @@ def draw_placement(found: Any) -> Figure:
     for outline in [] if found.scene is None else _outlines(found.scene):
         place.fill(*outline.T, facecolor="none", edgecolor=_INK, linewidth=1.2)
     place.plot(*found.poses[:, :2].T, ".", color="#c0392b", ms=4, label="poses")
-    (x, y, yaw, height), length = found.best, 0.08 * max(np.ptp(edges[0]), np.ptp(edges[1]))
+    (x, y, yaw, height), length = found.best, 0.08 * float(np.ptp(place.get_xlim()))
     place.plot(x, y, "o", color=_BEST, ms=9, label=f"best base: {found.is_reached.sum()} poses, height {height:.3g} m")
     place.annotate(
         "",
