@@ -132,7 +132,9 @@ def chunk(
             with poses, in the configuration nearest to ``robot.q0``.
         begin: time of the start [s], before the last waypoint; earlier waypoints do not count. Default: ``times[0]``.
         rest: whether the motion comes to rest after the last waypoint (static). False: it ends there, in motion.
-        velocity, acceleration, jerk: limits, as in ``retime``. Default: the robot's speeds and accelerations.
+        velocity: limits of the joints' speeds, as in ``retime``. Default: the robot's.
+        acceleration: limits of accelerations, likewise. Default: the robot's.
+        jerk: limits of jerks, likewise. Default: none.
         smoothing: weight of the squared third differences of the spline's coefficients, > 0; noisy waypoints need more.
         cells: number of the spline's cells (static), 8 or more. Default: one for each waypoint, 16 at least.
 

@@ -107,7 +107,9 @@ def follow(
             quaternions w x y z (N, 4) or rotation matrices (N, 3, 3); or matrices (N, 4, 4).
         free: by frame, its own axis "x", "y" or "z" about which it may turn, such as ``{"tool": "z"}``.
         speed: wanted speed of the first frame [m/s], kept where joints allow it. Default: as fast as possible.
-        velocity, acceleration, jerk: limits as in ``retime``.
+        velocity: limits of the joints' speeds, as in ``retime``.
+        acceleration: limits of accelerations, likewise.
+        jerk: limits of jerks, likewise.
         position_tolerance: largest distance of a frame from its curve [m].
         orientation_tolerance: largest angle [rad].
         q0: configuration to begin near. (n,)
