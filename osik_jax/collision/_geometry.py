@@ -273,7 +273,7 @@ def _different(directions: np.ndarray) -> np.ndarray:
     return directions[~repeats].reshape(-1, 3)
 
 
-def _of_one_length(parts: Sequence[Float[np.ndarray, "n 3"] | Array]) -> Float[np.ndarray, "k n 3"] | Array:
+def _of_one_length(parts: Sequence[Float[np.ndarray, "_ 3"] | Array]) -> Float[np.ndarray, "k n 3"] | Array:
     longest = max(map(len, parts))
     array = jnp if any(isinstance(part, jax.Array) for part in parts) else np
     rows = [np.minimum(np.arange(longest), max(len(part) - 1, 0)) for part in parts]

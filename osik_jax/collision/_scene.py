@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -106,7 +106,7 @@ class Scene(eqx.Module):
     @classmethod
     def from_file(
         cls, path: str | os.PathLike[str], *, capacity: int | None = None, vertex_capacity: int | None = None
-    ) -> Self:
+    ) -> Scene:
         """Read a MuJoCo XML, a URDF, or a scene of MoveIt: ``.yaml``, or the text format ``.scene``.
 
         XML: all shapes that collide, each link or body an object, with joints where they are at the start (0, or
@@ -132,7 +132,7 @@ class Scene(eqx.Module):
         return scene.allow(*allowed) if allowed else scene
 
     @classmethod
-    def stack(cls, scenes: Sequence[Self]) -> Self:
+    def stack(cls, scenes: Sequence[Scene]) -> Scene:
         """Return scenes with a leading axis, with room for the largest of them; ``stack[i]`` is one of them.
 
         Raises:
@@ -151,7 +151,7 @@ class Scene(eqx.Module):
         labels = Labels(tuple(s.labels.names for s in alike), tuple(s.labels.objects for s in alike))
         return _with(made, labels=labels)
 
-    def __getitem__(self, number: int) -> Self:
+    def __getitem__(self, number: int) -> Scene:
         """Return one scene of a stack."""
         if not self.is_stack:
             raise OsikTypeError("this is one scene and no stack of scenes: its shapes are in scene.table")
@@ -169,7 +169,7 @@ class Scene(eqx.Module):
         return self.table.kind.shape[-1]
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> tuple[Any, ...]:
         """Return the names of the shapes, in the order of the rows; in a stack, the names of each scene."""
         return self.labels.names
 
@@ -178,7 +178,7 @@ class Scene(eqx.Module):
             return f"Scene.stack of {self.table.kind.shape[0]} scenes with room for {self.capacity} shapes"
         return f"Scene of {len(self.names)} shapes, room for {self.capacity}: {', '.join(self.names)}"
 
-    def moved(self, name: str, pose: PoseLike) -> Self:
+    def moved(self, name: str, pose: PoseLike) -> Scene:
         """Return the scene with an object somewhere else. Nothing is compiled anew; the pose may be traced.
 
         Args:
@@ -200,7 +200,7 @@ class Scene(eqx.Module):
 
     def attach(
         self, name: str, robot: Robot, frame: str, *, q: ArrayLike | Array | None = None, touch: Sequence[str] = ()
-    ) -> Self:
+    ) -> Scene:
         """Return the scene with an object held by a frame of the robot, so that it moves with the frame.
 
         Args:
@@ -226,7 +226,7 @@ class Scene(eqx.Module):
         own = {part.aliases[0] for part in members(robot, {}) if part.solid and part.body == body}
         return held.allow(*((name, _quoted(link)) for link in sorted(own)), *((name, link) for link in touch))
 
-    def detach(self, name: str, robot: Robot, q: ArrayLike | Array) -> Self:
+    def detach(self, name: str, robot: Robot, q: ArrayLike | Array) -> Scene:
         """Return the scene with a held object in the world, where it is with the robot at q (nq,).
 
         What it may touch stays as it is.
@@ -243,7 +243,7 @@ class Scene(eqx.Module):
         world = self._placed(rows, _after(_body_pose(robot, body, q), self._poses(rows)))
         return _with(world, body=replaced_at(self.body, rows, -1))
 
-    def allow(self, *pairs: tuple[str, str]) -> Self:
+    def allow(self, *pairs: tuple[str, str]) -> Scene:
         """Return the scene with pairs that may touch.
 
         Args:
@@ -293,10 +293,10 @@ class Scene(eqx.Module):
             raise unknown_name("shape", pattern, tuple(dict.fromkeys((*self.labels.objects, *self.names))))
         return rows
 
-    def _poses(self, rows: np.ndarray) -> Pose:
+    def _poses(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.table.position, float)[rows], np.asarray(self.table.rotation, float)[rows]
 
-    def _placed(self, rows: np.ndarray, poses: Pose) -> Self:
+    def _placed(self, rows: np.ndarray, poses: tuple[Any, Any]) -> Scene:
         """Return the scene with other poses of some rows."""
         old = self.table.position, self.table.rotation
         position, rotation = tree_to_jax(
@@ -304,7 +304,7 @@ class Scene(eqx.Module):
         )
         return _with(self, table=self.table._replace(position=position, rotation=rotation))
 
-    def _enlarged(self, room: int, vertices: int, partners: tuple[str, ...]) -> Self:
+    def _enlarged(self, room: int, vertices: int, partners: tuple[str, ...]) -> Scene:
         """Return the scene with more room, and with columns of ``contact`` for all of these partners."""
         more = room - self.capacity
         contact = np.zeros((room, len(partners)), bool)
@@ -409,6 +409,6 @@ def _inverse(pose: Pose) -> Pose:
     return -rotate(pose[1].T, pose[0]), pose[1].T
 
 
-def _after(first: Pose, second: Pose) -> Pose:
+def _after(first: Pose, second: tuple[Any, Any]) -> tuple[Any, Any]:
     """Return poses in the outer frame from those (k, ...) in a frame whose pose is ``first``."""
     return first[0] + rotate(first[1], second[0]), compose(first[1], second[1])

@@ -153,7 +153,7 @@ class CollisionShape(eqx.Module):
         *,
         scale: float = 1.0,
         frame: str | None = None,
-    ) -> tuple[Self, ...]:
+    ) -> tuple[CollisionShape, ...]:
         """Return the convex parts of a triangle mesh; a ``Scene`` takes them as one object.
 
         A mesh that is not convex is split by CoACD (the extra ``meshes``). Without it, its hull is taken.

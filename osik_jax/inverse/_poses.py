@@ -17,6 +17,7 @@ from ..execution._platform import on_host
 from ..kinematics._pose_forms import as_pose, pose_array, pose_parts
 from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import concrete
+from ..numerics._host import Numbers
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ..robot import Robot
 from ._chain_search import Goal
@@ -67,7 +68,7 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
     return Goal(cast(Array, position), cast(Array, rotation)), tuple(rows for _, _, rows in parts.values()), count
 
 
-def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Array, Array, tuple[bool, ...]]:
+def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Numbers, Numbers, tuple[bool, ...]]:
     """Return position, rotation and rows of one pose or of n. (3,) or (n, 3), likewise the rotation."""
     pose = pose_parts(value, dtype, _ACCEPTED, numbers)
     if pose is None:

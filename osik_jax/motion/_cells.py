@@ -44,7 +44,7 @@ class Cells(NamedTuple):
         """Return s and its derivatives by time where s has given values, found by bisection."""
         cell = jnp.clip(jnp.searchsorted(self.path[:, 0], s, side="right") - 1, 0, len(self.width) - 1)
 
-        def halved(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        def halved(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
             middle = 0.5 * (ends[0] + ends[1])
             is_before = cubic_derivatives(self.path[cell], middle)[0] < s
             return jnp.where(is_before, middle, ends[0]), jnp.where(is_before, ends[1], middle)

@@ -81,7 +81,7 @@ def _feasible(width: Array, rows: _Rows) -> Float[Array, " K"]:
 def _backward(width: Array, rows: _Rows, largest: Float[Array, " K"]) -> Float[Array, " K1"]:
     """Return the largest b at each grid point from which rest at the end can be reached."""
 
-    def step(ahead: Array, cell: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    def step(ahead: Array, cell: tuple[Array, _Rows, Array]) -> tuple[Array, Array]:
         twice, (p, r, a), most = cell
         here = jnp.minimum(most, _bound(p - twice * r, p * ahead + twice * a).min())
         return here, here
@@ -94,7 +94,7 @@ def _backward(width: Array, rows: _Rows, largest: Float[Array, " K"]) -> Float[A
 def _forward(width: Array, rows: _Rows, reachable: Float[Array, " K1"]) -> Float[Array, " K1"]:
     """Return b at the grid points where each cell has the largest path acceleration that is allowed."""
 
-    def step(b: Array, cell: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    def step(b: Array, cell: tuple[Array, _Rows, Array]) -> tuple[Array, Array]:
         twice, (p, r, a), ahead = cell
         most = ((a - r * b) / jnp.maximum(p, _TINY)).min()
         b = jnp.clip(b + twice * most, 0.0, ahead)

@@ -22,7 +22,7 @@ from ._least_time import least_time
 from ._spline import Spline, chord_lengths, cubic_derivatives, spline_through
 from ._timing import Timing, by_progress
 
-Limit = Float[ArrayLike, " n"] | Mapping[str, float] | float | None
+Limit = ArrayLike | Mapping[str, float] | None
 _CELLS, _FEWEST = 400, 4
 _TINY = 1e-30
 _CHECKED = 5, 33
