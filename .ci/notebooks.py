@@ -25,7 +25,7 @@ _SCRIPT = re.compile(
 )
 """Scripts from elsewhere and for them: require.js, MathJax, and a module that loads Mermaid's diagrams."""
 _ELSEWHERE = re.compile(r'<(?:script|link|img|iframe)\b[^>]*\b(?:src|href)="https?://[^"]*|@import [^;]*https?://[^;]*')
-"""What a browser would fetch from another host."""
+"""Pattern of links that a browser would fetch from another host."""
 
 
 class _Page(HTMLExporter):

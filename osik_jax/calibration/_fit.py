@@ -27,7 +27,7 @@ _SHRINK, _GROW = 0.1, 10.0
 
 
 class Loss(NamedTuple):
-    """How readings are weighted.
+    """Weights of readings by their residuals.
 
     Attributes:
         name: one of ``LOSSES``.

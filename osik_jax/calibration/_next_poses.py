@@ -1,4 +1,4 @@
-"""Which configurations to measure next."""
+"""Choice of the configurations to measure next."""
 
 from __future__ import annotations
 

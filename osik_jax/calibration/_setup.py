@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..kinematics import Kinematics, forward_kinematics
-from ..kinematics._rigid import compose, rotate
+from ..kinematics._rigid import compose_poses
 from ..numerics._arguments import as_vector, check_finite
 from ..numerics._rotations import exact_rotation
 from ..robot import Robot
@@ -83,10 +83,10 @@ class Setup(eqx.Module):
 
     def _pose(self, kinematics: Kinematics, name: str) -> tuple[Array, Array]:
         if name not in self.names:
-            return _composed((self.position[0], self.rotation[0]), kinematics.frame_pose(self.robot, name))
+            return compose_poses((self.position[0], self.rotation[0]), kinematics.frame_pose(self.robot, name))
         own = self.names.index(name)
         pose, parent = (self.position[own], self.rotation[own]), self.parents[own]
-        return pose if parent is None else _composed(self._pose(kinematics, parent), pose)
+        return pose if parent is None else compose_poses(self._pose(kinematics, parent), pose)
 
     def frame(self, name: str) -> FixedFrame:
         """Return a fixed frame as it is here."""
@@ -94,10 +94,6 @@ class Setup(eqx.Module):
         frame = FixedFrame(self.parents[own])
         pose = self.position[..., own, :], self.rotation[..., own, :, :]
         return eqx.tree_at(lambda f: (f.position, f.rotation), frame, pose)
-
-
-def _composed(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:
-    return first[0] + rotate(first[1], second[0]), compose(first[1], second[1])
 
 
 def make_setup(robot: Robot, frames: Mapping[str, FixedFrame], base: FixedFrame | None) -> Setup:

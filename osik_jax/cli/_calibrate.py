@@ -38,7 +38,7 @@ class Calibrate:
     loss: Literal["squared", "huber", "cauchy", "geman_mcclure"] = "squared"
     """With outliers: geman_mcclure."""
     noise: Literal["given", "estimated"] = "given"
-    """Whether deviations follow from --sigma or from the residuals."""
+    """Source of the deviations: --sigma, or the residuals."""
     other: str | None = None
     """The other frame of distances, the plane of heights, the camera of pixels."""
     intrinsics: tuple[float, float, float, float] | None = None

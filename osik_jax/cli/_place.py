@@ -33,7 +33,7 @@ class Place:
     x: tuple[float, float, int]
     """First and last coordinate of the bases [m], and how many: -1 1 11."""
     y: tuple[float, float, int]
-    """Likewise."""
+    """First and last coordinate of the bases [m], and how many."""
     yaw: int = 8
     """Number of rotations of the base about the vertical."""
     height: float = 0.0

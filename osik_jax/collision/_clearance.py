@@ -1,4 +1,4 @@
-"""Whether configurations are free, and the distances of their nearest pairs."""
+"""Distances of the nearest pairs of shapes at configurations, and whether these are free."""
 
 from __future__ import annotations
 

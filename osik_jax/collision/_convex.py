@@ -19,7 +19,7 @@ from ._table import ShapeKind, ShapeTable
 NO_VERTICES = np.zeros((0, 3))
 
 _HALVINGS = 3
-"""Of the polyhedron of 642 corners around an ellipsoid, which sticks out by 0.5 %."""
+"""Halvings of the edges of an icosahedron: its 642 corners around an ellipsoid stick out by 0.5 %."""
 
 _KINDS = {
     int(mujoco.mjtGeom.mjGEOM_PLANE): ShapeKind.HALF_SPACE,
@@ -60,6 +60,13 @@ def shape_table(shapes: Sequence[ConvexShape]) -> ShapeTable:
         count=counts,
         vertices=np.concatenate([NO_VERTICES, *(shape.vertices for shape in shapes)]),
     )
+
+
+def table_shapes(table: ShapeTable) -> list[ConvexShape]:
+    """Return the rows of a table of numbers that are known."""
+    kind, size, position, rotation, first, count, vertices = map(np.asarray, table)
+    own = [vertices[start : start + number] for start, number in zip(first, count, strict=True)]
+    return [*map(ConvexShape, map(ShapeKind, kind), size, position, rotation, own)]
 
 
 def geom_shape(robot: Robot, number: int) -> ConvexShape:

@@ -18,6 +18,7 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._tree import KinematicTree
+from ._convex import bounding_ball, table_shapes
 from ._scene import Scene
 from ._table import RobotShapes, ShapeKind, ShapeTable
 
@@ -89,7 +90,7 @@ def core_robot(
         shapes.world,
         shapes.pairs,
     ]
-    centers, bounds = _bounds(table)
+    centers, bounds = zip(*map(bounding_ball, table_shapes(table)), strict=True)
     numbers = [factor, robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
     numbers += [
         robot.joint_position,
@@ -119,23 +120,6 @@ def _packed_vertices(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
         first[k], end = end, end + len(own)
         parts.append(own.T.ravel())
     return first, np.concatenate(parts)
-
-
-def _bounds(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
-    """Return a ball around each shape in its body: centre (k, 3) and radius (k,)."""
-    centers, radii = np.array(table.position, float), np.linalg.norm(table.size, axis=1)
-    for k, kind in enumerate(table.kind):
-        radius, half = table.size[k, 0], table.size[k, 1]
-        if kind == ShapeKind.HULL:
-            own = np.asarray(table.vertices[table.first[k] : table.first[k] + table.count[k]])
-            middle = 0.5 * (own.min(0) + own.max(0))
-            centers[k] += np.asarray(table.rotation[k]) @ middle
-            radii[k] = np.linalg.norm(own - middle, axis=1).max() + radius
-        elif kind in (ShapeKind.SPHERE, ShapeKind.CAPSULE):
-            radii[k] = radius + half
-        elif kind == ShapeKind.HALF_SPACE:
-            radii[k] = np.inf
-    return centers, radii
 
 
 def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..kinematics import Kinematics
 from ..kinematics._forward import independent_columns
-from ..kinematics._rigid import compose, cross, rotate
+from ..kinematics._rigid import compose_poses, cross
 from ..robot import Robot
 from ..robot._tree import KinematicTree, cached_arrays
 from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
@@ -111,16 +111,12 @@ def place(scene: PairLayout, robot: Robot, kinematics: Kinematics, added: Placed
     """Return the scene's shapes in the world; ``added`` has the poses of the added shapes, each in its frame."""
     own, frames = np.asarray(scene.geoms, int), np.asarray(scene.frames, int)
     robots = Placed(robot.geom_position[own], robot.geom_rotation[own], robot.geom_size[own])
-    turn = robot.frame_rotation[frames]
-    others = Placed(
-        robot.frame_position[frames] + rotate(turn, added.position), compose(turn, added.rotation), added.size
-    )
+    in_frames = robot.frame_position[frames], robot.frame_rotation[frames]
+    others = Placed(*compose_poses(in_frames, (added.position, added.rotation)), added.size)
     local = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), robots, others)
     bodies = np.asarray(scene.bodies, int)
-    turn = kinematics.body_rotation[bodies]
-    return Placed(
-        kinematics.body_position[bodies] + rotate(turn, local.position), compose(turn, local.rotation), local.size
-    )
+    placed = kinematics.body_position[bodies], kinematics.body_rotation[bodies]
+    return Placed(*compose_poses(placed, (local.position, local.rotation)), local.size)
 
 
 def nearest(scene: PairLayout, placed: Placed, hulls: UnitCore | None) -> Nearest:

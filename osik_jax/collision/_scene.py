@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..kinematics._home import kinematics_on_host
 from ..kinematics._pose_forms import Pose, PoseLike, as_pose
-from ..kinematics._rigid import compose, rotate
+from ..kinematics._rigid import compose, compose_poses, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
@@ -222,7 +222,9 @@ class Scene(eqx.Module):
             raise OsikValueError(f"{name!r} is held already; detach it first")
         body = robot.tree.frame_bodies[robot.tree.frame(frame)]
         hold = _frame_in_body(robot, frame) if q is None else _inverse(_body_pose(robot, body, q))
-        held = _with(self._placed(rows, _after(hold, self._poses(rows))), body=replaced_at(self.body, rows, body))
+        held = _with(
+            self._placed(rows, compose_poses(hold, self._poses(rows))), body=replaced_at(self.body, rows, body)
+        )
         own = {part.aliases[0] for part in members(robot, {}) if part.solid and part.body == body}
         return held.allow(*((name, _quoted(link)) for link in sorted(own)), *((name, link) for link in touch))
 
@@ -240,7 +242,7 @@ class Scene(eqx.Module):
         body = int(np.asarray(self.body)[rows[0]])
         if body < 0:
             raise OsikValueError(f"no body holds {name!r}, so it cannot be detached")
-        world = self._placed(rows, _after(_body_pose(robot, body, q), self._poses(rows)))
+        world = self._placed(rows, compose_poses(_body_pose(robot, body, q), self._poses(rows)))
         return _with(world, body=replaced_at(self.body, rows, -1))
 
     def allow(self, *pairs: tuple[str, str]) -> Scene:
@@ -407,8 +409,3 @@ def _body_pose(robot: Robot, body: int, q: Any) -> Pose:
 
 def _inverse(pose: Pose) -> Pose:
     return -rotate(pose[1].T, pose[0]), pose[1].T
-
-
-def _after(first: Pose, second: tuple[Any, Any]) -> tuple[Any, Any]:
-    """Return poses in the outer frame from those (k, ...) in a frame whose pose is ``first``."""
-    return first[0] + rotate(first[1], second[0]), compose(first[1], second[1])

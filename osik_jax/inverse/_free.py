@@ -32,7 +32,7 @@ SEEDS = 256
 
 
 class Obstacles(NamedTuple):
-    """What an answer may not touch.
+    """The robot's shapes and the obstacles that a search keeps apart.
 
     Attributes:
         route: the frames.

@@ -52,7 +52,7 @@ class Whole(NamedTuple):
 
 
 class Around(NamedTuple):
-    """What a robot may not touch.
+    """Arrays of the robot's shapes and of the obstacles for the core.
 
     Attributes:
         robot: its shapes.

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from ..execution._rules import custom_jvp
 from ..numerics._host import Numbers, module_of
 from ..robot._tree import KinematicTree
-from ._rigid import compose, cross, rotate
+from ._rigid import compose, compose_poses, cross, rotate
 
 Poses = tuple[Float[Numbers, "nbody 3"], Float[Numbers, "nbody 3 3"]]
 
@@ -79,8 +79,7 @@ def _one_by_one(position: Array, rotation: Array, rounds: Array) -> Poses:
 def _doubled(poses: Poses, above: Numbers) -> Poses:
     """Return the poses of one round: each relative to an ancestor twice as far above."""
     position, rotation = poses
-    turn = rotation[above]
-    return position[above] + rotate(turn, position), compose(turn, rotation)
+    return compose_poses((position[above], rotation[above]), poses)
 
 
 def _axis(skew: Float[Array, "... 3 3"]) -> Float[Array, "... 3"]:

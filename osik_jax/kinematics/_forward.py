@@ -28,7 +28,7 @@ from ..robot.loading._mjmodel import LEAST_MASS
 from . import _kernels
 from ._composition import world_poses
 from ._joints import dof_kinds, joint_transforms
-from ._rigid import compose, cross, rotate
+from ._rigid import compose_poses, cross, rotate
 
 Moving = tuple[Float[Array, "k 3"], Float[Array, "k 3 3"], Float[Array, "k 6 nv"]]
 
@@ -100,8 +100,7 @@ def _place_frames(
 ) -> tuple[Float[Numbers, "k 3"], Float[Numbers, "k 3 3"]]:
     ids = np.array(frames, int)
     bodies = np.asarray(tree.frame_bodies, int)[ids]
-    rotations = rotation[bodies]
-    return position[bodies] + rotate(rotations, offset[ids]), compose(rotations, turn[ids])
+    return compose_poses((position[bodies], rotation[bodies]), (offset[ids], turn[ids]))
 
 
 _frame_poses = jax.jit(_place_frames, static_argnums=(0, 1), inline=True)

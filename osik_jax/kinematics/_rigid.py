@@ -43,6 +43,14 @@ def compose(a: Float[Numbers, "... 3 3"], b: Float[Numbers, "... 3 3"]) -> Float
     return x + y + z
 
 
+def compose_poses(
+    first: tuple[Float[Numbers, "... 3"], Float[Numbers, "... 3 3"]],
+    second: tuple[Float[Numbers, "... 3"], Float[Numbers, "... 3 3"]],
+) -> tuple[Float[Numbers, "... 3"], Float[Numbers, "... 3 3"]]:
+    """Return poses in the outer frame from ``second``, those in a frame whose pose is ``first``."""
+    return first[0] + rotate(first[1], second[0]), compose(first[1], second[1])
+
+
 def cross(a: Float[Numbers, "..."], b: Float[Numbers, "..."], *, along: int = -1) -> Float[Numbers, "..."]:
     """Return a x b, along an axis of length 3."""
     ax, ay, az = (jax.lax.index_in_dim(a, i, along, keepdims=False) for i in range(3))

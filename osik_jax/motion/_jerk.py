@@ -27,7 +27,7 @@ _LEAST_GAP = {"float32": 1e-3, "float64": 1e-5}
 _MOST = 4.0
 """Largest squared rate, a bound on b where the reference stands still: it is hardly slower than the optimum."""
 PLACES = np.array([0.0, 1.0, 2.0, 3.0]) / 3.0
-"""Where limits hold in each cell, by its width."""
+"""Places in each cell at which limits are kept, as shares of its width."""
 _PIECES = np.array([[0.5, 0.5, 0.0], [-1.0, 1.0, 0.0], [0.5, -1.0, 0.5]])
 """Coefficients of a cell's polynomial, rising powers, by those of a uniform quadratic B-spline."""
 CUBIC = np.array([[1.0, 4.0, 1.0, 0.0], [-3.0, 0.0, 3.0, 0.0], [3.0, -6.0, 3.0, 0.0], [-1.0, 3.0, -3.0, 1.0]]) / 6.0

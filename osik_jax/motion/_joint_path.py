@@ -30,7 +30,7 @@ _JUMP = 0.5
 """Two neighbours that are farther apart are no continuous path [rad or m]."""
 
 Free = Mapping[str, str]
-"""By frame, its own axis about which it may turn."""
+"""Axis of each frame about which it may turn, by the frame's name."""
 
 
 @partial(jax.jit, static_argnames=("names", "axes"))

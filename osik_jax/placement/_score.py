@@ -21,7 +21,7 @@ _NUMBERS = 8_000_000
 
 
 class Task(NamedTuple):
-    """What a base is judged by.
+    """Poses, obstacles and settings by which bases are compared.
 
     Attributes:
         robot: the robot.
