@@ -23,11 +23,11 @@ def used_memory(monkeypatch: pytest.MonkeyPatch, left: float) -> Iterator[None]:
     """
     ffi_call = jax.ffi.ffi_call
 
-    def call(name: str, shapes: list[jax.ShapeDtypeStruct]) -> Callable[..., Sequence[Any]]:
+    def call(name: str, shapes: list[jax.ShapeDtypeStruct], **options: Any) -> Callable[..., Sequence[Any]]:
         def on_used_memory(*inputs: Any) -> Sequence[Any]:
             aliases = {len(inputs) + k: k for k in range(len(shapes))}
             used = (jnp.full(s.shape, left if s.dtype == jnp.float64 else 0x55555555, s.dtype) for s in shapes)
-            return ffi_call(name, shapes, input_output_aliases=aliases)(*inputs, *used)
+            return ffi_call(name, shapes, input_output_aliases=aliases, **options)(*inputs, *used)
 
         return on_used_memory
 
