@@ -223,3 +223,47 @@ def gaps_between(first: ShapeTable, second: ShapeTable) -> Gaps:
     out = _library.call("shape_gaps", [((len(integers), 10), float)], *(integers, numbers, np.concatenate(vertices)))[0]
     pair = jnp.arange(len(integers))[:, None].repeat(2, 1)
     return Gaps(out[:, 0], out[:, 1:7].reshape(-1, 2, 3), out[:, 7:], pair)
+
+
+class Ways(NamedTuple):
+    """Ways around obstacles; see ``core/way_around.hpp``.
+
+    Attributes:
+        vertices: of the lines; the first ones count. (lanes, longest, n)
+        radii: length of each line that the round corner at a vertex takes. (lanes, longest)
+        labels: status, number of the goal, number of vertices, states that were tried, and the two shapes that touch.
+            (lanes, 6)
+    """
+
+    vertices: Float[Array, "lanes longest n"]
+    radii: Float[Array, "lanes longest"]
+    labels: Int[Array, "lanes 6"]
+
+
+def ways(
+    starts: Float[Array, "lanes nq"],
+    goals: Float[Array, "lanes goals nq"],
+    robot: CoreRobot,
+    options: Int[Array, " k"],
+    ranges: Float[Array, " m"],
+    scene: CoreScene,
+    clearance: Float[Array, " 1"],
+    *,
+    longest: int,
+) -> Ways:
+    """Return ways between configurations.
+
+    Args:
+        starts, goals: configurations; any goal will do.
+        robot: its shapes.
+        options: number of entries of q that move, states to try, key, and those entries. (3 + n,)
+        ranges: lowest and highest value of each of them, and the longest step of a tree by the distance of the two
+            corners. (2 n + 1,)
+        scene: obstacles, one scene or one for each start.
+        clearance: distance that all pairs keep [m].
+        longest: number of vertices at most (static).
+    """
+    lanes, n = len(starts), (len(ranges) - 1) // 2
+    shapes = [((lanes, longest, n), float), ((lanes, longest), float), ((lanes, 6), int)]
+    given = starts, goals, robot.integers, robot.numbers, options, ranges, *scene, clearance
+    return Ways(*_library.call("ways", shapes, *given))

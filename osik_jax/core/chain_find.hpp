@@ -2,9 +2,8 @@
 // run_pool (inverse/_pool.py), explored (inverse/_run.py) and answer (inverse/_chain_problem.py). Arguments and results
 // as in inverse/_whole.py. With a scene, solutions that touch something are no solutions (freedom.hpp).
 #pragma once
-#include <atomic>
 #include <limits>
-#include <thread>
+#include <memory>
 #include <vector>
 
 #include "chain_search.hpp"
@@ -278,23 +277,14 @@ inline void find_chain(const xla::Call& call) {
 // The same in scenes, by all processor cores where there are many targets.
 inline void find_free(const xla::Call& call) {
   constexpr int LEAST = 8;  // targets of a thread
-  const int targets = call.size(0, 0), most = std::max(1, int(std::thread::hardware_concurrency()));
   const ShapedRobot<double> robot(call.in<int>(5), call.in<double>(6));
-  std::atomic<int> next{0};
-  std::atomic<bool> has_failed{false};
-  auto work = [&] {
-    try {
-      Freedom freedom(robot);
-      ChainFinder finder(call, &freedom);
-      for (int target = next++; target < targets; target = next++) finder.solve(call, target);
-    } catch (const std::exception&) {  // no memory
-      has_failed = true;
-    }
+  struct Worker {
+    Freedom freedom;
+    ChainFinder finder;
+    Worker(const xla::Call& call, const ShapedRobot<double>& robot) : freedom(robot), finder(call, &freedom) {}
   };
-  std::vector<std::thread> others;
-  for (int k = 1; k < std::min(most, targets / LEAST); ++k) others.emplace_back(work);
-  work();
-  for (auto& other : others) other.join();
-  xla::Call::require(!has_failed, "the core has no memory for a search in a scene");
+  in_threads(call.size(0, 0), LEAST, [&] {
+    return [&call, own = std::make_unique<Worker>(call, robot)](int target) { own->finder.solve(call, target); };
+  });
 }
 }  // namespace osik

@@ -130,7 +130,7 @@ template <class Real> class Collision {
     const int start = is_moving ? fixed : 0, end = is_moving ? int(pairs.size()) : fixed;
     for (int k = start; k < end; ++k) {
       const Pair p = pairs[k];
-      if (lower_bound(p) >= least || is_apart(world[p.i], world[p.j], least)) continue;
+      if (keeps(p.i, p.j, least)) continue;
       std::rotate(pairs.begin() + start, pairs.begin() + k, pairs.begin() + k + 1);  // first the next time
       return {p.i, p.j, {}};
     }
@@ -158,6 +158,11 @@ template <class Real> class Collision {
       if (f(p.i, p.j)) return true;
     return false;
   }
+  // Whether a pair is at least `least` >= 0 apart.
+  bool keeps(int i, int j, Real least) const { return lower_bound({i, j}) >= least || is_apart(world[i], world[j], least); }
+  int carrier_of(int shape) const { return carrier[shape]; }
+  V own_center(int shape) const { return local_center[shape]; }  // of its bounding sphere, in its body's axes
+  Real own_radius(int shape) const { return bound[shape]; }
   Gap<Real> gap_of(int i, int j) const { return gap_between(world[i], world[j]); }
   // Distance from a point to the farthest point of a shape, or more.
   Real reach(int shape, V from) const { return sqrt(inner(center[shape] - from, center[shape] - from)) + bound[shape]; }

@@ -1,6 +1,9 @@
 // Whether solutions of a search are free, which of them are the least wrong, and distances of many configurations.
 // Arguments and results as in collision/_core.py.
 #pragma once
+#include <atomic>
+#include <thread>
+
 #include "collision.hpp"
 #include "xla.hpp"
 
@@ -12,6 +15,26 @@ constexpr double TOUCH = 1e-6;  // solutions keep so much more, against rounding
 inline SceneRows<double> scene_of(const xla::Call& call, int k, int shapes, int target) {
   const size_t row = call.size(k, 0) > 1 ? target : 0;
   return {call.in<int>(k) + call.size(k, 1) * row, call.in<double>(k + 1) + call.size(k + 1, 1) * row, shapes};
+}
+
+// Call a worker that `make` makes with each number below `count`, in threads that take `least` of them or more.
+template <class Make> void in_threads(int count, int least, Make make) {
+  const int most = std::max(1, int(std::thread::hardware_concurrency()));
+  std::atomic<int> next{0};
+  std::atomic<bool> has_failed{false};
+  auto work = [&] {
+    try {
+      auto worker = make();
+      for (int k = next++; k < count; k = next++) worker(k);
+    } catch (const std::exception&) {  // no memory
+      has_failed = true;
+    }
+  };
+  std::vector<std::thread> others;
+  for (int k = 1; k < std::min(most, count / least); ++k) others.emplace_back(work);
+  work();
+  for (auto& other : others) other.join();
+  xla::Call::require(!has_failed, "the core has no memory for a search in a scene");
 }
 
 class Freedom {

@@ -2,6 +2,7 @@
 #include <vector>
 
 #include "chain_find.hpp"
+#include "way_around.hpp"
 #include "xla.hpp"
 
 using namespace osik;
@@ -31,6 +32,7 @@ void* osik_free_find(xla::CallFrame* frame) { return xla::handle<find_free>(fram
 void* osik_are_free(xla::CallFrame* frame) { return xla::handle<find_free_ones>(frame); }
 void* osik_clearances(xla::CallFrame* frame) { return xla::handle<find_clearances>(frame); }
 void* osik_shape_gaps(xla::CallFrame* frame) { return xla::handle<find_gaps>(frame); }
+void* osik_ways(xla::CallFrame* frame) { return xla::handle<find_ways>(frame); }
 void* osik_chain_find(xla::CallFrame* frame) { return xla::handle<find_chain>(frame); }
 void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Robots>>>(frame); }
 void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Robots>>>(frame); }

@@ -2,6 +2,8 @@
 
 from ._chunk import Chunk as Chunk
 from ._chunk import chunk as chunk
+from ._connect import Way as Way
+from ._connect import connect as connect
 from ._follow import Followed as Followed
 from ._follow import follow as follow
 from ._motion import Motion as Motion

@@ -30,7 +30,7 @@ _CHECKED = 5, 33
 
 
 def retime(
-    waypoints: Float[ArrayLike, "N n"],
+    waypoints: Float[ArrayLike, "N n"] | Spline,
     *,
     velocity: Limit = None,
     acceleration: Limit = None,
@@ -52,7 +52,8 @@ def retime(
     leave out how ``stretch`` and the grid change.
 
     Args:
-        waypoints: positions of the joints [rad or m]; no two neighbours are equal. (N, n)
+        waypoints: positions of the joints [rad or m]; no two neighbours are equal. (N, n). Or a path, such as
+            ``Way.path``.
         velocity: limits of the joints' speeds: an array (n,), one number for all joints, or with ``robot`` a mapping
             from joint names or globs. Default: those of ``robot``; none without one.
         acceleration: limits of accelerations, in the same way. They have to exist.
@@ -70,7 +71,8 @@ def retime(
             a robot with joints that are no hinges or slides.
         KeyError: no such joint or frame.
     """
-    points = as_floats(waypoints)
+    given = waypoints if isinstance(waypoints, Spline) else as_floats(waypoints)
+    points = given.coefficients[:, 0] if isinstance(given, Spline) else given
     _check_points(points, robot)
     limits = checked_limits(robot, velocity, acceleration, jerk, points)
     if (frame is None) != (speed is None) or (frame is not None and robot is None):
@@ -78,7 +80,7 @@ def retime(
     wanted = checked_speed(speed)
     count = _count(points) if cells is None else cells
     smooth = jerk is not None
-    path, progress, stretch, duration = _retimed(points, limits, robot, wanted, frame=frame, count=count, smooth=smooth)
+    path, progress, stretch, duration = _retimed(given, limits, robot, wanted, frame=frame, count=count, smooth=smooth)
     joints = () if robot is None else tuple(dof_names(robot))
     return Timing(duration, path, progress, limits, stretch, wanted, joints)
 
@@ -174,11 +176,10 @@ def _limit(robot: Robot | None, kind: str, value: Any, points: Any) -> Float[Arr
 def _check_points(points: Array, robot: Robot | None) -> None:
     if points.ndim != 2 or len(points) < 2:
         raise OsikValueError(f"waypoints have shape {points.shape}; they are two or more configurations, (N, n)")
-    if robot is not None and not (robot.nq == robot.nv == points.shape[1]):
-        raise OsikValueError(
-            f"waypoints have {points.shape[1]} columns, and the robot {robot.nq} configuration entries and {robot.nv} "
-            "velocities; a path is timed for hinges and slides alone: lock the other joints"
-        )
+    if robot is not None:
+        check_scalar_joints(robot)
+        if robot.nq != points.shape[1]:
+            raise OsikValueError(f"waypoints have {points.shape[1]} columns, and the robot {robot.nq} joints")
     seen = concrete(points)
     if seen is None:
         return
@@ -188,6 +189,15 @@ def _check_points(points: Array, robot: Robot | None) -> None:
     if equal.any():
         first = int(equal.argmax())
         raise OsikValueError(f"waypoints {first} and {first + 1} are equal; a path has none twice in a row: remove one")
+
+
+def check_scalar_joints(robot: Robot) -> None:
+    """Raise ValueError unless all joints are hinges and slides."""
+    if robot.nq != robot.nv:
+        raise OsikValueError(
+            f"the robot has {robot.nq} configuration entries and {robot.nv} velocities; a path is one of hinges and slides "
+            "alone: lock the other joints (locked_joints=)"
+        )
 
 
 def _check_limits(limits: Array, robot: Robot | None, least_time: bool) -> None:
@@ -205,7 +215,7 @@ def _check_limits(limits: Array, robot: Robot | None, least_time: bool) -> None:
 
 @partial(jax.jit, static_argnames=("frame", "count", "smooth", "uniform"))
 def _retimed(
-    points: Float[Array, "N n"],
+    points: Float[Array, "N n"] | Spline,
     limits: Float[Array, "3 n"],
     robot: Robot | None,
     wanted: Array | None,
@@ -216,7 +226,7 @@ def _retimed(
     uniform: bool = False,
 ) -> tuple[Spline, Cells, Array, Array]:
     """Return the spline, the progress, the factor that keeps limits between grid points, and the duration."""
-    path = _spline(points, uniform)
+    path = points if isinstance(points, Spline) else _spline(points, uniform)
 
     def cap(s: Array, first: Array) -> Array:
         """Return the largest squared path speed by the wanted speed of the frame."""
@@ -226,7 +236,7 @@ def _retimed(
         rate = jax.vmap(lambda q, move: jax.jvp(lambda q: _origin(own, q, name), (q,), (move,))[1])
         return wanted**2 / jnp.maximum((rate(path.derivatives(s)[0], first) ** 2).sum(axis=1), _TINY)
 
-    grid = _grid(path.knots, -(-count // (len(points) - 1)))
+    grid = _grid(path.knots, -(-count // (len(path.knots) - 1)))
     _, first, second, _ = path.derivatives(grid)
     by_joints = jnp.min(limits[0] / jnp.maximum(jnp.abs(first), _TINY), axis=1) ** 2
     progress = least_time(grid, first, second, jnp.minimum(by_joints, cap(grid, first)), limits[1])
