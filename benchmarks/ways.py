@@ -6,8 +6,8 @@
 ROBOT and FILE.npz are those of ``benchmarks.collision_free``; FILE.npz also has a ``start`` for each problem. WAYS.npz
 gets ``set`` and ``index`` of each problem, ``found``, ``seconds`` of the call from Python, ``duration`` of the motion
 under the limits of speed and 5 rad/s^2 [s], and ``q``, states of all ways one after another in the order of the file's
-joints, ``states`` of each, so near that no joint moves a point 1 m away by more than ``--dense`` [m]. Joints whose start
-or goal is out of range have their range widened to it.
+joints, ``states`` of each, so near that no joint moves a point 1 m away by more than ``--dense`` [m]. Joints whose
+start or goal is out of range have their range widened to it.
 """
 
 from __future__ import annotations
@@ -68,16 +68,17 @@ def main() -> None:
     for name in counts:
         which = np.array([problem.set == name for problem, _ in chosen])
         if which.any():
-            print(f"{name}: {text(found[which], seconds[which])}")
-    print(f"all: {text(found, seconds)}")
+            print(f"{name}: {text([way for way, own in zip(ways, which, strict=True) if own], seconds[which])}")
+    print(f"all: {text(ways, seconds)}")
 
 
-def text(found: np.ndarray, seconds: np.ndarray) -> str:
+def text(ways: list[Way], seconds: np.ndarray) -> str:
     """Return the row of a table."""
-    ms = 1e3 * seconds
+    ms, found = 1e3 * seconds, sum(way.found for way in ways)
+    closed = sum("the clearance" in way.problem for way in ways)
     return (
-        f"{len(found)} problems, found {100 * found.mean():.1f} %; a call: median {np.median(ms):.1f} ms, "
-        f"95 % {np.quantile(ms, 0.95):.1f} ms, longest {ms.max():.0f} ms"
+        f"{len(ways)} problems, {closed} whose start or goal touches, found {found}; "
+        f"a call: median {np.median(ms):.1f} ms, 95 % {np.quantile(ms, 0.95):.1f} ms, longest {ms.max():.0f} ms"
     )
 
 
@@ -101,12 +102,12 @@ def connected(own: Setting, problems: list[Problem], ends: np.ndarray, given: An
         return way, time.perf_counter() - start
 
     if given.batch:
-        call = q[:, 0], q[:, 1], osik.Scene.stack([problem.scene for problem in problems])
-        first, (ways, seconds) = timed(*call)[1], timed(*call)
+        scenes = osik.Scene.stack([problem.scene for problem in problems])
+        first, (ways, seconds) = timed(q[:, 0], q[:, 1], scenes)[1], timed(q[:, 0], q[:, 1], scenes)
         print(f"{len(ways)} problems in one call: {seconds:.3f} s; first call {first:.2f} s")
         return ways, np.full(len(ways), seconds / len(ways))
-    print(f"first call {timed(*q[0], problems[0].scene)[1]:.2f} s")
-    ways, seconds = zip(*(timed(*two, p.scene) for two, p in zip(q, problems, strict=True)), strict=True)
+    print(f"first call {timed(q[0, 0], q[0, 1], problems[0].scene)[1]:.2f} s")
+    ways, seconds = zip(*(timed(two[0], two[1], p.scene) for two, p in zip(q, problems, strict=True)), strict=True)
     return list(ways), np.array(seconds)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from ..collision import Scene, robot_shapes
 from ..collision._clearance import shape_names
 from ..collision._core import check_length, check_scene, core_robot, core_scene, require_core, ways
 from ..collision._robot_shapes import Given
+from ..numerics._arguments import check_count
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dofs_of, select_all
@@ -80,8 +81,8 @@ class Way(NamedTuple):
         """
         if self.path is None:
             raise OsikValueError(self.problem or "the start is a goal: there is nothing to time")
-        limits: dict[str, Limit] = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
-        return retime(self.path, robot=self.robot, frame=frame, speed=speed, **limits)
+        by_frame: dict[str, Any] = {"robot": self.robot, "frame": frame, "speed": speed}
+        return retime(self.path, velocity=velocity, acceleration=acceleration, jerk=jerk, **by_frame)
 
 
 def connect(
@@ -136,6 +137,7 @@ def connect(
     _check_held(robot, starts, goals, moving)
     if not (np.isfinite(clearance) and clearance >= 0.0):
         raise OsikValueError(f"clearance is {clearance!r}; it is one number, 0 or more, in metres")
+    check_count("states", states)
     shapes = robot_shapes(robot, srdf)
     around = core_scene(scene, shapes)
     check_length(around, len(starts), "starts")
@@ -150,7 +152,9 @@ def connect(
         problem = _outside(robot, starts[lane], goals[lane])
         if status != _FOUND and not problem:
             pair = shape_names(*names, np.array(pair), lane)
-            problem = _REASONS[status].format(states=states) + (f": {pair[0]} and {pair[1]}" if status < _NOT_FOUND else "")
+            problem = _REASONS[status].format(states=states) + (
+                f": {pair[0]} and {pair[1]}" if status < _NOT_FOUND else ""
+            )
         corners = np.repeat(starts[lane][None], 0 if problem else count, axis=0)
         corners[:, moving] = vertices[lane, : len(corners)]
         path = _rounded(corners, radii[lane], robot) if len(corners) > 1 else None
@@ -167,8 +171,8 @@ def _read(robot: Robot, q_from: ArrayLike, q_to: ArrayLike) -> tuple[np.ndarray,
     many = starts.ndim == 2
     if many and goals.ndim == 2:
         goals = goals[:, None]
-    if not many:
-        starts, goals = starts[None], goals.reshape(1, -1, goals.shape[-1])
+    if starts.ndim == 1:
+        starts, goals = starts[None], np.atleast_2d(goals)[None]
     good = starts.ndim == 2 and goals.ndim == 3 and len(starts) == len(goals) and min(starts.size, goals.size) > 0
     if not good or {starts.shape[-1], goals.shape[-1]} != {robot.nq}:
         raise OsikValueError(
@@ -189,9 +193,7 @@ def _check_held(robot: Robot, starts: np.ndarray, goals: np.ndarray, moving: np.
         raise OsikValueError(f"these joints may not move, and are elsewhere at a goal: {', '.join(names)}")
 
 
-def _ranges(
-    robot: Robot, starts: np.ndarray, goals: np.ndarray, moving: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _ranges(robot: Robot, starts: np.ndarray, goals: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the ranges in which trees grow: those of the joints, half a turn around the ends where there is none."""
     ends = np.concatenate([starts, goals.reshape(-1, robot.nq)])
     lower, upper = np.asarray(robot.position_lower, float), np.asarray(robot.position_upper, float)

@@ -195,8 +195,8 @@ def check_scalar_joints(robot: Robot) -> None:
     """Raise ValueError unless all joints are hinges and slides."""
     if robot.nq != robot.nv:
         raise OsikValueError(
-            f"the robot has {robot.nq} configuration entries and {robot.nv} velocities; a path is one of hinges and slides "
-            "alone: lock the other joints (locked_joints=)"
+            f"the robot has {robot.nq} configuration entries and {robot.nv} velocities; a path is one of hinges "
+            "and slides alone: lock the other joints (locked_joints=)"
         )
 
 

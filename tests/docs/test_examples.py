@@ -135,10 +135,17 @@ def carry_a_box(names: Names) -> None:
     assert names["figures"]["joints"]["beyond_range_max"] == 0.0 and not names["figures"]["notes"]
 
 
+def pick_and_place(names: Names) -> None:
+    motions, held = names["motions"], names["held"]
+    assert osik.is_free(names["robot"], motions[0].position, names["scene"], srdf=True).all()
+    assert osik.is_free(names["robot"], motions[1].position, held, srdf=True).all()
+    np.testing.assert_allclose(motions[0].position[-1], motions[1].position[0], atol=1e-9)
+
+
 CHECKS: list[Callable[[Names], None]] = [
     ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
     g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person, carry_a_box, collision_free,
+    retarget_a_person, carry_a_box, collision_free, pick_and_place,
 ]  # fmt: skip
 
 
