@@ -1,13 +1,14 @@
 """Collision-free inverse kinematics on recorded problems: answers for a judge, and the time of each call.
 
     python -m benchmarks.collision_free ROBOT ANSWERS.npz [--problems FILE.npz] [--sets box cage] [--count 10] [--batch]
-                                        [--clearance 0.005] [--key 0]
+                                        [--clearance 0.005] [--grow 0.015] [--key 0]
 
 ROBOT is a name of ``osik_jax.load_robot``, or the path of a URDF. A problem is a scene of boxes and cylinders with a
 configuration at the goal, at which the file's frames are where they are wanted. ANSWERS.npz gets ``set`` and ``index``
-of each problem, ``q`` in the order of the file's joints, ``called`` (it is said to be there and free) and ``seconds``:
-of the call from Python, one problem a call. ``--batch`` solves all problems in one call; each has the same share of its
-time.
+of each problem, ``q`` in the order of the file's joints, ``called`` (it is said to be there and free), ``impossible``
+(shapes that the target places touch others in each configuration: a proof that none is free) and ``seconds``: of the
+call from Python, one problem a call. ``--batch`` solves all problems in one call; each has the same share of its time.
+``--grow`` makes half edges, radii and half lengths of all obstacles so much larger [m].
 
 FILE.npz, by default ROBOT.npz in the folder that OSIK_PROBLEMS names or here, has ``head``, a JSON text (robot, sets,
 names, joints, frames, held, allowed), a row for each problem (set, index, objects, goal), one for each object (kind,
@@ -53,11 +54,12 @@ class Setting(NamedTuple):
     srdf: str
 
 
-def read(path: Path) -> tuple[dict[str, Any], Iterator[Problem]]:
-    """Return the head of a file of problems, and the problems."""
+def read(path: Path, grow: float = 0.0) -> tuple[dict[str, Any], Iterator[Problem]]:
+    """Return the head of a file of problems, and the problems with obstacles that are larger by ``grow`` [m]."""
     with np.load(path) as opened:
         file = {name: opened[name] for name in opened.files}
     head = json.loads(str(file["head"]))
+    file["sizes"] = np.asarray(file["sizes"], float) + grow
     return head, _problems(head, file)
 
 
@@ -116,58 +118,62 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="problems of each set; default: all")
     parser.add_argument("--batch", action="store_true", help="all problems in one call")
     parser.add_argument("--clearance", type=float, default=0.0)
+    parser.add_argument("--grow", type=float, default=0.0)
     parser.add_argument("--key", type=int, default=0)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     osik.runtime.configure_cpu()
     folder = Path(os.environ.get("OSIK_PROBLEMS", "."))
-    head, problems = read(given.problems or folder / f"{given.robot}.npz")
+    head, problems = read(given.problems or folder / f"{given.robot}.npz", given.grow)
     kept: dict[str, list[Problem]] = {}
     for problem in problems:
         own = kept.setdefault(problem.set, [])
         if (not given.sets or problem.set in given.sets) and (given.count is None or len(own) < given.count):
             own.append(problem)
     chosen = [problem for own in kept.values() for problem in own]
-    q, called, seconds, first = solve(setting(given.robot, head), chosen, given)
+    q, called, impossible, seconds, first = solve(setting(given.robot, head), chosen, given)
     np.savez(
         given.answers,
         set=np.array([problem.set for problem in chosen]),
         index=np.array([problem.index for problem in chosen]),
         q=q,
         called=called,
+        impossible=impossible,
         seconds=seconds,
     )
     ms = 1e3 * seconds
     print(
-        f"{len(chosen)} problems, called free {100 * called.mean():.2f} %; a call: median {np.median(ms):.3f} ms, "
+        f"{len(chosen)} problems, called free {100 * called.mean():.2f} %, "
+        f"impossible {100 * impossible.mean():.2f} %; a call: median {np.median(ms):.3f} ms, "
         f"99 % {np.quantile(ms, 0.99):.2f} ms, longest {ms.max():.1f} ms; first call {first:.2f} s"
     )
 
 
-def solve(own: Setting, problems: list[Problem], given: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return q (n, joints), whether each is called free, seconds of each call, and of the first one."""
+def solve(own: Setting, problems: list[Problem], given: Any) -> tuple[Any, ...]:
+    """Return q (n, joints), whether each is called free, whether none can be, and seconds of each call and the first."""
     options: dict[str, Any]
     poses, options = targets(own, np.array([problem.goal for problem in problems])), {"srdf": own.srdf}
     options |= dict(clearance=given.clearance, key=given.key)
 
-    def call(poses: Any, scene: osik.Scene) -> tuple[np.ndarray, np.ndarray, float]:
+    def call(poses: Any, scene: osik.Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         start = time.perf_counter()
         found = osik.inverse_kinematics(own.robot, poses, scene=scene, **options)
         q, called = np.asarray(found.q), np.asarray(found.converged)
-        return q[..., own.entries], called, time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        return q[..., own.entries], called, np.isin(found.obstruction, (1, 2)), seconds
 
-    def one(k: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         return call({f: (place[k], turn[k]) for f, (place, turn) in poses.items()}, problems[k].scene)
 
     if given.batch:
         scenes = osik.Scene.stack([problem.scene for problem in problems])
-        first = call(poses, scenes)[2]
-        q, called, seconds = call(poses, scenes)
+        first = call(poses, scenes)[-1]
+        q, called, impossible, seconds = call(poses, scenes)
         print(f"{len(problems)} problems in one call: {seconds:.3f} s")
-        return q, called, np.full(len(problems), seconds / len(problems)), first
-    first = one(0)[2]
-    q, called, seconds = zip(*(one(k) for k in range(len(problems))), strict=True)
-    return np.array(q), np.array(called), np.array(seconds), first
+        return q, called, impossible, np.full(len(problems), seconds / len(problems)), first
+    first = one(0)[-1]
+    found = (np.array(one_kind) for one_kind in zip(*(one(k) for k in range(len(problems))), strict=True))
+    return *found, first
 
 
 if __name__ == "__main__":
