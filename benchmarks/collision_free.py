@@ -150,7 +150,7 @@ def main() -> None:
 
 
 def solve(own: Setting, problems: list[Problem], given: Any) -> tuple[Any, ...]:
-    """Return q (n, joints), whether each is called free, whether none can be, and seconds of each call and the first."""
+    """Return q (n, joints), whether each is called free or impossible, and seconds of each call and of the first."""
     options: dict[str, Any]
     poses, options = targets(own, np.array([problem.goal for problem in problems])), {"srdf": own.srdf}
     options |= dict(clearance=given.clearance, key=given.key)
