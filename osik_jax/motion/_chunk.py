@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from .._errors import OsikValueError, warn
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
-from ..numerics._arguments import as_floats, check_count, check_finite, concrete
+from ..numerics._arguments import as_floats, check_count, concrete
 from ..numerics._guarded import positive_root
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
@@ -30,18 +30,15 @@ from ._motion import Motion, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
+from ._start import OUTSIDE, State, checked_state
 
 _FEWEST = 16
 _HELD = 4
 """Times after the last waypoint, while the motion comes to rest, at which it is to be there."""
 _ROOM = 1.5
 """Time to come to rest, by the shortest one."""
-_OUTSIDE = 1e-6
-"""Share of a limit, or of a range [rad or m], by which a start may be outside: rounding."""
 _JUMP = 0.5
 """Joint positions [rad or m] of two neighbouring poses that are farther apart are on different branches."""
-
-State = tuple[Float[ArrayLike, " n"], Float[ArrayLike, " n"], Float[ArrayLike, " n"]]
 
 
 class Chunk(eqx.Module):
@@ -154,7 +151,7 @@ def chunk(
     limits = checked_limits(robot, velocity, acceleration, jerk, least_time=False)
     begin = None if begin is None else as_floats(begin)
     time = _checked_times(as_floats(times), begin)
-    state = None if start is None else _checked_start(robot, start, limits)
+    state = None if start is None else checked_state(robot, start, limits)
     points = _points(robot, waypoints, None if state is None else state[0])
     if points.shape != (len(time), robot.nv):
         raise OsikValueError(f"waypoints have shape {points.shape}; {len(time)} times need ({len(time)}, {robot.nv})")
@@ -197,32 +194,6 @@ def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
     if seen is not None and first is not None and not first < seen[-1]:
         raise OsikValueError(f"begin is {first:g}; it is before the last waypoint, which is at {seen[-1]:g}")
     return time
-
-
-def _checked_start(robot: Robot, start: Any, limits: Array) -> Float[Array, "3 n"]:
-    """Return the state to start from, checked to be within limits."""
-    if not isinstance(start, tuple | list) or len(start) != 3 or any(np.shape(one) != (robot.nv,) for one in start):
-        raise OsikValueError(f"start is (position, velocity, acceleration), of {robot.nv} joints each")
-    state = jnp.stack([as_floats(one) for one in start])
-    check_finite(state, "start")
-    seen, most = concrete(state), concrete(limits)
-    if seen is None or most is None:
-        return state
-    lower, upper = (np.asarray(end) for end in joint_box(robot, None))
-    outside = {
-        "position": (seen[0] < lower - _OUTSIDE) | (seen[0] > upper + _OUTSIDE),
-        "velocity": np.abs(seen[1]) > (1.0 + _OUTSIDE) * most[0],
-        "acceleration": np.abs(seen[2]) > (1.0 + _OUTSIDE) * most[1],
-    }
-    for row, (kind, where) in enumerate(outside.items()):
-        if where.any():
-            joint = int(where.argmax())
-            allowed = f"{lower[joint]:g} to {upper[joint]:g}" if row == 0 else f"at most {most[row - 1, joint]:g}"
-            raise OsikValueError(
-                f"start has the {kind} {seen[row, joint]:g} of {dof_names(robot)[joint]!r}, whose limit is {allowed}: "
-                "start within the limits, or give wider ones"
-            )
-    return state
 
 
 def _points(robot: Robot, waypoints: Any, near: Array | None) -> Float[Array, "N n"]:
@@ -359,6 +330,6 @@ def _spans(
         jnp.stack([jnp.minimum(low, most), jnp.maximum(high, least)])
         for (low, high), least, most in zip(ends, lowest, highest, strict=True)
     ]
-    inside = (spans[0][0] >= bounds[0] - _OUTSIDE).all() & (spans[0][1] <= bounds[1] + _OUTSIDE).all()
+    inside = (spans[0][0] >= bounds[0] - OUTSIDE).all() & (spans[0][1] <= bounds[1] + OUTSIDE).all()
     jerks = jnp.stack([jnp.full(cells, -jerk), jnp.full(cells, jerk)])
     return spans[0], jnp.stack([*spans[1:], jerks]), inside
