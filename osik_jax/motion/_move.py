@@ -19,6 +19,9 @@ from ._motion import Motion, sample_times
 from ._retime import Limit, checked_limits
 from ._start import OUTSIDE, State, checked_state
 
+_SHARES = 0.0, 1e-9, 1e-8, 1e-7
+"""Shares by which limits are lowered in turn: at the border between two kinds of profiles Ruckig may find none."""
+
 
 class Move(eqx.Module):
     """Motion from one state of the joints to another: pieces of constant jerk.
@@ -127,14 +130,18 @@ def _trajectory(start: np.ndarray, goal: np.ndarray, limits: np.ndarray) -> Any:
     given.current_position, given.current_velocity, given.current_acceleration = start.astype(float).tolist()
     given.target_position, given.target_velocity = goal.astype(float).tolist()
     # a state beyond a limit by rounding would be refused
-    limits = np.maximum(limits, (1.0 + OUTSIDE) * np.abs([goal[1], start[2], 0.0 * start[2]]))
-    given.max_velocity, given.max_acceleration, given.max_jerk = limits.astype(float).tolist()
-    found = ruckig.Trajectory(start.shape[1])
-    try:
-        ruckig.Ruckig(start.shape[1]).calculate(given, found)
-    except ruckig.RuckigError as error:
-        raise OsikValueError(f"Ruckig finds no motion: {' '.join(str(error).split())}") from error
-    return found
+    least = (1.0 + OUTSIDE) * np.abs([goal[1], start[2], 0.0 * start[2]])
+    failed = None
+    for share in _SHARES:
+        used = np.maximum(limits * (1.0 - share * np.array([[1.0], [2.0], [3.0]])), least).astype(float)
+        given.max_velocity, given.max_acceleration, given.max_jerk = used.tolist()
+        found = ruckig.Trajectory(start.shape[1])
+        try:
+            ruckig.Ruckig(start.shape[1]).calculate(given, found)
+            return found
+        except ruckig.RuckigError as error:
+            failed = error
+    raise OsikValueError(f"Ruckig finds no motion: {' '.join(str(failed).split())}") from failed
 
 
 def _pieces(found: Any) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, "K 4 n"]]:

@@ -112,3 +112,11 @@ def test_in_jit_and_without_its_extra_it_says_so(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "ruckig", None)
     with pytest.raises(ModuleNotFoundError, match=r"a move needs ruckig: pip install \".\[planning\]\""):
         move(ARM, HOME, HOME + 0.1, **LIMITS)
+
+
+@pytest.mark.parametrize("way", [0.1, 0.8])
+def test_at_the_border_between_two_profiles(way) -> None:
+    """A way of ``2 a^3 / j^2`` reaches the limit of acceleration for no time: Ruckig finds no profile by rounding."""
+    limits = {"velocity": 2.61, "acceleration": 5.0 if way == 0.1 else 10.0, "jerk": 50.0}
+    goal = HOME + way * np.eye(7)[5]
+    assert move(ARM, HOME, goal, **limits).duration == pytest.approx(4.0 * limits["acceleration"] / 50.0, rel=1e-6)
