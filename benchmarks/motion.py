@@ -109,6 +109,8 @@ def follow_raster(speed: float) -> None:
 def chunk_stream(step: float, streams: int = 10) -> None:
     """Print how well chunks of 30 random waypoints in 1 s join and keep limits.
 
+    Where a chunk is not feasible the one that runs goes on, and the next one starts from that.
+
     Args:
         step: standard deviation of a waypoint's distance from the one before [rad].
         streams: number of streams, of four chunks each.
@@ -127,10 +129,11 @@ def chunk_stream(step: float, streams: int = 10) -> None:
             start_time = time.process_time()
             jax.block_until_ready(run(*given))
             took.append(time.process_time() - start_time)
+            kept.append(bool(found.feasible.all()))
+            found = found if kept[-1] or before is None else before
             q, *rates = np.asarray(found.at(np.linspace(begin, float(found.end), 1001)))
             past = np.maximum(q - arm.position_upper, arm.position_lower - q).max()
             used = np.maximum(used, [past, *(np.abs(a).max() / b for a, b in zip(rates, limits.values(), strict=True))])
-            kept.append(bool(found.feasible.all()))
             if before is not None:
                 pairs = zip(before.state(begin), found.state(begin), strict=True)
                 joins = max(joins, *(float(np.abs(a - b).max()) for a, b in pairs))
