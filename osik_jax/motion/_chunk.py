@@ -51,8 +51,8 @@ class Chunk(eqx.Module):
         width: time between two knots [s].
         coefficients: of the splines [rad or m]. (cells + 3, n)
         miss: position minus waypoint, 0 for waypoints before ``begin`` [rad or m]. (N, n)
-        feasible: whether the motion of each joint keeps all its limits. Where it is false, no spline of this width stops
-            the start within them: let the running chunk go on. (n,)
+        feasible: whether the motion of each joint keeps all its limits. Where it is false, no spline of this width
+            stops the start within them: let the running chunk go on. (n,)
         joints: names of the joints (static).
     """
 
@@ -183,9 +183,7 @@ def _warn_unless(found: Chunk) -> None:
     seen = concrete(found.feasible)
     if seen is not None and not seen.all():
         names = ", ".join(name for name, ok in zip(found.joints, seen, strict=True) if not ok)
-        warn(
-            f"the start cannot be stopped within the limits of {names}: let the running chunk go on, or give wider limits"
-        )
+        warn(f"the start cannot be stopped within the limits of {names}: let the running chunk go on, or widen them")
 
 
 def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
