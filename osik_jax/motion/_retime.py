@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ..inverse._inverse_kinematics import joint_box
 from ..kinematics import forward_kinematics
 from ..numerics._arguments import as_floats, concrete
 from ..robot import Robot
@@ -20,6 +21,7 @@ from ._cells import Cells
 from ._jerk import PLACES, reference, rows_of, stretched
 from ._least_time import largest_square, least_time
 from ._spline import Spline, chord_lengths, cubic_derivatives, spline_through
+from ._start import OUTSIDE
 from ._timing import Timing, by_progress
 
 Limit = ArrayLike | Mapping[str, float] | None
@@ -66,7 +68,7 @@ def retime(
 
     Raises:
         TypeError, ValueError: waypoints that are equal or not finite, fewer than two, limits that are not positive, or
-            a robot with joints that are no hinges or slides.
+            a robot with joints that are no hinges or slides; with ``robot``, waypoints outside of the joints' ranges.
         KeyError: no such joint or frame.
     """
     points = as_floats(waypoints)
@@ -183,10 +185,23 @@ def _check_points(points: Array, robot: Robot | None) -> None:
         return
     if not np.isfinite(seen).all():
         raise OsikValueError(f"waypoint {int(np.argmin(np.isfinite(seen).all(axis=1)))} is not finite")
+    if robot is not None:
+        _check_ranges(robot, seen)
     equal = (seen[1:] == seen[:-1]).all(axis=1)
     if equal.any():
         first = int(equal.argmax())
         raise OsikValueError(f"waypoints {first} and {first + 1} are equal; a path has none twice in a row: remove one")
+
+
+def _check_ranges(robot: Robot, points: np.ndarray) -> None:
+    lower, upper = (np.asarray(end) for end in joint_box(robot, None))
+    outside = (points < lower - OUTSIDE) | (points > upper + OUTSIDE)
+    if outside.any():
+        row, joint = (int(i) for i in np.argwhere(outside)[0])
+        raise OsikValueError(
+            f"waypoint {row} has {points[row, joint]:g} of {dof_names(robot)[joint]!r}, whose range is "
+            f"{lower[joint]:g} to {upper[joint]:g}: move it into the range"
+        )
 
 
 def _check_limits(limits: Array, robot: Robot | None, least_time: bool) -> None:

@@ -176,6 +176,13 @@ def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     assert parts[0].joint in timing.joints and parts[0].slowest < 0.05
 
 
+def test_a_waypoint_outside_of_its_range_is_named() -> None:
+    arm = osik.load_robot("arm7")
+    points = np.asarray(arm.q0) + np.linspace(0.0, 3.0, 4)[:, None] * np.eye(7)[0]
+    with pytest.raises(osik.OsikError, match="waypoint 3 has 3 of 'joint1', whose range is -2.8973 to 2.8973"):
+        retime(points, robot=arm, acceleration=5.0)
+
+
 @pytest.mark.parametrize(
     "points, more, message",
     [
