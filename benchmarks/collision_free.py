@@ -160,7 +160,7 @@ def solve(own: Setting, problems: list[Problem], given: Any) -> tuple[Any, ...]:
         found = osik.inverse_kinematics(own.robot, poses, scene=scene, **options)
         q, called = np.asarray(found.q), np.asarray(found.converged)
         seconds = time.perf_counter() - start
-        return q[..., own.entries], called, np.isin(found.obstruction, (1, 2)), seconds
+        return q[..., own.entries], called, np.isin(np.asarray(found.obstruction), (1, 2)), seconds
 
     def one(k: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
         return call({f: (place[k], turn[k]) for f, (place, turn) in poses.items()}, problems[k].scene)

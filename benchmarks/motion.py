@@ -2,6 +2,7 @@
 
 python -m benchmarks.motion [--speeds 0.1 0.3]. Needs toppra.
 python -m benchmarks.motion --chunks
+python -m benchmarks.motion --noise
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import time
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.motion import chunk, follow, retime
+from osik_jax.motion import PoseFilter, chunk, follow, retime
 
 LIMITS: dict[str, Any] = {
     "velocity": np.array([2.175] * 4 + [2.61] * 3),
@@ -106,6 +109,8 @@ def follow_raster(speed: float) -> None:
 def chunk_stream(step: float, streams: int = 10) -> None:
     """Print how well chunks of 30 random waypoints in 1 s join and keep limits.
 
+    Where a chunk is not feasible the one that runs goes on, and the next one starts from that.
+
     Args:
         step: standard deviation of a waypoint's distance from the one before [rad].
         streams: number of streams, of four chunks each.
@@ -124,10 +129,11 @@ def chunk_stream(step: float, streams: int = 10) -> None:
             start_time = time.process_time()
             jax.block_until_ready(run(*given))
             took.append(time.process_time() - start_time)
+            kept.append(bool(found.feasible.all()))
+            found = found if kept[-1] or before is None else before
             q, *rates = np.asarray(found.at(np.linspace(begin, float(found.end), 1001)))
             past = np.maximum(q - arm.position_upper, arm.position_lower - q).max()
             used = np.maximum(used, [past, *(np.abs(a).max() / b for a, b in zip(rates, limits.values(), strict=True))])
-            kept.append(bool(found.feasible.all()))
             if before is not None:
                 pairs = zip(before.state(begin), found.state(begin), strict=True)
                 joins = max(joins, *(float(np.abs(a - b).max()) for a, b in pairs))
@@ -140,13 +146,87 @@ def chunk_stream(step: float, streams: int = 10) -> None:
     )
 
 
+def waving_hand(steps: int, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return how a hand moves there and back, from the start: 0.4 m (steps, 3) and 0.6 rad about z (steps, 3, 3)."""
+    share, way = np.modf(dt * np.arange(steps) / 4.0)
+    share = 10.0 * share**3 - 15.0 * share**4 + 6.0 * share**5
+    share = np.where(way % 2 == 0, share, 1.0 - share)[:, None]
+    move = np.array([-0.1, 0.25, -0.295])
+    return 0.4 * share * move / np.linalg.norm(move), Rotation.from_rotvec(share * [0.0, 0.0, 0.6]).as_matrix()
+
+
+class _Noise:
+    """A Panda that follows a hand seen with 1 mm and 0.5 degrees of white noise, 50 times a second for 12 s."""
+
+    dt, steps = 0.02, 600
+
+    def __init__(self) -> None:
+        self.arm, rng = osik.load_robot("arm7"), np.random.default_rng(0)
+        place, turn = (np.asarray(a) for a in osik.FrameTask(self.arm, "hand").target)
+        move, rotation = waving_hand(self.steps, self.dt)
+        self.true = place + move, rotation @ turn
+        noise = Rotation.from_rotvec(np.deg2rad(0.5) * rng.normal(size=(self.steps, 3))).as_matrix()
+        self.seen = (
+            jnp.asarray(self.true[0] + 1e-3 * rng.normal(size=(self.steps, 3))),
+            jnp.asarray(noise @ self.true[1]),
+        )
+
+    def row(self, gain: float, time_constant: float | None = None, damping: float = 0.0, inertia: float = 0.0) -> str:
+        """Return the errors of the tool, root mean square [mm, deg], and those of joints' accelerations [rad/s^2]."""
+        arm, dt = self.arm, self.dt
+        hand, posture = osik.FrameTask(arm, "hand", gain=gain), osik.PostureTask(arm, weight=1e-5, target=arm.q0)
+        extra: dict[str, Any] = {"calm": osik.DampingTask(arm, weight=damping)} if damping else {}
+
+        def step(state: Any, seen: Any) -> Any:
+            q, smooth, v = state
+            target, velocity = seen, jnp.zeros(6)
+            if time_constant is not None:
+                smooth, target, velocity = smooth.update(seen, dt)
+            tasks = {"hand": hand.replace(target=target, target_velocity=velocity), "posture": posture, **extra}
+            if inertia:
+                tasks["inertia"] = osik.LowAccelerationTask(arm, weight=inertia).after(v)
+            v = osik.solve(arm, q, tasks, dt=dt).velocity
+            q = osik.integrate(arm, q, v, dt)
+            return (q, smooth, v), (v, *osik.forward_kinematics(arm, q).frame_pose(arm, "hand"))
+
+        smooth = PoseFilter(hand.target, time_constant=time_constant or 0.1)
+        start = arm.q0, smooth, jnp.zeros(arm.nv)
+        v, *poses = map(np.asarray, jax.jit(lambda: jax.lax.scan(step, start, self.seen)[1])())
+        # a step ends when the next pose is seen
+        off = np.linalg.norm(poses[0][:-1] - self.true[0][1:], axis=1)
+        angle = Rotation.from_matrix(poses[1][:-1] @ self.true[1][1:].swapaxes(1, 2)).magnitude()
+        pull = (np.diff(v, axis=0) / dt)[50:] ** 2
+        rms = 1e3 * np.sqrt((off[50:] ** 2).mean()), np.degrees(np.sqrt((angle[50:] ** 2).mean()))
+        return f"{rms[0]:.1f} | {rms[1]:.2f} | {np.sqrt(pull.mean()):.2f} | {np.sqrt(pull.mean(0)).max():.2f}"
+
+
+def noise_rows() -> None:
+    """Print gain, filter, damping and inertia beside each other."""
+    run = _Noise()
+    cases: dict[str, dict[str, float]] = {f"gain {gain:g}": {"gain": gain} for gain in (5.0, 10.0, 20.0, 30.0)}
+    cases |= {f"gain 30, `DampingTask`, weight {w:g}": {"gain": 30.0, "damping": w} for w in (0.01, 0.1)}
+    cases |= {f"gain 30, `LowAccelerationTask`, weight {w:g}": {"gain": 30.0, "inertia": w} for w in (0.1, 0.3)}
+    for gain, time_constant in ((10.0, 0.05), (10.0, 0.08), (10.0, 0.15), (20.0, 0.08)):
+        cases[f"`PoseFilter`, {time_constant:g} s, gain {gain:g}"] = {"gain": gain, "time_constant": time_constant}
+    both = {"gain": 20.0, "time_constant": 0.05}
+    for weight in (0.1, 0.2):
+        cases[f"`PoseFilter`, 0.05 s, gain 20, `LowAccelerationTask`, weight {weight:g}"] = both | {"inertia": weight}
+    print("| | tool error [mm] | [deg] | joint acceleration [rad/s²] | of the fastest joint |\n|---|---|---|---|---|")
+    for name, case in cases.items():
+        print(f"| {name} | {run.row(**case)} |", flush=True)
+
+
 def main() -> None:
     """Run the measurements."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--speeds", type=float, nargs="*", default=[0.05, 0.1, 0.3, 1.0])
     parser.add_argument("--chunks", action="store_true", help="streams of chunks alone")
+    parser.add_argument("--noise", action="store_true", help="a hand seen with noise alone")
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
+    if arguments.noise:
+        noise_rows()
+        return
     if arguments.chunks:
         for step in (0.02, 0.12):
             chunk_stream(step)

@@ -18,6 +18,7 @@ from benchmarks.data_file import DOCS
 from ._accepted import accepted
 from ._files import files
 from ._models import folder
+from ._motions import motions
 from ._problems import in_programs, limits, problems
 from ._tasks import configurations, targets, tasks
 
@@ -81,6 +82,7 @@ _GROUPS = {
     "Tasks": tasks,
     "Problems": problems,
     "Limits": limits,
+    "Motions": motions,
     "Files": files,
     "Inside a program": in_programs,
     "Accepted": accepted,

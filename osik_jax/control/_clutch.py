@@ -88,7 +88,7 @@ class Clutch(Replaceable):
             frame: pose of the frame now, of the commanded configuration: a measured one has noise, and moves always.
         """
         dtype = self.scale.dtype
-        return _step(self, jnp.asarray(engaged, bool), _numbers(device, dtype), _numbers(frame, dtype))
+        return _step(self, jnp.asarray(engaged, bool), pose_numbers(device, dtype), pose_numbers(frame, dtype))
 
     def _check(self) -> None:
         scale = concrete(self.scale)
@@ -117,7 +117,7 @@ def _is_at_rest(frame: Pose, last: Pose) -> Bool[Array, ""]:
     return (jnp.abs(frame[0] - last[0]).max() <= _REST) & (jnp.abs(frame[1] - last[1]).max() <= _REST)
 
 
-def _numbers(pose: PoseLike, dtype: Any) -> Any:
+def pose_numbers(pose: PoseLike, dtype: Any) -> Any:
     """Return a pose as arrays, with NaN allowed."""
     if isinstance(pose, jaxlie.SE3):
         return pose

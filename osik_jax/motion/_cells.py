@@ -11,6 +11,9 @@ from jaxtyping import Array, Float
 from ..numerics._guarded import positive_root
 from ._spline import cubic_derivatives
 
+_FLAT = 1e-12
+"""Least slope of s(x) of which an inverse is taken."""
+
 
 class Cells(NamedTuple):
     """Path parameter s as a function of time: a cubic s(x) on each cell, where ``(dx/dt)^2`` is a quadratic in x.
@@ -49,7 +52,11 @@ class Cells(NamedTuple):
             is_before = cubic_derivatives(self.path[cell], middle)[0] < s
             return jnp.where(is_before, middle, ends[0]), jnp.where(is_before, ends[1], middle)
 
-        x = jax.lax.fori_loop(0, 50, halved, (jnp.zeros_like(s), self.width[cell]))[1]
+        ends = jax.lax.stop_gradient((jnp.zeros_like(s), self.width[cell]))
+        x = jax.lax.fori_loop(0, 50, halved, ends)[1]
+        # moves by nothing, and has the derivative of the inverse function
+        reached, slope = cubic_derivatives(self.path[cell], x)[:2]
+        x -= (reached - s) / jnp.maximum(jax.lax.stop_gradient(slope), _FLAT)
         return _progress(self.path[cell], self.square[cell], x)
 
     def slower(self, factor: Float[Array, ""]) -> Cells:
@@ -57,20 +64,24 @@ class Cells(NamedTuple):
         return self._replace(start=self.start * factor, square=self.square / factor**2)
 
 
-def timed(width: Float[Array, " K"], path: Float[Array, "K 4"], square: Float[Array, "K 3"]) -> Cells:
-    """Return cells with the times that follow from their squared rates."""
-    start = jnp.concatenate([jnp.zeros(1, width.dtype), jnp.cumsum(durations(width, square))])
+def timed(
+    width: Float[Array, " K"], path: Float[Array, "K 4"], square: Float[Array, "K 3"], last: Float[Array, ""]
+) -> Cells:
+    """Return cells with the times that follow from their squared rates, the last of which is at the end."""
+    start = jnp.concatenate([jnp.zeros(1, width.dtype), jnp.cumsum(durations(width, square, last))])
     return Cells(start, width, path, square)
 
 
-def durations(width: Float[Array, " K"], square: Float[Array, "K 3"]) -> Float[Array, " K"]:
+def durations(width: Float[Array, " K"], square: Float[Array, "K 3"], last: Float[Array, ""]) -> Float[Array, " K"]:
     """Return the time that x takes through each cell.
 
     The integral of 1 / sqrt(quadratic) is ``2 artanh(sqrt(c) w / S) / sqrt(c)`` with the curvature c and the sum S of
-    the rates at both ends; the series in ``c w^2 / S^2``, which is small, holds for both signs of c.
+    the rates at both ends; the series in ``c w^2 / S^2``, which is small, holds for both signs of c. The rate at the
+    end of a cell is that of the next one: the polynomial's own value is 0 at rest by cancellation alone, and the root
+    of its rounding is noise.
     """
-    first, slope, bend = square.T
-    mean_time = width / (positive_root(first) + positive_root(first + width * (slope + width * bend)))
+    rate, bend = positive_root(jnp.append(square[:, 0], last)), square[:, 2]
+    mean_time = width / (rate[:-1] + rate[1:])
     y = bend * mean_time**2
     return 2.0 * mean_time * (1.0 + y / 3.0 + y**2 / 5.0 + y**3 / 7.0 + y**4 / 9.0)
 

@@ -20,28 +20,27 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from .._errors import OsikValueError, warn
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
-from ..numerics._arguments import as_floats, check_count, check_finite, concrete
+from ..numerics._arguments import as_floats, check_count, concrete
 from ..numerics._guarded import positive_root
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
-from ..solvers import Status, solve_qp
+from ..solvers import Status, solve_least_squares_qp
 from ._jerk import CUBIC
 from ._motion import Motion, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
+from ._start import OUTSIDE, State, checked_state
 
 _FEWEST = 16
 _HELD = 4
 """Times after the last waypoint, while the motion comes to rest, at which it is to be there."""
 _ROOM = 1.5
 """Time to come to rest, by the shortest one."""
-_OUTSIDE = 1e-6
-"""Share of a limit, or of a range [rad or m], by which a start may be outside: rounding."""
+_DAMPING = 1e-12
+"""Weight of the coefficients beside the waypoints: where these are few, smoothing alone determines the rest."""
 _JUMP = 0.5
 """Joint positions [rad or m] of two neighbouring poses that are farther apart are on different branches."""
-
-State = tuple[Float[ArrayLike, " n"], Float[ArrayLike, " n"], Float[ArrayLike, " n"]]
 
 
 class Chunk(eqx.Module):
@@ -52,8 +51,8 @@ class Chunk(eqx.Module):
         width: time between two knots [s].
         coefficients: of the splines [rad or m]. (cells + 3, n)
         miss: position minus waypoint, 0 for waypoints before ``begin`` [rad or m]. (N, n)
-        feasible: whether the motion of each joint keeps all its limits. Where it is false, the start cannot be stopped
-            within them. (n,)
+        feasible: whether the motion of each joint keeps all its limits. Where it is false, no spline of this width
+            stops the start within them: let the running chunk go on. (n,)
         joints: names of the joints (static).
     """
 
@@ -154,7 +153,7 @@ def chunk(
     limits = checked_limits(robot, velocity, acceleration, jerk, least_time=False)
     begin = None if begin is None else as_floats(begin)
     time = _checked_times(as_floats(times), begin)
-    state = None if start is None else _checked_start(robot, start, limits)
+    state = None if start is None else checked_state(robot, start, limits)
     points = _points(robot, waypoints, None if state is None else state[0])
     if points.shape != (len(time), robot.nv):
         raise OsikValueError(f"waypoints have shape {points.shape}; {len(time)} times need ({len(time)}, {robot.nv})")
@@ -184,7 +183,7 @@ def _warn_unless(found: Chunk) -> None:
     seen = concrete(found.feasible)
     if seen is not None and not seen.all():
         names = ", ".join(name for name, ok in zip(found.joints, seen, strict=True) if not ok)
-        warn(f"the start cannot be stopped within the limits of {names}: begin slower, or give wider limits")
+        warn(f"the start cannot be stopped within the limits of {names}: let the running chunk go on, or widen them")
 
 
 def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
@@ -197,32 +196,6 @@ def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
     if seen is not None and first is not None and not first < seen[-1]:
         raise OsikValueError(f"begin is {first:g}; it is before the last waypoint, which is at {seen[-1]:g}")
     return time
-
-
-def _checked_start(robot: Robot, start: Any, limits: Array) -> Float[Array, "3 n"]:
-    """Return the state to start from, checked to be within limits."""
-    if not isinstance(start, tuple | list) or len(start) != 3 or any(np.shape(one) != (robot.nv,) for one in start):
-        raise OsikValueError(f"start is (position, velocity, acceleration), of {robot.nv} joints each")
-    state = jnp.stack([as_floats(one) for one in start])
-    check_finite(state, "start")
-    seen, most = concrete(state), concrete(limits)
-    if seen is None or most is None:
-        return state
-    lower, upper = (np.asarray(end) for end in joint_box(robot, None))
-    outside = {
-        "position": (seen[0] < lower - _OUTSIDE) | (seen[0] > upper + _OUTSIDE),
-        "velocity": np.abs(seen[1]) > (1.0 + _OUTSIDE) * most[0],
-        "acceleration": np.abs(seen[2]) > (1.0 + _OUTSIDE) * most[1],
-    }
-    for row, (kind, where) in enumerate(outside.items()):
-        if where.any():
-            joint = int(where.argmax())
-            allowed = f"{lower[joint]:g} to {upper[joint]:g}" if row == 0 else f"at most {most[row - 1, joint]:g}"
-            raise OsikValueError(
-                f"start has the {kind} {seen[row, joint]:g} of {dof_names(robot)[joint]!r}, whose limit is {allowed}: "
-                "start within the limits, or give wider ones"
-            )
-    return state
 
 
 def _points(robot: Robot, waypoints: Any, near: Array | None) -> Float[Array, "N n"]:
@@ -288,7 +261,8 @@ def _fitted(
     spread[3 + free :, -1] = 1.0  # equal coefficients at the end: rest
     rows = _rows(cells, free)
     third = np.diff(np.eye(cells + 3), n=3, axis=0)
-    hessian = fit.T @ fit + smoothing * third.T @ third
+    cost = jnp.concatenate([fit, jnp.asarray(third, fit.dtype)])
+    weight = jnp.concatenate([jnp.ones(len(fit), fit.dtype), jnp.full(len(third), smoothing)])
     moved = rows.matrix @ spread
 
     def solved(joint: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
@@ -296,17 +270,20 @@ def _fitted(
         wanted, state, bounds, limits = joint
         first = _first_coefficients(state, width)
         fixed = jnp.zeros(cells + 3, first.dtype).at[:3].set(first)
-        box, spans, is_inside = _spans(first, width, bounds, limits, cells)
+        box, spans = _spans(first, width, bounds, limits, cells)
         lower, upper = spans[rows.order - 1, :, np.concatenate([np.arange(n) for n in _counts(rows)])].T
         shift = rows.matrix @ fixed
-        gradient = spread.T @ (hessian @ fixed - fit.T @ wanted)
-        answer = solve_qp(spread.T @ hessian @ spread, gradient, *box[:, :free], moved, lower - shift, upper - shift)
-        return fixed + spread @ answer.x, is_inside & (answer.status == Status.SOLVED)
+        target = jnp.concatenate([wanted, jnp.zeros(len(third), first.dtype)]) - cost @ fixed
+        answer = solve_least_squares_qp(
+            cost @ spread, target, weight, *box[:, :free], moved, lower - shift, upper - shift, damping=_DAMPING
+        )
+        return fixed + spread @ answer.x, answer.status == Status.SOLVED
 
     # one by one: joints need different numbers of iterations
     found, feasible = jax.lax.map(solved, (wanted.T, state.T, bounds.T, limits.T))
     miss = jnp.where(is_ahead[:, None], weights @ found.T - points, 0.0)
-    return begin, width, found.T, miss, feasible & is_finite
+    is_inside = _is_inside(jax.lax.stop_gradient(found.T), width, bounds, limits)
+    return begin, width, found.T, miss, feasible & is_inside & is_finite
 
 
 def _counts(rows: _Rows) -> list[int]:
@@ -339,26 +316,59 @@ def _first_coefficients(state: Float[Array, "3"], width: Array) -> Float[Array, 
 
 def _spans(
     first: Float[Array, "3"], width: Array, bounds: Float[Array, "2"], limits: Float[Array, "3"], cells: int
-) -> tuple[Float[Array, "2 K"], Float[Array, "3 2 K"], Bool[Array, ""]]:
-    """Return lower and upper bounds of the coefficients to come and of their differences, and whether they suffice.
+) -> tuple[Float[Array, "2 K"], Float[Array, "3 2 K"]]:
+    """Return lower and upper bounds of the coefficients to come, and of their differences.
 
     Where even the hardest braking exceeds a limit, as right after a start near it, that braking is the bound.
     """
     speed, pull, jerk = limits * width ** jnp.arange(1, 4)
     steps = jnp.arange(1, cells + 1)
 
-    def extreme(sign: float) -> tuple[Array, Array, Array]:
-        """Return the smallest (sign 1) or largest (-1) coefficients and differences that can follow the start."""
-        second = jnp.maximum(sign * (first[0] - 2.0 * first[1] + first[2]) - steps * jerk, -pull)
-        slope = sign * (first[2] - first[1]) + jnp.cumsum(second)
-        return sign * (sign * first[2] + jnp.cumsum(slope)), sign * slope, sign * second
+    def least(sign: float) -> tuple[Array, Array, Array]:
+        """Return the upper bounds (sign 1), or the lower ones (-1), of coefficients and two differences."""
+        before, slope = jnp.diff(sign * first)
+        seconds = jnp.maximum(slope - before - steps * jerk, -pull)  # the hardest braking
+        slopes = slope + jnp.cumsum(seconds)
+        places = sign * first[2] + jnp.cumsum(slopes)
+        fastest = jnp.minimum(speed, _below_peak(jnp.concatenate([jnp.stack([before, slope]), slopes[:-1]]), speed))
+        ends = jnp.where(sign > 0.0, bounds[1], -bounds[0]), fastest, pull
+        return tuple(sign * jnp.maximum(*pair) for pair in zip(ends, (places, slopes, seconds), strict=True))  # pyright: ignore
 
-    lowest, highest = extreme(1.0), extreme(-1.0)
-    ends = (bounds[0], bounds[1]), (-speed, speed), (-pull, pull)
-    spans = [
-        jnp.stack([jnp.minimum(low, most), jnp.maximum(high, least)])
-        for (low, high), least, most in zip(ends, lowest, highest, strict=True)
-    ]
-    inside = (spans[0][0] >= bounds[0] - _OUTSIDE).all() & (spans[0][1] <= bounds[1] + _OUTSIDE).all()
+    spans = [jnp.stack(pair) for pair in zip(least(-1.0), least(1.0), strict=True)]
     jerks = jnp.stack([jnp.full(cells, -jerk), jnp.full(cells, jerk)])
-    return spans[0], jnp.stack([*spans[1:], jerks]), inside
+    return spans[0], jnp.stack([*spans[1:], jerks])
+
+
+def _below_peak(slopes: Float[Array, " K1"], speed: Array) -> Float[Array, " K"]:
+    """Return the largest slope after each two for which the speed between the knots stays below its limit.
+
+    Where a coefficient of the speed is above the limit, the speed is a parabola with the peak ``v + a^2 / (2 b)`` in
+    the next cell, b being the braking. In units of the cell's width.
+    """
+    here, pull = slopes[1:], jnp.diff(slopes)
+    room = speed - 0.5 * (slopes[1:] + slopes[:-1])
+    is_above = (here > speed) & (pull > 0.0)
+    braking = jnp.where(is_above, pull**2 / (2.0 * jnp.where(is_above & (room > 0.0), room, 1e-12)), 0.0)
+    return jnp.where(is_above, here + pull - braking, jnp.inf)
+
+
+def _is_inside(
+    coefficients: Float[Array, "K3 n"], width: Array, bounds: Float[Array, "2 n"], limits: Float[Array, "3 n"]
+) -> Bool[Array, " n"]:
+    """Return whether positions and speeds of each joint are within limits, at knots and where their slopes are 0."""
+    four = jnp.stack([coefficients[i : len(coefficients) - 3 + i] for i in range(4)])
+    cubics = jnp.einsum("ck,ktn->tcn", CUBIC.astype(width.dtype), four)
+    _, b, c, d = (cubics[:, power] for power in range(4))
+    root, tiny = positive_root(c**2 - 3.0 * b * d), jnp.finfo(width.dtype).tiny
+
+    def share(above: Array, below: Array) -> Array:
+        """Return a quotient inside the cell, 0 where it is outside."""
+        quotient = above / jnp.where(jnp.abs(below) > tiny, below, 1.0)
+        return jnp.where((quotient > 0.0) & (quotient < 1.0), quotient, 0.0)
+
+    zero = jnp.zeros_like(b)
+    places = [zero, zero + 1.0, share(-c, 3.0 * d), share(-b, c + root), share(-b, c - root)]
+    states = jnp.stack([cubic_derivatives(cubics, x)[:2] for x in places])
+    q, v = states[:, 0], jnp.abs(states[:, 1]) / width
+    above = jnp.maximum(q - bounds[1], bounds[0] - q), v / limits[0] - 1.0
+    return jnp.stack([(one <= 2.0 * OUTSIDE).all(axis=(0, 1)) for one in above]).all(axis=0)

@@ -16,6 +16,7 @@ from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
+from ..tasks._pose import RADIAN
 from ._joint_path import Free, PathSearch
 from ._motion import Motion, sample_times
 from ._pose_path import Poses, corners, interpolated, lengths, read_poses
@@ -191,14 +192,12 @@ def _errors_between(
 
 def _why_not(search: PathSearch, poses: Mapping[str, Poses]) -> str:
     """Return why there is no path: the poses that cannot be reached, or that none is continuous."""
-    if any(search.free.get(name) for name in poses):
-        return "no continuous path was found through the poses, with free axes: try another key, or q0"
-    targets = {name: one.position if one.rotation is None else tuple(one) for name, one in poses.items()}
-    found = inverse_kinematics(search.robot, targets, key=search.key)
-    missed = np.flatnonzero(~np.asarray(found.converged))
+    found = [inverse_kinematics(search.robot, targets, key=search.key) for targets in search.targets(poses)]
+    missed = np.flatnonzero(~np.any([one.converged for one in found], axis=0))
     if len(missed) == 0:
         return "each pose can be reached, and no continuous path through all was found: try another key, free= or q0"
     shown = ", ".join(map(str, missed[:10])) + (", ..." if len(missed) > 10 else "")
     first = int(missed[0])
-    why = found.explain(first)
-    return f"{len(missed)} of {len(found.converged)} poses cannot be reached: {shown}. Pose {first}: {why}"
+    nearest = min(found, key=lambda one: float(one.position_error[first] + RADIAN * one.orientation_error[first]))
+    count = len(next(iter(poses.values())).position)
+    return f"{len(missed)} of {count} poses cannot be reached: {shown}. Pose {first}: {nearest.explain(first)}"

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ._cells import Cells, timed
 
-_STEPS = 50
+_STEPS, _LAST_STEPS = 50, 3
 _SHRINK = 0.75  # of the barrier's weight in a step
 _LEAST_GAP = {"float32": 1e-3, "float64": 1e-5}
 """Least weight of the barrier, as a share of the duration: the rounding of margins bounds it from below."""
@@ -104,17 +104,13 @@ def rows_of(
     return Rows(jnp.concatenate([speed, pull, -pull], axis=1), jerk)
 
 
-def stretched(width: Array, cubics: Float[Array, "K 4"], rows: Rows) -> tuple[Cells, Float[Array, ""]]:
-    """Return the least-time progress, and its duration, whose derivative by the rows is that of the optimum.
-
-    By the envelope theorem the derivative of the least duration is that of the barrier's terms alone, at the answer.
-    """
-    square, weight = jax.tree.map(jax.lax.stop_gradient, _optimum(width, *jax.lax.stop_gradient(rows)))
+def stretched(width: Array, cubics: Float[Array, "K 4"], rows: Rows) -> Cells:
+    """Return the least-time progress; its derivatives are those of the optimum, of first order."""
+    square = _optimum(width, rows)
     pieces = jnp.stack([square[i : i + len(cubics)] for i in range(3)], axis=1) @ _PIECES.T.astype(width.dtype)
-    cells = timed(jnp.broadcast_to(width, len(cubics)), cubics, pieces / width ** jnp.arange(3))
-    cells = jax.lax.stop_gradient(cells)
-    barrier = -weight * sum(jnp.log(margin).sum() for margin in _margins(rows, _values(square, width)))
-    return cells, cells.start[-1] + barrier - jax.lax.stop_gradient(barrier)
+    return timed(
+        jnp.broadcast_to(width, len(cubics)), cubics, pieces / width ** jnp.arange(3), 0.5 * (square[-2] + square[-1])
+    )
 
 
 def _values(square: Float[Array, " K2"], width: Array) -> Float[Array, "P 3"]:
@@ -133,17 +129,26 @@ def _margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Array, Array, Arr
     return 1.0 - jnp.einsum("kmc,kc->km", rows.fixed, values), 1.0 - jerk, 1.0 + jerk
 
 
-def _optimum(width: Array, fixed: Array, jerk: Array) -> tuple[Float[Array, " K2"], Float[Array, ""]]:
-    """Return the coefficients of b, and the last weight of the barrier."""
-    rows, least = Rows(fixed, jerk), _LEAST_GAP[str(width.dtype)]
-    scale = width / len(PLACES) / (fixed.shape[1] + 2 * jerk.shape[1])
+def _optimum(width: Array, rows: Rows) -> Float[Array, " K2"]:
+    """Return the coefficients of b, with the derivatives of the barrier problem's stationary point.
+
+    Where the gradient vanishes, a Newton step with the exact second derivatives moves by nothing, and its derivative by
+    the arguments is that of the stationary point (the implicit function theorem).
+    """
+    least = _LEAST_GAP[str(width.dtype)]
+    scale = width / len(PLACES) / (rows.fixed.shape[1] + 2 * rows.jerk.shape[1])
+    fixed_width, fixed_scale, fixed_rows = jax.lax.stop_gradient((width, scale, rows))
 
     def step(square: Array, power: Array) -> tuple[Array, None]:
-        weight = scale * jnp.maximum(_SHRINK**power, least)
-        return _newton(square, width, rows, weight), None
+        weight = fixed_scale * jnp.maximum(_SHRINK**power, least)
+        return _moved(square, fixed_width, fixed_rows, weight), None
 
-    square = jax.lax.scan(step, _slow(width, rows), jnp.arange(_STEPS, dtype=width.dtype))[0]
-    return square, scale * least
+    steps = jnp.arange(_STEPS, dtype=width.dtype)
+    square = jax.lax.scan(step, _slow(fixed_width, fixed_rows), steps)[0]
+    for _ in range(_LAST_STEPS):
+        square = _moved(square, fixed_width, fixed_rows, fixed_scale * least, exact=True)
+    move = _newton(jax.lax.stop_gradient(square), width, rows, scale * least, exact=True)[0]
+    return jax.lax.stop_gradient(square) + move - jax.lax.stop_gradient(move)
 
 
 def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:
@@ -154,8 +159,20 @@ def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:
     return jnp.full(len(rows.fixed) // len(PLACES) + 2, square)
 
 
-def _newton(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array) -> Float[Array, " K2"]:
+def _moved(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array, exact: bool = False) -> Array:
     """Return the coefficients after one Newton step of the barrier problem, inside all limits."""
+    move, taken = _newton(square, width, rows, weight, exact)
+    return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(taken, 1e-9))
+
+
+def _newton(
+    square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array, exact: bool = False
+) -> tuple[Float[Array, " K2"], Float[Array, ""]]:
+    """Return a Newton step of the barrier problem, and the largest share of a margin that it takes.
+
+    Without ``exact``, the convex bound of the limits of jerk is taken, so the step goes downhill. The step has the
+    derivatives of the gradient alone: where that vanishes, those of the matrix do not count.
+    """
     values, stencils = _values(square, width), _stencils(width)
     b, share = values[:, 0], jnp.tile(width * _SHARES, len(square) - 2)
     margin, slope = _linear_margins(rows, values)
@@ -164,15 +181,17 @@ def _newton(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array
     down = down.at[:, 0].add(0.5 * share * b**-1.5).reshape(-1, len(PLACES), 3)
     down = jnp.einsum("kec,ecs->ks", down, stencils)
     curvature = weight * jnp.einsum("kmc,kmd->kcd", scaled, scaled)
+    if exact:
+        curvature = curvature.at[:, 0, 0].add(-0.75 * weight * b**-2 * (1.0 / margin[:, rows.fixed.shape[1] :]).sum(1))
     curvature = curvature.at[:, 0, 0].add(0.75 * share * b**-2.5).reshape(-1, len(PLACES), 3, 3)
     curvature = jnp.einsum("ecs,kecd,edt->kst", stencils, curvature, stencils)
     diagonal, one, two = _bands(curvature)
     ends = 1.0 / square, -1.0 / (_MOST - square)
     diagonal = diagonal + weight * (ends[0] ** 2 + ends[1] ** 2)
-    move = _solve_banded(diagonal, one, two, _added(down) + weight * (ends[0] + ends[1]))
+    bands = jax.lax.stop_gradient((diagonal, one, two))
+    move = _solve_banded(*bands, _added(down) + weight * (ends[0] + ends[1]))
     taken = jnp.max(-jnp.einsum("kmc,kc->km", scaled, _values(move, width)))
-    most = jnp.maximum(taken, jnp.maximum(jnp.max(-move * ends[0]), jnp.max(-move * ends[1])))
-    return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(most, 1e-9))
+    return move, jnp.maximum(taken, jnp.maximum(jnp.max(-move * ends[0]), jnp.max(-move * ends[1])))
 
 
 def _linear_margins(rows: Rows, values: Float[Array, "P 3"]) -> tuple[Float[Array, "P m"], Float[Array, "P m 3"]]:

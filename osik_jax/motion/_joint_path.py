@@ -78,12 +78,16 @@ class PathSearch:
         found = pose_errors(*given, names=tuple(poses), axes=axes)
         return np.asarray(found[0])[: len(q)], np.asarray(found[1])[: len(q)]
 
+    def targets(self, poses: Mapping[str, Poses]) -> list[dict[str, Any]]:
+        """Return poses as targets, once for each turn about free axes."""
+        spinning = [name for name in poses if self.free.get(name) and poses[name].rotation is not None]
+        spins = range(_SPINS if spinning else 1)
+        return [{name: _spun(one, self.free.get(name), spin) for name, one in poses.items()} for spin in spins]
+
     def branches(self, poses: Mapping[str, Poses]) -> list[np.ndarray]:
         """Return all configurations found for each of some poses, (k, n) each."""
-        spinning = [name for name in poses if self.free.get(name) and poses[name].rotation is not None]
         found: list[list[np.ndarray]] = [[] for _ in next(iter(poses.values())).position]
-        for spin in range(_SPINS if spinning else 1):
-            targets = {name: _spun(one, self.free.get(name), spin) for name, one in poses.items()}
+        for targets in self.targets(poses):
             answer = inverse_kinematics(self.robot, targets, all=True, q0=self.q0, key=self.key)
             for own, q, count in zip(found, *map(np.asarray, (answer.solutions, answer.count)), strict=True):
                 own.append(q[:count])

@@ -50,7 +50,7 @@ def least_time(
     slope = jnp.diff(square) / width
     zero = jnp.zeros_like(width)
     path = jnp.stack([grid[:-1], zero + 1.0, zero, zero], axis=1)
-    return timed(width, path, jnp.stack([square[:-1], slope, zero], axis=1))
+    return timed(width, path, jnp.stack([square[:-1], slope, zero], axis=1), square[-1])
 
 
 def _rows(width: Array, first: Array, second: Array, limit: Array) -> _Rows:
@@ -62,7 +62,7 @@ def _rows(width: Array, first: Array, second: Array, limit: Array) -> _Rows:
     return _Rows(jnp.abs(p), jnp.where(p < 0.0, -r, r), jnp.ones_like(p))
 
 
-def _bound(coefficient: Array, constant: Array) -> Array:
+def largest_square(coefficient: Array, constant: Array) -> Array:
     """Return the largest b with ``coefficient b <= constant``; infinite where the coefficient is not positive."""
     acts = coefficient > _TINY * constant
     return jnp.where(acts, constant / jnp.where(acts, coefficient, 1.0), jnp.inf)
@@ -71,10 +71,10 @@ def _bound(coefficient: Array, constant: Array) -> Array:
 def _feasible(width: Array, rows: _Rows) -> Float[Array, " K"]:
     """Return the largest b of each cell for which some u meets all rows and keeps b from becoming negative."""
     p, r, a = rows.p.T, rows.r.T, rows.a.T
-    most = _bound(2.0 * width * r - p, 2.0 * width * a).min(axis=0)
+    most = largest_square(2.0 * width * r - p, 2.0 * width * a).min(axis=0)
     for row in range(1, len(p)):  # slices instead of an array of all pairs: XLA fuses them
         beside = jnp.abs(p[row] * r[:row] - p[:row] * r[row]), p[row] * a[:row] + p[:row] * a[row]
-        most = jnp.minimum(most, _bound(*beside).min(axis=0))
+        most = jnp.minimum(most, largest_square(*beside).min(axis=0))
     return most
 
 
@@ -83,7 +83,7 @@ def _backward(width: Array, rows: _Rows, largest: Float[Array, " K"]) -> Float[A
 
     def step(ahead: Array, cell: tuple[Array, _Rows, Array]) -> tuple[Array, Array]:
         twice, (p, r, a), most = cell
-        here = jnp.minimum(most, _bound(p - twice * r, p * ahead + twice * a).min())
+        here = jnp.minimum(most, largest_square(p - twice * r, p * ahead + twice * a).min())
         return here, here
 
     inputs: Any = 2.0 * width, rows, largest

@@ -12,19 +12,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ..inverse._inverse_kinematics import joint_box
 from ..kinematics import forward_kinematics
 from ..numerics._arguments import as_floats, concrete
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
 from ._cells import Cells
 from ._jerk import PLACES, reference, rows_of, stretched
-from ._least_time import least_time
+from ._least_time import largest_square, least_time
 from ._spline import Spline, chord_lengths, cubic_derivatives, spline_through
+from ._start import OUTSIDE
 from ._timing import Timing, by_progress
 
 Limit = ArrayLike | Mapping[str, float] | None
 _CELLS, _FEWEST = 400, 4
-_TINY = 1e-30
 _CHECKED = 5, 33
 """Places in each cell where limits are checked: the cells of the smooth motion may have knots inside."""
 
@@ -47,9 +48,9 @@ def retime(
     in the squared rate of progress follows, so accelerations are continuous. Then times are stretched by the factor
     ``stretch`` that keeps limits between the grid's points too.
 
-    Works in ``jit`` and ``vmap``. ``duration`` has derivatives by waypoints and limits in both modes. With limits of
-    jerk these follow from the envelope theorem, so they are of first order alone; they are those of the least time, and
-    leave out how ``stretch`` and the grid change.
+    Works in ``jit`` and ``vmap``. ``duration`` has derivatives by waypoints and limits in both modes, which include how
+    ``stretch`` and the grid change. With limits of jerk they follow from the implicit function theorem, and are of
+    first order alone.
 
     Args:
         waypoints: positions of the joints [rad or m]; no two neighbours are equal. (N, n). Or a path, such as
@@ -68,7 +69,7 @@ def retime(
 
     Raises:
         TypeError, ValueError: waypoints that are equal or not finite, fewer than two, limits that are not positive, or
-            a robot with joints that are no hinges or slides.
+            a robot with joints that are no hinges or slides; with ``robot``, waypoints outside of the joints' ranges.
         KeyError: no such joint or frame.
     """
     given = waypoints if isinstance(waypoints, Spline) else as_floats(waypoints)
@@ -185,6 +186,8 @@ def _check_points(points: Array, robot: Robot | None) -> None:
         return
     if not np.isfinite(seen).all():
         raise OsikValueError(f"waypoint {int(np.argmin(np.isfinite(seen).all(axis=1)))} is not finite")
+    if robot is not None:
+        _check_ranges(robot, seen)
     equal = (seen[1:] == seen[:-1]).all(axis=1)
     if equal.any():
         first = int(equal.argmax())
@@ -197,6 +200,17 @@ def check_scalar_joints(robot: Robot) -> None:
         raise OsikValueError(
             f"the robot has {robot.nq} configuration entries and {robot.nv} velocities; a path is one of hinges "
             "and slides alone: lock the other joints (locked_joints=)"
+        )
+
+
+def _check_ranges(robot: Robot, points: np.ndarray) -> None:
+    lower, upper = (np.asarray(end) for end in joint_box(robot, None))
+    outside = (points < lower - OUTSIDE) | (points > upper + OUTSIDE)
+    if outside.any():
+        row, joint = (int(i) for i in np.argwhere(outside)[0])
+        raise OsikValueError(
+            f"waypoint {row} has {points[row, joint]:g} of {dof_names(robot)[joint]!r}, whose range is "
+            f"{lower[joint]:g} to {upper[joint]:g}: move it into the range"
         )
 
 
@@ -234,26 +248,25 @@ def _retimed(
             return jnp.full(len(s), jnp.inf, s.dtype)
         own, name = robot, frame
         rate = jax.vmap(lambda q, move: jax.jvp(lambda q: _origin(own, q, name), (q,), (move,))[1])
-        return wanted**2 / jnp.maximum((rate(path.derivatives(s)[0], first) ** 2).sum(axis=1), _TINY)
+        return largest_square((rate(path.derivatives(s)[0], first) ** 2).sum(axis=1), wanted**2)
 
     grid = _grid(path.knots, -(-count // (len(path.knots) - 1)))
     _, first, second, _ = path.derivatives(grid)
-    by_joints = jnp.min(limits[0] / jnp.maximum(jnp.abs(first), _TINY), axis=1) ** 2
+    by_joints = largest_square((first / limits[0]) ** 2, jnp.ones((), grid.dtype)).min(axis=1)
     progress = least_time(grid, first, second, jnp.minimum(by_joints, cap(grid, first)), limits[1])
-    duration = progress.start[-1]
     if smooth:
         moving = jnp.isfinite(limits[2])
         ramp = jnp.max(jnp.where(moving, limits[1] / jnp.where(moving, limits[2], 1.0), 0.0))
-        width, cubics = jax.lax.stop_gradient(reference(progress, jnp.minimum(ramp, duration), count))
+        width, cubics = reference(progress, jnp.minimum(ramp, progress.start[-1]), count)
         at = jax.vmap(lambda x: cubic_derivatives(cubics, jnp.full(count, x)), out_axes=2)(width * PLACES)
         thirds = jnp.stack([jnp.repeat(path.derivatives(at[0, :, end])[3], len(PLACES), axis=0) for end in (0, -1)])
         at = at.reshape(4, -1)
         states = path.derivatives(at[0])
         rows = rows_of(states, thirds, at, cap(at[0], states[1]), limits)
-        progress, duration = stretched(width, cubics, rows)
+        progress = stretched(width, cubics, rows)
     ratio = _largest_ratio(path, progress, limits, cap, _CHECKED[smooth])
-    ratio = jax.lax.stop_gradient(ratio) if smooth else ratio  # the progress has no derivatives then
-    return path, progress.slower(ratio), ratio, duration * ratio
+    progress = progress.slower(ratio)
+    return path, progress, ratio, progress.start[-1]
 
 
 def _origin(robot: Robot, q: Array, frame: str) -> Float[Array, "3"]:
@@ -283,10 +296,12 @@ def _largest_ratio(
         return largest
 
     fractions = jnp.linspace(0.0, 1.0, places, dtype=limits.dtype)
-    inside = jnp.max(jax.lax.map(lambda fraction: ratio(progress.inside(fraction), ends), fractions))
+    # the backward pass computes each place anew: kept, many paths would not fit into memory
+    at = jax.checkpoint(lambda fraction: ratio(progress.inside(fraction), ends))
+    inside = jnp.max(jax.lax.map(at, fractions))
     if len(path.knots) > 2:  # between two places of a cell
         sides = 6.0 * path.coefficients[:-1, 3], 6.0 * path.coefficients[1:, 3]
-        inside = jnp.maximum(inside, ratio(progress.through(jax.lax.stop_gradient(path.knots[1:-1])), sides))
+        inside = jnp.maximum(inside, ratio(progress.through(path.knots[1:-1]), sides))
     return jnp.maximum(inside, 1.0)
 
 

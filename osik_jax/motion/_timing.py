@@ -39,7 +39,7 @@ class Timing(eqx.Module):
     """Least-time motion along a spline.
 
     Attributes:
-        duration: of the motion [s]. Its derivatives by waypoints and limits are those of the optimum.
+        duration: of the motion [s]; with derivatives by waypoints and limits.
         path: the spline, by a parameter s from 0 to 1.
         progress: s as a function of time.
         limits: of speed, acceleration and jerk, infinite where there is none. (3, n)

@@ -136,6 +136,38 @@ def test_many_chunks_in_one_call(rng) -> None:
     np.testing.assert_array_equal(many.feasible.all(axis=1), [True, False, True])
 
 
+def test_a_start_just_below_the_limit_of_speed_stays_below_it() -> None:
+    """At 0.995 of the limit and still faster: the coefficients of the speed are above it, the speed is not."""
+    for speed, pull in ((1.4927, 0.569), (1.35, 3.29), (1.4999, 0.08)):
+        start = HOME, np.full(7, -speed) * np.eye(7)[0], np.full(7, -pull) * np.eye(7)[0]
+        found = planned(HOME - 2.0 * TIMES[:, None] * np.eye(7)[0], start, 0.0, LIMITS)
+        assert found.feasible.all()
+        states = np.asarray(found.at(np.linspace(0.0, 0.3, 4000)))
+        assert np.abs(states[1]).max() <= 1.5 * (1.0 + 1e-6)
+        assert np.abs(states[1]).max() > 1.499  # and as fast as it may be
+
+
+@pytest.mark.slow
+def test_a_chunk_is_feasible_where_it_keeps_its_limits_and_only_there(rng) -> None:
+    """Streams into the ends of ranges: where a chunk is not feasible, the running one goes on."""
+    lower, upper = np.asarray(ARM.position_lower), np.asarray(ARM.position_upper)
+    kept = []
+    for _ in range(15):
+        start, begin, running = (HOME, REST, REST), 0.0, None
+        for _ in range(4):
+            points = np.asarray(start[0]) + np.cumsum(0.25 * rng.normal(size=(12, 7)), axis=0)
+            found = planned(points, start, begin, LIMITS)
+            q, *rates = np.asarray(found.at(np.linspace(begin, float(found.end), 4000)))
+            past = np.maximum(q - upper, lower - q).max(axis=0) <= 1e-6
+            used = [np.abs(a).max(axis=0) <= (1.0 + 1e-6) * b for a, b in zip(rates, LIMITS.values(), strict=True)]
+            assert (np.all([past, *used], axis=0) | ~np.asarray(found.feasible)).all()
+            kept.append(bool(found.feasible.all()))
+            running = found if kept[-1] or running is None else running
+            begin += 0.4
+            start = running.state(begin)
+    assert np.mean(kept) > 0.9
+
+
 def test_a_start_that_cannot_be_stopped_is_named() -> None:
     fast = np.array([1.4, 0, 0, 0, 0, 0, 0])
     edge = HOME + np.array([2.8 - HOME[0], 0, 0, 0, 0, 0, 0])

@@ -123,6 +123,11 @@ def test_a_command_follows_a_file(tmp_path, capsys) -> None:
             {},
             "cannot be reached: .*, 7. Pose 2: not found",
         ),
+        (
+            {"hand": (POSES[0] + np.linspace(0, 1.5, 8)[:, None] * [1.0, 0.0, 0.0], POSES[1])},
+            {"free": {"hand": "z"}},
+            r"of 8 poses cannot be reached: .*, 7. Pose 2: not found in .* is 0.04.* m and",
+        ),
         ({"hnd": POSES}, {}, "did you mean 'hand'"),
         ({"hand": POSES}, {"free": {"hand": "w"}}, "axis"),
         ({"hand": POSES}, {"speed": 0.0}, "speed is"),

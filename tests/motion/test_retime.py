@@ -92,29 +92,48 @@ def test_the_time_is_least() -> None:
 ARGUMENTS = jnp.asarray(POINTS), jnp.asarray(VELOCITY), jnp.asarray(ACCELERATION), jnp.asarray(JERK)
 
 
-def slopes(of, kind: int, smooth: bool) -> tuple[float, float]:
-    """Derivative of the duration along a random change of one argument, and its central difference."""
+@partial(jax.jit, static_argnames=("kind", "smooth"))
+def gradient(kind: int, smooth: bool, *given):
+    return jax.grad(lambda *given: run(*given, smooth=smooth).duration, argnums=kind)(*given)
+
+
+def check_slope(kind: int, smooth: bool, seed: int = 0) -> None:
+    """Compare the duration's derivative along a random change of one argument with its central difference."""
+    points = np.cumsum(np.random.default_rng(seed).normal(size=(6, 3)) * 0.5, axis=0)
+    arguments = jnp.asarray(points), *ARGUMENTS[1:]
     change = jnp.asarray(np.random.default_rng(kind).normal(size=ARGUMENTS[kind].shape)) * ARGUMENTS[kind].std()
-    gradient = jax.grad(lambda *given: run(*given, smooth=smooth).duration, argnums=kind)(*ARGUMENTS)
-    ends = []
-    for step in (1e-4, -1e-4):
-        given = [a + step * change if i == kind else a for i, a in enumerate(ARGUMENTS)]
-        ends.append(float(of(run(*given, smooth=smooth))))
-    return float((gradient * change).sum()), (ends[0] - ends[1]) / 2e-4
+    step, ends = 1e-6 if smooth else 1e-5, []
+    for sign in (step, -step):
+        given = [a + sign * change if i == kind else a for i, a in enumerate(arguments)]
+        ends.append(float(run(*given, smooth=smooth).duration))
+    wanted = (ends[0] - ends[1]) / (2.0 * step)
+    np.testing.assert_allclose((gradient(kind, smooth, *arguments) * change).sum(), wanted, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_duration_has_the_derivatives_of_central_differences(kind) -> None:
-    found, wanted = slopes(lambda timing: timing.duration, kind, smooth=False)
-    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+    check_slope(kind, smooth=False)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [0, 1])
-def test_with_jerk_derivatives_are_those_of_the_least_time(kind) -> None:
-    """Of the duration before its stretch, whose grid changes with the arguments in the second order of its width."""
-    found, wanted = slopes(lambda timing: timing.duration / timing.stretch, kind, smooth=True)
-    np.testing.assert_allclose(found, wanted, rtol=1e-2)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("kind", [0, 1, 2, 3])
+def test_with_jerk_too_stretch_and_grid_count(kind, seed) -> None:
+    check_slope(kind, True, seed)
+
+
+@pytest.mark.slow
+def test_both_modes_give_the_same_derivative_with_jerk() -> None:
+    moved = jax.jvp(lambda points: run(points, smooth=True).duration, (ARGUMENTS[0],), (ARGUMENTS[0] ** 2,))[1]
+    np.testing.assert_allclose(moved, (gradient(0, True, *ARGUMENTS) * ARGUMENTS[0] ** 2).sum(), rtol=1e-9)
+
+
+def test_without_a_limit_of_speed_gradients_are_finite() -> None:
+    def duration(points, acceleration):
+        return retime(points, acceleration=acceleration, cells=40).duration
+
+    for found in jax.jit(jax.grad(duration, argnums=(0, 1)))(ARGUMENTS[0], ARGUMENTS[2]):
+        assert np.isfinite(found).all() and np.abs(found).max() > 0.01
 
 
 SINGLE = """
@@ -155,6 +174,13 @@ def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     parts = timing.slow_parts(speed, time[:-1])
     assert len(parts) == 2 and {part.limit for part in parts} == {"acceleration"}  # at both ends
     assert parts[0].joint in timing.joints and parts[0].slowest < 0.05
+
+
+def test_a_waypoint_outside_of_its_range_is_named() -> None:
+    arm = osik.load_robot("arm7")
+    points = np.asarray(arm.q0) + np.linspace(0.0, 3.0, 4)[:, None] * np.eye(7)[0]
+    with pytest.raises(osik.OsikError, match="waypoint 3 has 3 of 'joint1', whose range is -2.8973 to 2.8973"):
+        retime(points, robot=arm, acceleration=5.0)
 
 
 @pytest.mark.parametrize(
