@@ -91,8 +91,14 @@ def base_clearances(
 
     These are the robot's shapes that no joint moves, and the footprint. ``Scene.allow`` says what may touch them.
     """
-    shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
-    q = np.broadcast_to(robot.q0, (len(bases), robot.nq))
+    return shape_clearances(robot, bases, scene, _fixed_shapes(robot_shapes(robot, srdf), footprint), robot.q0)
+
+
+def shape_clearances(
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
+) -> Float[np.ndarray, " n"]:
+    """Return the distance of the nearest pair of shapes at each base, with one configuration at all of them [m]."""
+    q = np.broadcast_to(q, (len(bases), robot.nq))
     near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
     return np.asarray(near.distance)
 

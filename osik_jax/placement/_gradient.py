@@ -14,6 +14,7 @@ from scipy.optimize import linprog
 from scipy.sparse import block_diag, csr_array, hstack, vstack
 
 from ..collision import is_free
+from ..inverse._chain_problem import ENOUGH
 from ..inverse._chain_search import ChainSearch, Goal
 from ._bases import in_bases, scenes_in_bases
 from ._score import Task, joint_margin, manipulability
@@ -22,6 +23,8 @@ _TURN = 0.2
 """Largest motion of a joint in the first step of the climb [rad or m]."""
 _STEPS, _CORRECTIONS = 12, 6
 """Steps of the climb at most, and steps after each that bring the frames back to their poses."""
+_LEAST, _KEPT = 0.1, 0.5
+"""Share of the first step below which the climb ends, and share of the smallest manipulability that it keeps."""
 _TOUCH = 1e-6
 """Configurations keep so much more than the clearance, as in ``core/freedom.hpp`` [m]."""
 
@@ -100,22 +103,25 @@ class Climber(NamedTuple):
         """Return a base and configurations with larger margins, from ones of poses that are reached.
 
         Each step is the linear program of the largest smallest margin, over motions of the base and of the joints that
-        keep the frames at their poses. A step that does not hold is halved.
+        keep the frames at their poses. A step that does not hold is halved: one after which a frame is off its pose,
+        something touches, or the smallest manipulability is below half of what it was.
         """
-        radius, margin = 1.0, self._margin(q)
+        radius, (margin, start) = 1.0, self._smallest(q)
         for _ in range(_STEPS):
             tried = self._corrected(*self._step(base, q, radius))
-            if tried is None or not self._margin(tried[1]) > margin:
+            more, index = (0.0, 0.0) if tried is None else self._smallest(tried[1])
+            if tried is not None and more > margin and index >= _KEPT * start:
+                (base, q), margin, radius = tried, more, min(2.0 * radius, 1.0)
+            elif radius < _LEAST:
+                break
+            else:
                 radius *= 0.5
-                if radius < 0.05:
-                    break
-                continue
-            (base, q), radius = tried, min(2.0 * radius, 1.0)
-            margin = self._margin(q)
         return base, q
 
-    def _margin(self, q: np.ndarray) -> float:
-        return float(joint_margin(self.task.search, q[:, self.task.entries]).min())
+    def _smallest(self, q: np.ndarray) -> tuple[float, float]:
+        """Return the smallest margin and the smallest manipulability of some configurations."""
+        margin = joint_margin(self.task.search, q[:, self.task.entries])
+        return float(margin.min()), float(manipulability(self.task.frames, q).min())
 
     def _step(self, base: np.ndarray, q: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return base and configurations after a step by the linear program; the frames move a little.
@@ -168,4 +174,4 @@ class Climber(NamedTuple):
 def _solved(search: ChainSearch, goal: Goal, base: Any, x: Any) -> tuple[Array, Array]:
     """Return configurations after steps towards the poses, and whether they are there."""
     x, _, errors = search.finishing(exact=True).advance(x, goal_in_base(base, goal), _CORRECTIONS)
-    return x, errors.score <= 1.0
+    return x, errors.score <= ENOUGH  # of a stretched arm the last millimetre of a tolerance is worth much margin

@@ -22,6 +22,8 @@ from ._bases import in_bases, scenes_in_bases
 
 _PAIRS = 64, 1024
 """Pairs of a base and a pose in one call, if they are few or many: each number compiles anew."""
+_NUMBERS = 8_000_000
+"""Largest number of entries of all scenes of one call, so that they take about 100 MB."""
 
 
 class Task(NamedTuple):
@@ -146,7 +148,13 @@ def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndar
     count = len(base)
     if not count:
         return Scores(*(field[base, pose] for field in Scores.empty(task, len(bases))))
-    size = _PAIRS[count > 8 * _PAIRS[0]]
+    each = (
+        1
+        if task.scene is None
+        else task.scene.capacity * (task.scene.capacity + 100) + 3 * len(task.scene.table.vertices)
+    )
+    few, many = _PAIRS
+    size = few if count <= 8 * few or each * many > _NUMBERS else many
     padded = np.arange(-(-count // size) * size) % count  # the last call has the first pairs again
     parts = []
     for k in range(0, len(padded), size):
