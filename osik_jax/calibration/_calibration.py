@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..robot import Robot
 from ._files import write_calibration
-from ._residuals import Combination, Residuals
+from ._residuals import Combination, Residuals, root_mean_square
 from ._setup import BASE, FixedFrame, Setup
 from ._unknowns import Parameter
 
@@ -123,7 +123,7 @@ class Calibration(eqx.Module):
         """Return the fit in words: residuals before and after, numbers with deviations, what is not determined."""
         lines = [f"{'converged' if bool(self.converged) else 'NOT converged'} after {int(self.iterations)} iterations"]
         for part, noise in zip(self.residuals, np.asarray(self.noise), strict=True):
-            before, after = (_rms(rows) for rows in (part.before, part.after))
+            before, after = (root_mean_square(rows) for rows in (part.before, part.after))
             lines.append(
                 f"{part.kind}: {len(part.after)} readings, rms {before:.4g} -> {after:.4g} {part.unit}, "
                 f"{noise:.2f} of the given sigma, {int((np.asarray(part.weights) < 0.1).sum())} outliers"
@@ -147,10 +147,6 @@ class Calibration(eqx.Module):
         numbers = zip(self.names, np.asarray(self.vector), np.asarray(self.deviation), self.units, strict=True)
         frames = {"base": self.base, **self.frames}
         write_calibration(path, bool(self.converged), list(numbers), self.residuals, self.unobservable, frames)
-
-
-def _rms(rows: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(np.asarray(rows)))))
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:

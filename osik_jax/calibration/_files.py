@@ -14,7 +14,7 @@ from .._whole_file import write_text
 from ..robot import Robot
 from ..robot.loading._mjmodel import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
-from ._residuals import Combination, Residuals
+from ._residuals import Combination, Residuals, root_mean_square
 from ._setup import FixedFrame
 
 _POSITION, _QUATERNION, _PIXEL = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("u", "v")
@@ -134,7 +134,7 @@ def write_calibration(
 
 
 def _of_residuals(part: Residuals) -> str:
-    before, after = (_number(np.sqrt(np.square(np.asarray(rows)).mean())) for rows in (part.before, part.after))
+    before, after = (_number(root_mean_square(rows)) for rows in (part.before, part.after))
     numbers = f"readings: {len(part.after)}, rms_before: {before}, rms_after: {after}"
     return f"{{of: {json.dumps(part.kind)}, {numbers}, unit: {json.dumps(part.unit)}}}"
 

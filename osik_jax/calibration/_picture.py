@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import ArrayLike
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from ._residuals import Residuals
+from ._residuals import Residuals, lengths, root_mean_square
 
 _BEFORE, _AFTER, _INK = "#c98b2b", "#2f6fb0", "#2b2f36"
 _OUTLIER = 0.1
@@ -25,11 +24,12 @@ def draw_residuals(parts: Sequence[Residuals]) -> Figure:
     figure = Figure(figsize=(9.0, 0.5 + 2.9 * len(parts)), dpi=130, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
     for place, part in zip(figure.subplots(len(parts), 1, squeeze=False)[:, 0], parts, strict=True):
-        before, after = (_sizes(rows, part.unit) for rows in (part.before, part.after))
-        unit = "mm" if part.unit.startswith("m") else part.unit
+        unit, scale = ("mm", 1e3) if part.unit.startswith("m") else (part.unit, 1.0)
+        before, after = (scale * lengths(rows) for rows in (part.before, part.after))
+        first, last = (scale * root_mean_square(rows) for rows in (part.before, part.after))
         number = np.arange(1, len(after) + 1)
-        place.plot(number, before, "o", color=_BEFORE, ms=4, label=f"before, rms {_rms(before):.3g} {unit}")
-        place.plot(number, after, "o", color=_AFTER, ms=4, label=f"after, rms {_rms(after):.3g} {unit}")
+        place.plot(number, before, "o", color=_BEFORE, ms=4, label=f"before, rms {first:.3g} {unit}")
+        place.plot(number, after, "o", color=_AFTER, ms=4, label=f"after, rms {last:.3g} {unit}")
         out = np.asarray(part.weights) < _OUTLIER
         if out.any():
             place.plot(number[out], after[out], "x", color=_INK, ms=9, label=f"{int(out.sum())} outliers")
@@ -41,13 +41,3 @@ def draw_residuals(parts: Sequence[Residuals]) -> Figure:
         place.grid(alpha=0.3)
         place.legend(frameon=False, fontsize=9)
     return figure
-
-
-def _sizes(rows: ArrayLike, unit: str) -> np.ndarray:
-    """Return the length of each reading's residual [mm, or the unit as it is]; of a pose that of its position."""
-    rows = np.asarray(rows)[:, :3]
-    return np.linalg.norm(rows, axis=-1) * (1e3 if unit.startswith("m") else 1.0)
-
-
-def _rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

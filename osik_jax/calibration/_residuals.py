@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 
 class Combination(NamedTuple):
@@ -40,3 +41,13 @@ class Residuals(NamedTuple):
     before: Float[Array, "n k"]
     after: Float[Array, "n k"]
     weights: Float[Array, " n"]
+
+
+def lengths(rows: ArrayLike) -> Float[np.ndarray, " n"]:
+    """Return the length of each reading's residual, in its unit; of a pose that of its position."""
+    return np.linalg.norm(np.asarray(rows)[:, :3], axis=-1)
+
+
+def root_mean_square(rows: ArrayLike) -> float:
+    """Return the root mean square of the lengths of the readings' residuals."""
+    return float(np.sqrt(np.mean(lengths(rows) ** 2)))

@@ -107,6 +107,8 @@ def find_free(
     if is_traced((goals, settings, obstacles.around, robot)):
         return Explored(_traced(robot, goals, settings, most, steps, how, obstacles), *split(None))
     counts = np.full(count, most)
+    if not (how.near or how.every):
+        how = how._replace(seeds=0)  # static, and ``counts`` says how many
     given = robot, route, goals, settings, counts, most, steps, how
     results = whole(*given, single=single, around=obstacles.around)
     return Explored(_named(results, obstacles), *split(None if results.ends is None else np.asarray(results.ends)))

@@ -118,10 +118,10 @@ def whole(
 
 @remembered
 def _known(robot: Robot, lower: Array, upper: Array, *, frames: tuple[str, ...]) -> _Known:
-    return _Known(*jax.tree.flatten(_carried(robot, lower, upper, frames=frames)), {})
+    return _Known(*jax.tree.flatten(carried_by(robot, lower, upper, frames=frames)), {})
 
 
-_carried = jax.jit(carried, static_argnames="frames")
+carried_by = jax.jit(carried, static_argnames="frames")
 
 
 def _shift(key: Any, dimensions: int) -> Array:

@@ -18,6 +18,7 @@ from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Labels, _convex_shapes, _with
 from ..collision._table import RobotShapes
 from ..kinematics._rigid import compose, rotate
+from ..numerics._host import module_of
 from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
@@ -49,9 +50,10 @@ def grid_bases(axes: Sequence[np.ndarray]) -> Float[np.ndarray, "n 4"]:
 
 def base_poses(bases: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
     """Return position [m] and rotation (base axes to world axes) of bases."""
-    cos, sin, zero = np.cos(bases[:, 2]), np.sin(bases[:, 2]), np.zeros(len(bases))
+    numbers = module_of(bases)
+    cos, sin, zero = numbers.cos(bases[:, 2]), numbers.sin(bases[:, 2]), numbers.zeros(len(bases))
     rows = (cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1.0)
-    return bases[:, [0, 1, 3]], np.stack([np.stack(row, -1) for row in rows], -2)
+    return bases[:, [0, 1, 3]], numbers.stack([numbers.stack(row, -1) for row in rows], -2)
 
 
 def in_bases(bases: Float[np.ndarray, "n 4"], position: Any, rotation: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -63,19 +65,20 @@ def in_bases(bases: Float[np.ndarray, "n 4"], position: Any, rotation: Any) -> t
         rotation: (k, 3, 3) or (n, k, 3, 3)
     """
     origin, turn = base_poses(bases)
-    inverse = np.swapaxes(turn, -1, -2)[:, None]
-    return rotate(inverse, np.asarray(position) - origin[:, None]), compose(inverse, np.asarray(rotation))
+    inverse = turn.swapaxes(-1, -2)[:, None]
+    return rotate(inverse, position - origin[:, None]), compose(inverse, rotation)
 
 
 def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
     """Return a stack of the scene in the axes of each base; held objects stay in their hands."""
     count, table = len(bases), scene.table
-    moved = in_bases(bases, table.position, table.rotation)
-    held = np.asarray(scene.body) >= 0
-    position = np.where(held[:, None], np.asarray(table.position), moved[0])
-    rotation = np.where(held[:, None, None], np.asarray(table.rotation), moved[1])
+    numbers = module_of(bases)
+    given, held = [numbers.asarray(part) for part in (table.position, table.rotation)], scene.body >= 0
+    moved = in_bases(bases, *given)
+    position = numbers.where(held[:, None], given[0], moved[0])
+    rotation = numbers.where(held[:, None, None], given[1], moved[1])
     parts = table, scene.body, scene.contact, scene.among
-    table, body, contact, among = jax.tree.map(lambda a: np.broadcast_to(a, (count, *np.shape(a))), parts)
+    table, body, contact, among = jax.tree.map(lambda a: numbers.broadcast_to(a, (count, *np.shape(a))), parts)
     labels = Labels((scene.labels.names,) * count, (scene.labels.objects,) * count)
     table = table._replace(position=position, rotation=rotation)
     return _with(scene, table=table, body=body, contact=contact, among=among, labels=labels)
@@ -88,8 +91,14 @@ def base_clearances(
 
     These are the robot's shapes that no joint moves, and the footprint. ``Scene.allow`` says what may touch them.
     """
-    shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
-    q = np.broadcast_to(robot.q0, (len(bases), robot.nq))
+    return shape_clearances(robot, bases, scene, _fixed_shapes(robot_shapes(robot, srdf), footprint), robot.q0)
+
+
+def shape_clearances(
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
+) -> Float[np.ndarray, " n"]:
+    """Return the distance of the nearest pair of shapes at each base, with one configuration at all of them [m]."""
+    q = np.broadcast_to(q, (len(bases), robot.nq))
     near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
     return np.asarray(near.distance)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
@@ -14,15 +15,21 @@ from ..collision import CollisionShape, Scene
 from ..collision._core import check_scene
 from ..collision._robot_shapes import Given
 from ..control._checks import check_setting
+from ..inverse._chain_problem import ChainRoute, search_of
+from ..inverse._chain_search import Goal
 from ..inverse._free import checked_clearance
+from ..inverse._inverse_kinematics import joint_box
 from ..inverse._poses import read_poses
+from ..inverse._seeds import shift_of
+from ..inverse._whole import carried_by
 from ..kinematics._pose_forms import PoseLike
 from ..numerics._arguments import check_count
 from ..reachability._frame import read_frame
 from ..robot import Robot
 from ._bases import AXES, base_clearances, checked_axis, grid_bases
+from ._gradient import Climber
 from ._placement import Placement
-from ._score import Scores, Task, score_bases, solve_bases
+from ._score import Task, is_too_far, joint_margin, manipulability, score_bases, score_grid, solve_pairs
 
 _BEST = 6
 """Number of bases of the grid that are improved."""
@@ -49,12 +56,15 @@ def place_base(
 ) -> Placement:
     """Return where to put a robot's base so that it reaches most of a set of poses, and how well each base does.
 
-    All bases of a grid are tried in one batch of ``inverse_kinematics``, with the poses and the scene in the axes of
+    All bases of a grid are tried in batches of ``inverse_kinematics``, with the poses and the scene in the axes of
     each base. A base is allowed only if what stands with it keeps ``clearance`` to the scene: the robot's shapes that
     no joint moves, and ``footprint``. Bases are compared by the number of poses reached, then by the smallest margin
-    of a joint to its limits. The best bases of the grid are then improved by a pattern search: steps of half the
-    grid's spacing along each coordinate, halved ``refine`` times, with the configuration of the largest margin for each
-    pose. The same arguments give the same answer.
+    of a joint to its limits. Bases that cannot be the best get fewer searches (``Placement.reaches``).
+
+    The best base is then moved off the grid, within its range. While it misses poses, bases around it are tried, at
+    half the grid's spacing and less. Base and configurations together climb the smallest margin of the poses reached:
+    each step is a linear program of the exact derivatives, and is made only if the frames come back to their poses and
+    nothing touches. The same arguments give the same answer.
 
     A pose that counts as reached has a configuration; one that does not was not found by ``seeds`` searches.
 
@@ -71,7 +81,7 @@ def place_base(
         footprint: more shapes that stand with the base, in its axes, such as a pedestal. Moving links may touch them.
         q0: where those joints stay that do not move the frames, such as open fingers. Default: ``robot.q0``. (nq,)
         seeds: number of searches for a pose at a base.
-        refine: number of halvings of the pattern search; 0: the best base of the grid, as it is.
+        refine: number of times that the best base is moved off the grid; 0: the best base of the grid, as it is.
         key: an integer: other starts of the searches.
         position_tolerance: largest distance from a pose [m].
         orientation_tolerance: largest angle to a pose [rad].
@@ -111,11 +121,11 @@ def place_base(
             f"no base of the grid stands free: the best one is {gap.max():.3g} m from the scene. Let the base touch "
             "what it stands on by scene.allow, or give other x, y or height"
         )
-    reached, margin, index = _spread(allowed, score_bases(task, grid[allowed]).table)
-    best = _order(reached, margin, index)[:_BEST]
-    bases, scores = _improved(task, grid[best], axes, refine, lambda b: gaps(b) >= clearance)
-    first = _order(*scores.table)[0]
-    shape = tuple(map(len, axes))
+    scores = score_grid(task, grid[allowed])
+    best = grid[allowed][_order(*scores.table)[:_BEST]]
+    reaches, margin, index = _spread(allowed, (scores.reached, *scores.table[1:]))
+    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases) >= clearance)
+    shape, count = tuple(map(len, axes)), len(task.goal.position)
     return Placement(
         robot=robot,
         scene=scene,
@@ -123,14 +133,16 @@ def place_base(
         poses=np.asarray(task.goal.position).reshape(-1, 3),
         **dict(zip(AXES, axes, strict=True)),
         base_clearance=gap.reshape(shape),
-        reached=reached.reshape(shape),
+        reaches=reaches.reshape(*shape, count),
+        too_far=is_too_far(task, grid).sum(1).reshape(shape),
         margin=margin.reshape(shape),
         manipulability=index.reshape(shape),
-        best=bases[first],
-        q=scores.q[first],
-        best_margin=scores.margin[first],
-        best_manipulability=scores.manipulability[first],
-        solution=solve_bases(task, bases[first : first + 1]),
+        best=base,
+        q=q,
+        best_margin=joint_margin(task.search, q[:, task.entries]),
+        best_manipulability=np.asarray(manipulability(task.frames, q)),
+        solution=solve_pairs(task, base[None], np.zeros(count, int), np.arange(count)),
+        task=task,
     )
 
 
@@ -146,40 +158,55 @@ def _read_task(robot: Robot, poses: Any, scene: Scene | None, settings: dict[str
         raise OsikValueError(f"poses is {type(poses).__name__}; it is a dictionary, name of a frame to its poses")
     frames = tuple(read_frame(robot, name, None, key) for name in poses)
     goal, rows, _ = read_poses(robot, poses)
-    return Task(robot, frames, rows, goal, scene, settings)
+    lower, upper = joint_box(robot, None)
+    home = jnp.asarray(robot.q0 if settings["q0"] is None else settings["q0"])
+    tolerance = jnp.array([settings["position_tolerance"], settings["orientation_tolerance"]])
+    route, own = ChainRoute(tuple(poses), rows), carried_by(robot, lower, upper, frames=tuple(poses))
+    shift = shift_of(key, len(own.lower))
+    search = search_of(own, route, home, shift, tolerance, 1, warm=False, near=False)
+    return Task(robot, frames, rows, goal, scene, settings, search)
 
 
 def _spread(allowed: np.ndarray, table: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the scores of the allowed bases as those of all bases: 0 and NaN for those that are not allowed."""
+    """Return the scores of the allowed bases as those of all bases: False and NaN for those that are not allowed."""
     whole = []
     for values in table:
-        whole.append(np.full(len(allowed), 0 if values.dtype.kind == "i" else np.nan, values.dtype))
+        nothing = False if values.dtype == bool else np.nan
+        whole.append(np.full((len(allowed), *values.shape[1:]), nothing, values.dtype))
         whole[-1][allowed] = values
     return whole
+
+
+def _refined(
+    task: Task, bases: np.ndarray, axes: Sequence[np.ndarray], refine: int, stands: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best of some bases, moved off the grid, and its configurations; ``stands``: which bases are free."""
+    lower, upper = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    steps = np.array([0.5 * float(np.diff(axis).min()) if len(axis) > 1 else 0.0 for axis in axes])
+    base, q = _best_of(task, bases)
+    for _ in range(refine if steps.any() else 0):
+        if np.isnan(q).any():
+            near = base + grid_bases([np.array([-1.0, 0.0, 1.0]) * step if step else np.zeros(1) for step in steps])
+            near = near[stands(near) & ((near >= lower) & (near <= upper)).all(1)]
+            base, q = _best_of(task, near[_order(*score_grid(task, near).table)[:1]])
+        here = np.isfinite(q).all(-1)
+        if here.any():
+            part = task._replace(goal=Goal(*(field[here] for field in task.goal)))
+            base, q[here] = Climber(part, lower, upper, steps, stands).climb(base, q[here])
+            again = score_bases(task, base[None], every=True)
+            worse = ~(joint_margin(task.search, q[:, task.entries]) >= again.margin[0])
+            q[worse] = again.q[0][worse]
+        steps = 0.5 * steps
+    return base, q
+
+
+def _best_of(task: Task, bases: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the best base, and for each pose its configuration with the largest margin."""
+    scores = score_bases(task, bases, every=True)
+    first = _order(*scores.table)[0]
+    return bases[first], scores.q[first]
 
 
 def _order(reached: np.ndarray, margin: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return the numbers of bases, best first: by poses reached, then by margin, then by manipulability."""
     return np.lexsort((-np.nan_to_num(index), -np.nan_to_num(margin), -reached))
-
-
-def _improved(
-    task: Task, bases: np.ndarray, axes: Sequence[np.ndarray], refine: int, stands: Any
-) -> tuple[np.ndarray, Scores]:
-    """Return the bases after a pattern search, and their scores; ``stands``: whether bases are free of the scene."""
-    scores = _scored(task, bases, stands)
-    steps = np.array([0.5 * float(np.diff(axis).min()) if len(axis) > 1 else 0.0 for axis in axes])
-    for _ in range(refine if steps.any() else 0):
-        moves = np.concatenate([np.diag(steps), -np.diag(steps)])
-        tried = bases[_order(*scores.table)[:1]] + moves[moves.any(1)]
-        more = _scored(task, tried, stands)
-        bases = np.concatenate([bases, tried])
-        scores = Scores(*(np.concatenate(part) for part in zip(scores, more, strict=True)))
-        steps *= 0.5
-    return bases, scores
-
-
-def _scored(task: Task, bases: np.ndarray, stands: Any) -> Scores:
-    """Return the scores of bases; those that do not stand free reach no pose."""
-    scores = score_bases(task, bases, every=True)
-    return scores._replace(reached=scores.reached & stands(bases)[:, None])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,8 @@ from ..collision import Scene
 from ..inverse import InverseKinematicsSolution
 from ..robot import Robot
 from ._bases import base_poses
+from ._gradient import BaseGradient, base_gradient
+from ._score import Task
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +34,11 @@ class Placement:
         yaw: likewise [rad]. (nyaw,)
         height: likewise [m]. (nh,)
         base_clearance: signed distance from the scene to what stands with the base [m]. (nx, ny, nyaw, nh)
-        reached: number of poses reached; 0 for bases that do not stand free. (nx, ny, nyaw, nh)
+        reaches: whether each pose is reached; False for bases that do not stand free. All searches are made at the
+            eighth of the bases with the most poses. The others have an eighth of them for each pose, and all of them
+            for one pose after another until one is missed: so much is sure of each. (nx, ny, nyaw, nh, poses)
+        too_far: number of poses that are out of reach even with all links in one line. Where it is above 0, the base
+            does not reach all poses, whatever the search. (nx, ny, nyaw, nh)
         margin: smallest distance of a joint from its limits over its range, of all poses reached: 0.5 if all joints are
             in the middle; NaN if no pose is reached. Of the first configuration found, so a lower bound of the best.
             (nx, ny, nyaw, nh)
@@ -43,6 +50,7 @@ class Placement:
         best_manipulability: index of each of these. (poses,)
         solution: the answers for all poses at the best base, in the base's axes: ``solution.explain(i)`` says what
             stops the robot at pose i.
+        task: frames, poses and settings of the searches.
     """
 
     robot: Robot
@@ -54,7 +62,8 @@ class Placement:
     yaw: Float[np.ndarray, " nyaw"]
     height: Float[np.ndarray, " nh"]
     base_clearance: Float[np.ndarray, "nx ny nyaw nh"]
-    reached: Int[np.ndarray, "nx ny nyaw nh"]
+    reaches: Bool[np.ndarray, "nx ny nyaw nh poses"]
+    too_far: Int[np.ndarray, "nx ny nyaw nh"]
     margin: Float[np.ndarray, "nx ny nyaw nh"]
     manipulability: Float[np.ndarray, "nx ny nyaw nh"]
     best: Float[np.ndarray, "4"]
@@ -63,8 +72,20 @@ class Placement:
     best_manipulability: Float[np.ndarray, " poses"]
     solution: InverseKinematicsSolution
 
+    task: Task
+
     def __repr__(self) -> str:
         return f"Placement, {self._summary()}"
+
+    @property
+    def reached(self) -> Int[np.ndarray, "nx ny nyaw nh"]:
+        """Return the number of poses reached by each base of the grid."""
+        return self.reaches.sum(-1)
+
+    @property
+    def gradient(self) -> BaseGradient:
+        """Return the derivatives of ``best_margin``, ``best_manipulability`` and ``q`` by the base's coordinates."""
+        return base_gradient(self.task, self.best, self.q)
 
     @property
     def is_reached(self) -> Bool[np.ndarray, " poses"]:
@@ -104,8 +125,13 @@ class Placement:
                 f"smallest margin of a joint {100.0 * np.nanmin(self.best_margin):.1f} % of its range, "
                 f"smallest manipulability {np.nanmin(self.best_manipulability):.3g}"
             )
-        full, blocked = int((self.reached == count).sum()), int((~self.stands_free).sum())
-        lines.append(f"of {self.reached.size} bases of the grid {full} reach all poses; {blocked} do not stand free")
+        full, free, seeds = int((self.reached == count).sum()), self.stands_free, self.task.settings["seeds"]
+        far = int((free & (self.too_far > 0)).sum())
+        lines.append(
+            f"of {free.size} bases of the grid {full} reach all poses, {int((~free).sum())} do not stand free, "
+            f"{far} have a pose out of reach even with all links in one line, "
+            f"and {int(free.sum()) - far - full} miss one after {seeds} searches"
+        )
         lines += [f"pose {k}: {self.solution.explain(int(k))}" for k in np.flatnonzero(~found)]
         return "\n".join(lines)
 
@@ -119,3 +145,22 @@ class Placement:
         from ._picture import draw_placement  # matplotlib, an extra
 
         return draw_placement(self)
+
+
+def compare_placements(found: Mapping[str, Placement]) -> str:
+    """Return a table of placements by name: robots, tools or heights for the same poses.
+
+    It has the poses that the best base reaches, their smallest margin and manipulability, and how many bases of the
+    grid reach all poses.
+    """
+    head = ("", "best base reaches", "smallest margin", "smallest manipulability", "bases that reach all poses")
+    rows: list[tuple[str, ...]] = [head]
+    for name, one in found.items():
+        reached, count = one.is_reached, len(one.q)
+        scores = ["-", "-"]
+        if reached.any():
+            scores = [f"{100.0 * np.nanmin(one.best_margin):.1f} %", f"{np.nanmin(one.best_manipulability):.3g}"]
+        full = int((one.reached == count).sum())
+        rows.append((name, f"{reached.sum()} of {count}", *scores, f"{full} of {one.reached.size}"))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..collision import Scene
-from ..inverse._chain_problem import ChainRoute, dof_of_entries
-from ..inverse._chain_search import Goal
-from ..inverse._inverse_kinematics import inverse_kinematics, joint_box
+from ..inverse._chain_search import ChainSearch, Goal
+from ..inverse._inverse_kinematics import inverse_kinematics
+from ..inverse._reach import beyond
 from ..inverse._solution import InverseKinematicsSolution
+from ..numerics._host import module_of
 from ..reachability._frame import Frame
 from ..robot import Robot
 from ._bases import in_bases, scenes_in_bases
 
+_PAIRS = 64, 1024
+"""Pairs of a base and a pose in one call, if they are few or many: each number compiles anew."""
 _NUMBERS = 8_000_000
 """Largest number of entries of all scenes of one call, so that they take about 100 MB."""
 
@@ -30,6 +36,7 @@ class Task(NamedTuple):
         goal: the poses, in world axes. (poses, frames, ...)
         scene: in world axes; None: collisions do not count.
         settings: other arguments of ``inverse_kinematics``.
+        search: the coordinates that move the frames, with their limits.
     """
 
     robot: Robot
@@ -38,6 +45,12 @@ class Task(NamedTuple):
     goal: Goal
     scene: Scene | None
     settings: dict[str, Any]
+    search: ChainSearch
+
+    @property
+    def entries(self) -> np.ndarray:
+        """Return the entries of q that the coordinates are."""
+        return np.array(self.search.chain.layout.dofs, int)
 
 
 class Scores(NamedTuple):
@@ -55,6 +68,20 @@ class Scores(NamedTuple):
     manipulability: Float[np.ndarray, "n poses"]
     q: Float[np.ndarray, "n poses nq"]
 
+    @classmethod
+    def empty(cls, task: Task, count: int) -> Scores:
+        """Return the scores of bases that reach nothing."""
+        shape = count, len(task.goal.position)
+        none = np.full(shape, np.nan)
+        return cls(np.zeros(shape, bool), none, none, np.full((*shape, task.robot.nq), np.nan))
+
+    def updated(self, pairs: Any, scores: Scores) -> Scores:
+        """Return the scores with those of some pairs, numbers of bases and of poses, in their place."""
+        fields = [np.array(field) for field in self]
+        for field, new in zip(fields, scores, strict=True):
+            field[tuple(pairs)] = new
+        return Scores(*fields)
+
     @property
     def table(self) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """Return for each base the number of poses reached, the smallest margin and the smallest index of them."""
@@ -64,62 +91,114 @@ class Scores(NamedTuple):
         return self.reached.sum(1), margin, index
 
 
+def score_grid(task: Task, bases: Float[np.ndarray, "n 4"]) -> Scores:
+    """Return the scores of bases, with all searches only where they can matter.
+
+    Poses that are out of reach even with all links in one line have none. All others have an eighth of the searches at
+    each base. Then the eighth of the bases with the most poses get all
+    searches for the poses that they miss. The other bases get them for one pose after another, those first that fewest
+    bases reach, until one is missed: such a base does not reach all poses.
+    """
+    seeds = task.settings["seeds"]
+    far = is_too_far(task, bases)
+    near = np.nonzero(~far)
+    scores = Scores.empty(task, len(bases)).updated(near, _search_pairs(task, bases, *near, seeds=-(-seeds // 8)))
+    reached = scores.reached
+    rank = np.argsort(np.argsort(-reached.sum(1), kind="stable"))
+    rare, searched = np.argsort(reached.sum(0), kind="stable"), reached | far
+    wanted = ~searched & (8 * rank < len(bases))[:, None]
+    while wanted.any():
+        scores = scores.updated(np.nonzero(wanted), _search_pairs(task, bases, *np.nonzero(wanted)))
+        searched |= wanted
+        left = ~searched & (searched == scores.reached).all(1)[:, None]
+        wanted = np.zeros_like(left)
+        wanted[np.arange(len(left)), rare[left[:, rare].argmax(1)]] = True
+        wanted &= left
+    return scores
+
+
 def score_bases(task: Task, bases: Float[np.ndarray, "n 4"], *, every: bool = False) -> Scores:
-    """Return the scores of bases, with all their poses in one batch, or in several if memory asks for it.
+    """Return the scores of bases after all searches for all poses.
 
     Args:
         task: the poses and the scene.
         bases: x, y, yaw, height. (n, 4)
         every: take the configuration with the largest margin of all that are found, not the first one.
     """
-    each = 1 if task.scene is None else max(_numbers_of(task.scene), 1)
-    chunk = max(_NUMBERS // each // len(task.goal.position), 1)
-    parts = [_searched(task, bases[k : k + chunk], every) for k in range(0, len(bases), chunk)]
-    reached, q = (np.concatenate(part) for part in zip(*parts, strict=True))
-    # all bases at once, because each number of configurations compiles anew
-    index = np.min([np.asarray(frame.manipulability(q)) for frame in task.frames], 0)  # pyright: ignore[reportArgumentType]
-    margin, shape = joint_margin(task, q), (len(bases), len(task.goal.position))
-    margin, index = (np.where(reached, part, np.nan).reshape(shape) for part in (margin, index))
-    return Scores(reached.reshape(shape), margin, index, np.where(reached[:, None], q, np.nan).reshape(*shape, -1))
+    pairs = np.indices((len(bases), len(task.goal.position))).reshape(2, -1)
+    return Scores.empty(task, len(bases)).updated(pairs, _search_pairs(task, bases, *pairs, all=every))
 
 
-def _numbers_of(scene: Scene) -> int:
-    """Return about how many numbers the core reads of a scene."""
-    rows, vertices = scene.capacity, len(scene.table.vertices)
-    return rows * (rows + 100) + 3 * vertices
+def is_too_far(task: Task, bases: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, "n poses"]:
+    """Return whether each pose is out of reach of each base, even with all links in one line."""
+    count, frames = task.goal.position.shape[:2]
+    position = in_bases(bases, *(np.asarray(part).reshape(-1, *part.shape[2:]) for part in task.goal))[0]
+    asked: Any = np.array(task.rows)[:, :3].all(-1)
+    away = np.asarray(_beyond(task.search, position.reshape(-1, frames, 3), asked))
+    return away.reshape(-1, count) > task.settings["position_tolerance"]
 
 
-def _searched(task: Task, bases: np.ndarray, every: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Return whether each pose is reached at each base, and the configurations. (n * poses,), (n * poses, nq)."""
-    found = solve_bases(task, bases, all=every)
-    q = np.asarray(found.q)
-    if every:
-        others = np.asarray(found.solutions)
-        pick = np.nan_to_num(joint_margin(task, others), nan=-1.0).argmax(-1)  # rows without a solution are NaN
-        q = np.take_along_axis(others, pick[:, None, None], 1)[:, 0]
-    return np.asarray(found.converged), q
+@jax.jit
+def _beyond(search: ChainSearch, position: Any, asked: Any) -> Array:
+    return beyond(search.reaches, position, asked)
 
 
-def solve_bases(task: Task, bases: Float[np.ndarray, "n 4"], **settings: Any) -> InverseKinematicsSolution:
-    """Return the answers for all poses at all bases: the poses of the first base, then those of the second."""
-    count, number = len(bases), len(task.goal.position)
-    parts = [np.asarray(part).reshape(-1, *part.shape[2:]) for part in task.goal]
-    position, rotation = in_bases(bases, parts[0], parts[1])
-    position = position.reshape(count * number, -1, 3)
-    rotation = rotation.reshape(count * number, -1, 3, 3)
+def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndarray, **settings: Any) -> Scores:
+    """Return the scores of pairs of a base and a pose, given by their numbers; the fields are (pairs,)."""
+    count = len(base)
+    if not count:
+        return Scores(*(field[base, pose] for field in Scores.empty(task, len(bases))))
+    each = (
+        1
+        if task.scene is None
+        else task.scene.capacity * (task.scene.capacity + 100) + 3 * len(task.scene.table.vertices)
+    )
+    few, many = _PAIRS
+    size = few if count <= 8 * few or each * many > _NUMBERS else many
+    padded = np.arange(-(-count // size) * size) % count  # the last call has the first pairs again
+    parts = []
+    for k in range(0, len(padded), size):
+        at = padded[k : k + size]
+        found = solve_pairs(task, bases, base[at], pose[at], **settings)
+        q = _roomiest(task, found) if settings.get("all") else np.asarray(found.q)
+        margin = joint_margin(task.search, q[:, task.entries])
+        parts.append((np.asarray(found.converged), margin, np.asarray(manipulability(task.frames, q)), q))
+    reached, *fields = (np.concatenate(part)[:count] for part in zip(*parts, strict=True))
+    return Scores(reached, *(np.where(reached.reshape(-1, *[1] * (a.ndim - 1)), a, np.nan) for a in fields))
+
+
+def _roomiest(task: Task, found: InverseKinematicsSolution) -> np.ndarray:
+    """Return the solution with the largest margin of each answer."""
+    others = np.asarray(found.solutions)
+    pick = np.nan_to_num(joint_margin(task.search, others[..., task.entries]), nan=-1.0).argmax(
+        -1
+    )  # rows without a solution are NaN
+    return np.take_along_axis(others, pick[:, None, None], 1)[:, 0]
+
+
+def solve_pairs(
+    task: Task, bases: Float[np.ndarray, "n 4"], base: np.ndarray, pose: np.ndarray, **settings: Any
+) -> InverseKinematicsSolution:
+    """Return the answer for each pair of a base and a pose, given by their numbers, in the axes of the base."""
+    own = bases[base]
+    position, rotation = in_bases(own, *(np.asarray(part)[pose] for part in task.goal))
     poses = {
         frame.name: (position[:, k], rotation[:, k]) if all(rows) else position[:, k]
         for k, (frame, rows) in enumerate(zip(task.frames, task.rows, strict=True))
     }
-    scene = None if task.scene is None else scenes_in_bases(task.scene, bases.repeat(number, 0))
+    scene = None if task.scene is None else scenes_in_bases(task.scene, own)
     return inverse_kinematics(task.robot, poses, scene=scene, **{**task.settings, **settings})
 
 
-def joint_margin(task: Task, q: Float[np.ndarray, "*n nq"]) -> Float[np.ndarray, "*n"]:
-    """Return the smallest distance of a joint of the frames from its limits, over its range: 0.5 at the middle."""
-    robot = task.robot
-    entries = ChainRoute(tuple(frame.name for frame in task.frames), task.rows).entries(robot)
-    lower, upper = (np.asarray(end)[dof_of_entries(robot)[entries]] for end in joint_box(robot, None))
-    limited = np.isfinite(upper - lower) & (upper > lower)
-    own, lower, upper = q[..., entries[limited]], lower[limited], upper[limited]
-    return np.min(np.minimum(own - lower, upper - own) / (upper - lower), -1, initial=0.5)
+def joint_margin(search: ChainSearch, x: Any) -> Any:
+    """Return the smallest distance of a coordinate from its limits, over its range: 0.5 at the middle. (..., n)."""
+    numbers = module_of(x)
+    lower, upper = (numbers.asarray(end) for end in (search.lower, search.upper))
+    limited = numbers.isfinite(upper - lower) & (upper > lower)
+    share = numbers.minimum(x - lower, upper - x) / numbers.where(limited, upper - lower, 1.0)
+    return numbers.min(numbers.where(limited, share, 0.5), -1, initial=0.5)
+
+
+def manipulability(frames: Sequence[Frame], q: Any) -> Array:
+    """Return Yoshikawa's index of configurations, the smallest of the frames. (n,)."""
+    return jnp.min(jnp.stack([frame.manipulability(q) for frame in frames]), 0)

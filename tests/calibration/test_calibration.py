@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -87,6 +89,10 @@ def test_a_tool_with_its_sigma(ur5: osik.Robot):
     assert np.abs(found.robot.frame_position[at] - offset).max() < 2e-4
     np.testing.assert_allclose(list(found.sigma.values()), 2e-4 / 20**0.5, rtol=1e-6)  # a linear problem
     assert "frame_position[tool0].y: +120." in found.explain()
+    before, after = (np.sqrt((np.linalg.norm(rows, axis=1) ** 2).mean()) for rows in found.residuals[0][2:4])
+    assert f"rms {before:.4g} -> {after:.4g} m" in found.explain()  # of lengths, as the picture has them
+    legend: Any = found.figure().axes[0].get_legend()
+    assert f"before, rms {1e3 * before:.3g} mm" in [text.get_text() for text in legend.texts]
 
 
 def test_offsets_axes_and_rotations_are_what_replace_sets(ur5: osik.Robot):

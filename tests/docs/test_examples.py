@@ -142,10 +142,31 @@ def pick_and_place(names: Names) -> None:
     np.testing.assert_allclose(motions[0].position[-1], motions[1].position[0], atol=1e-9)
 
 
+def ur5e_calibrated(names: Names) -> None:
+    assert names["found"].converged and not names["found"].unobservable
+    assert names["off"].max() < 1e-4
+    found = names["found"].values  # the maker's parameters of both arms
+    assert abs(found["body_position[shoulder_link].z"] - (0.1625 - 0.089159)) < 2e-5
+    assert abs(found["frame_position[tool0].y"] - (0.0996 - 0.0823)) < 2e-5
+
+
+def hand_eye(names: Names) -> None:
+    assert names["found"].converged and names["missed"] < 0.5 and names["turned"] < 0.05
+
+
+def panda_placed(names: Names) -> None:
+    found = names["found"]
+    assert found.is_reached.all() and np.isfinite(names["slope"]).all()
+
+
+def tiago_parks(names: Names) -> None:
+    assert names["found"].is_reached.all()
+
+
 CHECKS: list[Callable[[Names], None]] = [
     ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
     g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person, carry_a_box, collision_free, pick_and_place,
+    retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye, panda_placed, tiago_parks,
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from refusals import refuses
 import osik_jax as osik
 from osik_jax.cli import main
 from osik_jax.core import _library
-from osik_jax.placement import Placement, place_base
+from osik_jax.placement import Placement, compare_placements, place_base, place_robots
 
 pytestmark = pytest.mark.skipif(not _library.installed(), reason="no compiled core")
 
@@ -89,6 +89,69 @@ def test_the_best_base_reaches_all_poses_and_mujoco_sees_nothing_touch(arm, foun
     assert margin.min() > np.nanmax(found.margin[found.reached == len(points)])  # the search has improved the grid's
 
 
+def moved_q(base: np.ndarray, q: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return MuJoCo's nearest configuration with the tip at the point, and the tip's index of Yoshikawa there."""
+    model = mujoco.MjModel.from_xml_string(mjcf(base))
+    data, matrix = mujoco.MjData(model), np.zeros((6, 4))
+    data.qpos[:] = q
+    for _ in range(4):
+        mujoco.mj_forward(model, data)
+        mujoco.mj_jacSite(model, data, matrix[:3], matrix[3:], model.site("tip").id)
+        data.qpos[:] += np.linalg.pinv(matrix[:3]) @ (point - data.site("tip").xpos)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_jacSite(model, data, matrix[:3], matrix[3:], model.site("tip").id)
+    return data.qpos.copy(), float(np.sqrt(np.linalg.det(matrix.T @ matrix)))
+
+
+def test_the_gradient_is_that_of_central_differences_of_mujoco(arm, found, points):
+    slope, lower, upper = found.gradient, np.asarray(arm.position_lower), np.asarray(arm.position_upper)
+    for k, step in [(k, step) for k in (0, 3, 7) for step in 1e-5 * np.eye(4)]:
+        # from configurations on the point, or the first correction would count as motion
+        start = moved_q(found.best, found.q[k], points[k])[0]
+        ends = [moved_q(found.best + sign * step, start, points[k]) for sign in (1.0, -1.0)]
+        margins = [(np.minimum(q - lower, upper - q) / (upper - lower)).min() for q, _ in ends]
+        at = step.argmax()
+        assert np.allclose(slope.q[k, :, at], (ends[0][0] - ends[1][0]) / 2e-5, atol=1e-5)
+        assert np.isclose(slope.margin[k, at], (margins[0] - margins[1]) / 2e-5, atol=1e-5)
+        assert np.isclose(slope.manipulability[k, at], (ends[0][1] - ends[1][1]) / 2e-5, atol=1e-5)
+
+
+def test_the_climb_leaves_no_base_nearby_with_a_larger_margin(arm, scene, points):
+    grid: dict[str, Any] = dict(GRID, x=[-0.2, 0.0], y=[0.0, 0.3], yaw=[0.0])
+    kept = place_base(arm, {"tip": points}, **grid, scene=scene, refine=0)
+    climbed = place_base(arm, {"tip": points}, **grid, scene=scene)
+    assert kept.is_reached.all() and climbed.is_reached.all()
+    # the best of a fine grid of bases, with the configurations that searches find
+    fine: dict[str, Any] = dict(x=np.linspace(-0.2, 0.0, 9), y=np.linspace(0.0, 0.3, 9), yaw=[0.0])
+    best = place_base(arm, {"tip": points}, **fine, scene=scene, refine=0)
+    assert climbed.best_margin.min() > kept.best_margin.min() + 0.005
+    assert climbed.best_margin.min() > best.best_margin.min() - 0.005
+    assert (climbed.best >= [-0.2, 0.0, 0.0, 0.0]).all() and (climbed.best <= [0.0, 0.3, 0.0, 0.0]).all()
+
+
+def test_poses_too_far_are_counted_and_searched_for_nowhere(arm, scene):
+    far = np.array([[0.3, 0.0, 0.4], [5.0, 0.0, 0.4]])
+    found = place_base(arm, {"tip": far}, x=[0.0, 0.1, 4.5], y=0.0, yaw=[0.0], scene=scene, refine=1)
+    assert found.too_far.ravel().tolist() == [1, 1, 1] and found.reached.ravel().tolist() == [1, 1, 1]
+    assert (
+        "of 3 bases of the grid 0 reach all poses, 0 do not stand free, 3 have a pose out of reach" in found.explain()
+    )
+    none = place_base(
+        arm, {"tip": far + np.array([0.0, 9.0, 0.0])}, x=[0.0, 0.1], y=0.0, yaw=[0.0], scene=scene, refine=1
+    )
+    assert not none.reaches.any() and np.isnan(none.gradient.margin).all()
+
+
+def test_fewer_searches_find_the_base_that_all_searches_find(arm, scene, points):
+    grid: dict[str, Any] = dict(x=np.linspace(-0.2, 0.8, 11), y=np.linspace(-0.6, 0.6, 9), yaw=[0.0], refine=0)
+    found = place_base(arm, {"tip": points}, **grid, scene=scene)
+    every = place_base(arm, {"tip": points}, **grid, scene=scene, seeds=256)  # an eighth of them is 32
+    assert found.reached.max() == every.reached.max() == len(points)
+    assert (found.reached <= every.reached).all() and (found.reached.sum() > 0.9 * every.reached.sum())
+    full = every.reached == len(points)
+    assert (found.reached[full] == len(points)).all()
+
+
 def test_which_bases_stand_free_is_as_mujoco_says(found):
     gaps = np.zeros(found.reached.shape)
     for at in np.ndindex(gaps.shape):
@@ -154,6 +217,63 @@ def test_a_footprint_and_what_the_base_may_touch_count(arm, scene, points):
     )
     on = place_base(arm, {"tip": points}, x=[0.6], y=[0.0], yaw=[0.0], refine=0, scene=scene.allow(("table", "stand")))
     assert on.base_clearance > 0.0
+
+
+@pytest.fixture(scope="module")
+def around(arm: osik.Robot, scene: osik.Scene) -> tuple[np.ndarray, Placement]:
+    """Points over the whole table, and the placement of one arm, which does not reach them all."""
+    points = np.random.default_rng(1).uniform([0.35, -0.8, 0.35], [0.85, 0.8, 0.5], (14, 3))
+    grid: dict[str, Any] = dict(x=np.linspace(-0.2, 1.4, 9), y=np.linspace(-1.0, 1.0, 9), yaw=[0.0, 3.0])
+    return points, place_base(arm, {"tip": points}, **grid, scene=scene, clearance=0.01)
+
+
+def test_two_robots_reach_more_and_mujoco_sees_them_keep_clear(around, arm):
+    points, one = around
+    team = place_robots({"a": one, "b": one})
+    assert team.is_reached.sum() > one.is_reached.sum()
+    # no pair of bases of the grid reaches more, whether it keeps clear or not
+    reaches = one.reaches.reshape(-1, len(points)).astype(int)
+    together = reaches.sum(1)[:, None] + reaches.sum(1) - reaches @ reaches.T
+    assert team.is_reached.sum() <= together.max() <= team.is_reached.sum() + 1
+    bodies = [mjcf(base).split("<worldbody>")[1].split("</worldbody>")[0] for base in team.bases]
+    arms = [
+        body[body.index("<body") :].replace('name="', f'name="{name}_') for body, name in zip(bodies, "ab", strict=True)
+    ]
+    boxes = bodies[0][: bodies[0].index("<body")]
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{boxes}{"".join(arms)}</worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    data, parts = mujoco.MjData(model), ("stand", "upper", "lower", "hand")
+    for k, owner in enumerate(team.robot):
+        if owner < 0:
+            continue
+        name = "ab"[owner]
+        data.qpos[:] = np.tile(arm.q0, 2)
+        data.qpos[4 * owner : 4 * owner + 4] = team.q[owner][k]
+        mujoco.mj_forward(model, data)
+        assert np.linalg.norm(data.site(f"{name}_tip").xpos - points[k]) < 1e-3
+        assert distance(model, data, tuple(f"{name}_{part}" for part in parts)) > 0.01 - 1e-6
+        pairs = [(model.geom(f"a_{first}").id, model.geom(f"b_{second}").id) for first in parts for second in parts]
+        assert min(mujoco.mj_geomDistance(model, data, *pair, 2.0, None) for pair in pairs) > 0.01 - 1e-6
+    taken = [(team.robot == k).sum() for k in (0, 1)]
+    assert min(taken) > 0 and sum(taken) == team.is_reached.sum() and f"takes {taken[1]}" in team.explain()
+
+
+def test_robots_of_other_poses_or_without_a_scene_are_refused(around, arm, points):
+    _, one = around
+    alone = place_base(arm, {"tip": points}, x=0.0, y=0.0, yaw=1, refine=0)
+    refuses(ValueError, r"poses of each: {'a': 14}", place_robots, {"a": one})
+    refuses(ValueError, r"poses of each: {'a': 14, 'b': 10}", place_robots, {"a": one, "b": alone})
+    refuses(ValueError, "has no scene", place_robots, {"a": alone, "b": alone})
+
+
+def test_a_longer_tool_is_compared_with_a_shorter_one(found, scene, points):
+    other = osik.Robot.from_mjcf(mjcf().replace('pos="0.1 0 0"', 'pos="0.02 0 0"'))
+    short = place_base(other, {"tip": points}, **GRID, scene=scene, clearance=0.01)
+    lines = compare_placements({"long": found, "short": short}).splitlines()
+    for line, name, one in zip(lines[1:], ("long", "short"), (found, short), strict=True):
+        full = (one.reached == len(points)).sum()
+        assert line.split()[:4] == [name, str(one.is_reached.sum()), "of", "10"] and f"{full} of 90" in line
+    assert lines[1].split()[1:] != lines[2].split()[1:]
 
 
 def test_what_is_wrong_is_told(arm, points):
