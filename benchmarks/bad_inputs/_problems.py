@@ -3,6 +3,9 @@
 # pyright: reportArgumentType=false
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,9 +34,40 @@ from ._given import (
 )
 
 
+@cache
+def ur5() -> osik.Robot:
+    return osik.load_robot("ur5")
+
+
+def _scene(**options: Any) -> osik.Scene:
+    return osik.Scene({"can": osik.CollisionShape.sphere(0.1, [0.3, 0.5, 0.2])}, **options)
+
+
+def _free(scene: Any = None, poses: Any = None, **options: Any) -> Any:
+    poses = {"tool0": ([0.5, 0.1, 0.4], [0.0, 1.0, 0.0, 0.0])} if poses is None else poses
+    return osik.inverse_kinematics(ur5(), poses, scene=_scene() if scene is None else scene, **options)
+
+
 def _held_twice() -> osik.Scene:
     held = osik.Scene({"can": osik.CollisionShape.sphere(0.1)}).attach("can", arm(), "hand")
     return held.attach("can", arm(), "hand")
+
+
+def _in_frame() -> osik.Scene:
+    return osik.Scene({"can": osik.CollisionShape.sphere(0.1, frame="hand")})
+
+
+def _scenes_for_targets() -> Any:
+    poses = {"tool0": (np.tile([0.5, 0.1, 0.4], (3, 1)), np.tile([0.0, 1.0, 0.0, 0.0], (3, 1)))}
+    return _free(osik.Scene.stack([_scene(), _scene()]), poses)
+
+
+def _clearance_alone() -> Any:
+    return osik.inverse_kinematics(ur5(), {"tool0": ([0.5, 0.1, 0.4], [0.0, 1.0, 0.0, 0.0])}, clearance=0.01)
+
+
+def _apart(scene: Any, **options: Any) -> osik.CollisionAvoidanceLimit:
+    return osik.CollisionAvoidanceLimit(ur5(), scene=scene, **options)
 
 
 def problems(add: Add) -> None:
@@ -191,6 +225,37 @@ def limits(add: Add) -> None:
     add("an object held twice", _held_twice, V, "detach")
     add("a box of words", lambda: osik.CollisionShape.box("abc"), T, "half_sizes is 'abc'")
     add("a scene of another kind of file", lambda: osik.Scene.from_file("scene.stl"), V, ".yaml")
+    for size in ("a radius of -1", -1.0), ("a radius of 0", 0.0), ("a radius of NaN", np.nan):
+        add(f"a ball with {size[0]}", lambda size=size: osik.CollisionShape.sphere(size[1]), V, "positive")
+    add("a box of 2 sizes", lambda: osik.CollisionShape.box([0.1, 0.1]), V, "half_sizes has shape (2,)")
+    add("a cylinder without length", lambda: osik.CollisionShape.cylinder(0.1, np.zeros(3), np.zeros(3)), V, "length")
+    add("a hull of one point", lambda: osik.CollisionShape.convex(np.zeros((1, 3))), V, "no convex hull")
+    add("a mesh file that is not there", lambda: osik.CollisionShape.mesh("none.stl"), FileNotFoundError, "none.stl")
+    add("a scene file that is not there", lambda: osik.Scene.from_file("none.xml"), FileNotFoundError, "none.xml")
+    add("a shape of a frame in a scene", _in_frame, V, "attach")
+    add("a capacity of -1", lambda: _scene(capacity=-1), V, "capacity")
+    add("a capacity of '3'", lambda: _scene(capacity="3"), V, "capacity")
+    add("an object moved to no pose", lambda: _scene().moved("can", np.zeros(2)), V, "pose")
+    add("an object held by no frame", lambda: _scene().attach("can", arm(), "hnd"), K, "hand")
+    add("an object let go that nobody holds", lambda: _scene().detach("can", arm(), arm().q0), V, "cannot be detached")
+    add("contacts that are no pairs", lambda: _scene().allow("can"), T, "pairs of names")
+    add("contacts of an unknown object", lambda: _scene().allow(("cam", "hand")), K, "can")
+    add("a stack of no scenes", lambda: osik.Scene.stack([]), V, "no scene")
+    add("a stack of stacks", lambda: osik.Scene.stack([osik.Scene.stack([_scene()])]), V, "stack")
+    add("an object of a stack moved", lambda: osik.Scene.stack([_scene()]).moved("can", np.eye(4)), V, "before")
+    add("shapes for a scene", lambda: _free({"can": ball}), T, "Scene({name: shape})")
+    add("a negative clearance", lambda: _free(clearance=-0.01), V, "0 or more")
+    add("a clearance for each target", lambda: _free(clearance=[0.0, 0.1]), V, "one number")
+    add("a clearance without a scene", _clearance_alone, V, "scene")
+    add("two scenes for three targets", _scenes_for_targets, V, "2 scenes and 3 targets")
+    add("a scene for tasks", lambda: _free(poses={"p": osik.FrameTask(ur5(), "tool0")}), T, "CollisionAvoidanceLimit")
+    add("an SRDF that is not there", lambda: _free(srdf="none.srdf"), FileNotFoundError, "none.srdf")
+    add("an SRDF of broken text", lambda: _free(srdf="<robot"), V, "broken XML")
+    add("clearance of q of another length", lambda: osik.clearance(ur5(), np.zeros(7), _scene()), V, "6 entries")
+    add("a limit with shapes for a scene", lambda: _apart({"can": ball}), T, "Scene({name: shape})")
+    add("a limit with a stack of scenes", lambda: _apart(osik.Scene.stack([_scene()])), V, "jax.vmap")
+    add("a limit with a scene and pairs", lambda: _apart(_scene(), pairs=[("*", "*")]), T, "scene.allow")
+    add("a limit with an SRDF alone", lambda: _apart(None, srdf=True), T, "scene=osik_jax.Scene({})")
     add("shapes of a robot without any", lambda: robot_shapes(arm()), V, "<collision>")
 
 

@@ -53,15 +53,18 @@ def notes() -> Iterator[None]:
 @contextmanager
 def told() -> Iterator[None]:
     """Turn the exceptions of wrong input into a one-line message."""
+    from .._errors import OsikError
+
     try:
         yield
-    except USER_ERRORS as error:
+    except (*USER_ERRORS, OsikError) as error:
         text = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
         raise CommandError(_as_options(" ".join(text.split()))) from error
 
 
 def _as_options(text: str) -> str:
     """Return a message with arguments of Python as options of the command line."""
+    text = text.replace("scene= goes", "--scene goes")
     return text.replace("floating_base=False", "--base fixed").replace("floating_base=True", "--base floating")
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..execution._computed import in_shared_lanes
-from ..kinematics import forward_kinematics
+from ..kinematics import Kinematics, forward_kinematics
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ._core import (
@@ -162,22 +162,43 @@ def _moved(
 
     Its derivative is that of the distance: to first order nearest points slide along the surfaces.
     """
-    kinematics = forward_kinematics(robot, q)
-    count = len(bodies)
+    turn, at = shape_frames(forward_kinematics(robot, q), bodies, position, rotation, carrying, pair)
+    stopped = jax.lax.stop_gradient((turn, at))
+    local = jnp.einsum("kji,kj->ki", stopped[0], points - stopped[1])
+    here = at + jnp.einsum("kij,kj->ki", turn, local)
+    return jnp.dot(normal, here[1] - here[0])
+
+
+def shape_frames(
+    kinematics: Kinematics,
+    bodies: Int[Array, " shapes"],
+    position: Float[Array, "rows 3"],
+    rotation: Float[Array, "rows 3 3"],
+    carrying: Int[Array, " rows"],
+    pair: Int[Array, "2"],
+) -> tuple[Float[Array, "2 3 3"], Float[Array, "2 3"]]:
+    """Return the rotations and positions in the world that a pair of shapes goes along with.
+
+    Args:
+        kinematics: where the robot is.
+        bodies: of the robot's shapes, whose places in their bodies are constant.
+        position: of the scene's shapes, in the world or in the body that carries them.
+        rotation: likewise.
+        carrying: bodies that carry them, -1 for none.
+        pair: numbers of the two shapes.
+    """
+    count, dtype = len(bodies), position.dtype
     row = jnp.clip(pair - count, 0, max(len(position) - 1, 0))
     is_row = pair >= count
     carrier = jnp.where(is_row, carrying[row], bodies[jnp.clip(pair, 0, count - 1)]) if len(position) else bodies[pair]
     turn, at = kinematics.body_rotation[carrier], kinematics.body_position[carrier]
     if len(position):
         fixed = carrier < 0
-        turn = jnp.where(fixed[:, None, None], jnp.eye(3, dtype=q.dtype), turn)
+        turn = jnp.where(fixed[:, None, None], jnp.eye(3, dtype=dtype), turn)
         at = jnp.where(fixed[:, None], 0.0, at)
-        inner = jnp.where(is_row[:, None, None], rotation[row], jnp.eye(3, dtype=q.dtype))
+        inner = jnp.where(is_row[:, None, None], rotation[row], jnp.eye(3, dtype=dtype))
         turn, at = turn @ inner, at + jnp.einsum("kij,kj->ki", turn, jnp.where(is_row[:, None], position[row], 0.0))
-    stopped = jax.lax.stop_gradient((turn, at))
-    local = jnp.einsum("kji,kj->ki", stopped[0], points - stopped[1])
-    here = at + jnp.einsum("kij,kj->ki", turn, local)
-    return jnp.dot(normal, here[1] - here[0])
+    return turn, at
 
 
 def shape_names(own: tuple[str, ...], rows: tuple[Any, ...], pair: np.ndarray, index: int) -> tuple[str, str]:

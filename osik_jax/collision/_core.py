@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.spatial
 from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import OsikError, OsikTypeError, OsikValueError
 from ..core import _library
 from ..execution._platform import cpu_is_default
-from ..kinematics._kernels import tree_integers
+from ..kinematics._kernels import dof_columns, tree_integers
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
@@ -22,6 +23,8 @@ from ._convex import bounding_ball, table_shapes
 from ._scene import Scene
 from ._table import RobotShapes, ShapeKind, ShapeTable
 
+_SPREAD = 32
+"""Vertices of a hull in all directions, from which the core begins to look for the farthest one."""
 _PACK = 4
 """Hulls have a multiple of so many vertices in the core: the last one is repeated."""
 
@@ -77,7 +80,8 @@ def core_robot(
     moves, groups = _moves(tree, range(tree.nq) if entries is None else entries, posed)
     index, factor = tree.qpos_source
     sizes = [len(tree.body_parents), len(tree.joint_types), len(tree.dof_joint), len(index)]
-    sizes += [len(shapes.names), len(shapes.pairs), len(vertices) // 3]
+    sizes += [len(shapes.names), len(shapes.pairs), len(vertices) // 3, tree.nv]
+    columns, column_factors = dof_columns(tree)
     integers = [
         sizes,
         tree_integers(tree)[1:],
@@ -89,6 +93,8 @@ def core_robot(
         count,
         shapes.world,
         shapes.pairs,
+        columns,
+        *_neighbours(first, count, vertices),
     ]
     centers, bounds = zip(*map(bounding_ball, table_shapes(table)), strict=True)
     numbers = [factor, robot.qpos_offset, robot.joint_reference, robot.body_position, robot.body_quaternion]
@@ -101,6 +107,7 @@ def core_robot(
         centers,
         bounds,
         vertices,
+        column_factors,
     ]
     with jax.ensure_compile_time_eval():  # on the device once, also if a user's program is traced
         return CoreRobot(jnp.asarray(_flat(integers, np.int32)), jnp.asarray(_flat(numbers, np.float64)))
@@ -115,11 +122,43 @@ def _packed_vertices(table: ShapeTable) -> tuple[np.ndarray, np.ndarray]:
     first, parts, end = np.full(len(table.kind), -1), [np.zeros(0)], 0
     for k in np.flatnonzero(np.asarray(table.kind) == ShapeKind.HULL):
         start, count = int(table.first[k]), int(table.count[k])
-        own = np.asarray(table.vertices[start : start + count])
+        own = spread_first(np.asarray(table.vertices[start : start + count]))
         own = np.concatenate([own, own[-1:].repeat(-count % _PACK, 0)])
         first[k], end = end, end + len(own)
         parts.append(own.T.ravel())
     return first, np.concatenate(parts)
+
+
+def spread_first(vertices: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
+    """Return the vertices of a hull, those first that are the farthest in directions all around."""
+    if len(vertices) <= _SPREAD:
+        return vertices
+    height = np.linspace(-1.0, 1.0, 2 * _SPREAD + 1)[1::2]  # a spiral of Fibonacci
+    around, across = np.pi * (3.0 - 5.0**0.5) * np.arange(_SPREAD), np.sqrt(1.0 - height**2)
+    ways = np.stack([across * np.cos(around), across * np.sin(around), height])
+    order = dict.fromkeys([*np.argmax(vertices @ ways, 0).tolist(), *range(len(vertices))])
+    return vertices[list(order)]
+
+
+def _neighbours(first: Any, count: Any, packed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the neighbours of each vertex begin, and the neighbours: numbers of vertices in the hull.
+
+    Small hulls have none, nor those whose vertices are not all corners within rounding.
+    """
+    total = len(packed) // 3
+    lists: list[np.ndarray] = [np.zeros(0, int)] * total
+    for start, number in zip(first, count, strict=True):
+        if number <= 2 * _SPREAD:
+            continue
+        own = packed[3 * start : 3 * (start + number)].reshape(3, -1).T
+        hull = scipy.spatial.ConvexHull(own[: len(np.unique(own, axis=0))])
+        edges = np.unique(np.sort(hull.simplices[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2), 1), axis=0)
+        both = np.concatenate([edges, edges[:, ::-1]])
+        if len(np.unique(both[:, 0])) == len(hull.points):
+            ends = np.cumsum(np.bincount(both[:, 0]))
+            lists[start : start + len(ends)] = np.split(both[np.argsort(both[:, 0], kind="stable"), 1], ends[:-1])
+    starts = np.concatenate([[0], np.cumsum([len(own) for own in lists])])
+    return starts, np.concatenate([np.zeros(0, int), *lists])
 
 
 def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | None]) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +234,7 @@ class Gaps(NamedTuple):
 
 def gaps_at(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> Gaps:
     """Return the nearest pair at each configuration."""
-    lanes = max(len(q), len(scene.integers))
+    lanes = max(map(len, (q, *scene)))
     shapes = [((lanes, 10), float), ((lanes, 2), int)]
     numbers, pair = _library.call("clearances", shapes, q, robot.integers, robot.numbers, *scene)
     return Gaps(numbers[:, 0], numbers[:, 1:7].reshape(-1, 2, 3), numbers[:, 7:], pair)
@@ -206,7 +245,7 @@ def are_free(
 ) -> Bool[Array, " lanes"]:
     """Return whether all pairs keep a distance at each configuration."""
     given = q, robot.integers, robot.numbers, *scene, clearance
-    lanes = max(map(len, (q, scene.integers, clearance)))
+    lanes = max(map(len, (q, *scene, clearance)))
     return _library.call("are_free", [((lanes,), int)], *given)[0] > 0
 
 

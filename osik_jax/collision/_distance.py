@@ -127,6 +127,14 @@ def between_polytopes(a: Core, b: Core, *, rounds: int = 1) -> Nearest:
     )
 
 
+def nearest_points(
+    a: Float[Array, "4 3"], b: Float[Array, "4 3"], radii: Float[Array, "2"], otherwise: Float[Array, "3"]
+) -> Nearest:
+    """Return the separation of two shapes from the points of their cores between which the nearest ones lie."""
+    weights = _weights(b - a)
+    return _rounded(weights @ a, weights @ b, radii[0], radii[1], otherwise)
+
+
 class _Apart(NamedTuple):
     """Separating direction of two polytopes, the second one shifted, and the vertices nearest to each other then."""
 

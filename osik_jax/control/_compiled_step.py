@@ -3,9 +3,9 @@
 The core computes the rows of the tasks that it knows. JAX computes those of all other tasks and hands them over as
 arrays: they are GIVEN.
 
-``_step.py`` is the definition, the derivative, and what runs for hard tasks, limits with rows, other schemes and other
-platforms. No search of plain JAX stands beside the call: XLA makes place for all of its numbers in every step, searched
-or not, which costs more than the call.
+``_step.py`` is the definition, the derivative, and what runs for hard tasks, limits with rows beside priorities, other
+schemes and other platforms. No search of plain JAX stands beside the call: XLA makes place for all of its numbers in
+every step, searched or not, which costs more than the call.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._forward import kinematics_by
 from ..kinematics._kernels import dof_columns, tree_integers
-from ..limits import ConfigurationLimit, Limit, NoLimits, VelocityLimit, limit_box
+from ..limits import ConfigurationLimit, Limit, LimitRows, NoLimits, VelocityLimit, limit_box, limit_rows
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
@@ -42,6 +42,8 @@ from ._solution import Solution
 _LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
 """Limits whose box the core computes; JAX computes the box of others."""
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
+_HARD_ROWS = 2
+"""``StepLimit`` of the core."""
 Step = Callable[..., Solution]
 
 
@@ -58,7 +60,8 @@ def is_compiled(
 
     It takes none on a GPU, where XLA runs each part of a step by a kernel of its own.
     """
-    apart = any(task.hard for task in tasks.values()) or any(limit.has_rows(robot) for limit in limits)
+    has_rows = any(limit.has_rows(robot) for limit in limits) and type(scheme) is not WeightedQP
+    apart = has_rows or any(task.hard for task in tasks.values())
     if cuda_is_default() or apart or unknown_scheme(scheme) is not None:
         return False
     kinds = {jnp.result_type(a) for a in jax.tree.leaves((robot, q, tasks, scheme, limits, dt))}
@@ -66,13 +69,26 @@ def is_compiled(
     return (
         one_precision
         and takes(getattr(scheme, "backend", "jax"), "core", fits=True)
-        and (warm_start is None or _fits(warm_start, robot, q, tasks, scheme, dt))
+        and (warm_start is None or _fits(warm_start, robot, q, tasks, scheme, limits, dt))
     )
 
 
-def _fits(warm_start: Any, robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, dt: Any) -> bool:
-    rows = jax.eval_shape(given_rows, robot, q, tasks, scheme, dt)
-    return [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == Layout(robot, tasks, scheme, rows).labels
+def _fits(
+    warm_start: Any, robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, limits: Any, dt: Any
+) -> bool:
+    rows, of_limits = jax.eval_shape(given_rows, robot, q, tasks, scheme, limits, dt)
+    labels = Layout(robot, tasks, scheme, rows, row_count(of_limits)).labels
+    return [jnp.shape(a) for a in jax.tree.leaves(warm_start)] == labels
+
+
+def row_count(of_limits: LimitRows | None) -> int:
+    """Return how many rows limits have."""
+    return 0 if of_limits is None else of_limits.lower.shape[-1]
+
+
+def has_box(limit: Limit) -> bool:
+    """Return whether a limit bounds single dofs, and not rows alone."""
+    return any(type(part).box is not Limit.box for part in limit.parts()) or isinstance(limit, NoLimits)
 
 
 def unknown_scheme(scheme: Scheme) -> str | None:
@@ -122,16 +138,18 @@ def _card(robot: Robot, task: Task) -> CoreCard:
 
 
 def given_rows(
-    robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, dt: Array | float
-) -> dict[str, TaskRows]:
-    """Return the rows of the tasks that JAX computes, from placeholders for numbers that are not valid."""
+    robot: Robot, q: Array, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit], dt: Array | float
+) -> tuple[dict[str, TaskRows], LimitRows | None]:
+    """Return the rows of tasks and of limits that JAX computes, from placeholders for numbers that are not valid."""
     given = {name: task for name, task in tasks.items() if _unknown(robot, task)}
-    if not given:
-        return {}
-    (robot, q, dt, given), _ = with_placeholder((robot, q, positive(dt), given))
+    with_rows = tuple(limit for limit in limits if limit.has_rows(robot))
+    if not given and not with_rows:
+        return {}, None
+    (robot, q, dt, given, with_rows), _ = with_placeholder((robot, q, positive(dt), given, with_rows))
     kinematics = kinematics_by(getattr(scheme, "backend", "jax"), robot, q)
-    rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in given.items()})
-    return {name: _of_full_shape(own) for name, own in rows.items()}
+    of_limits = limit_rows(robot, kinematics, q, with_rows, dt)
+    rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in given.items()}) if given else {}
+    return {name: _of_full_shape(own) for name, own in rows.items()}, of_limits
 
 
 def _of_full_shape(rows: TaskRows) -> TaskRows:
@@ -200,6 +218,7 @@ class Layout:
         tasks: by name.
         scheme: the scheme.
         given: rows that JAX computes, of which the structure and shapes count.
+        limit_rows: number of rows of limits.
 
     Attributes:
         labels: shapes of the warm start's arrays.
@@ -207,7 +226,12 @@ class Layout:
     """
 
     def __init__(
-        self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, given: Mapping[str, TaskRows] | None = None
+        self,
+        robot: Robot,
+        tasks: Mapping[str, Task],
+        scheme: Scheme,
+        given: Mapping[str, TaskRows] | None = None,
+        limit_rows: int = 0,
     ) -> None:
         self.robot, self.tasks, self.kind, self.given = robot, tasks, _kind(scheme), given or {}
         own = self.given
@@ -238,7 +262,8 @@ class Layout:
         )
         levels, longest, h = len(self.of_level), max(self.of_level), nv + len(self.hard)
         if by_weight:
-            self.labels, self.sizes = [(nv + intervals,)], (dense, intervals, 0, 0, 20 * (nv + intervals))
+            bounded_rows = intervals + limit_rows
+            self.labels, self.sizes = [(nv + bounded_rows,)], (dense, bounded_rows, 0, 0, 20 * (nv + bounded_rows))
         else:
             self.labels = [] if projects else [(levels, h), (levels, longest)]
             self.sizes = longest, 0, levels, h, 10 * (nv + (2 if projects else longest))
@@ -249,6 +274,7 @@ class Layout:
         numbered: tuple[Any, ...],
         box: int,
         given: Mapping[str, list[int]] | None = None,
+        limit_rows: Sequence[int] = (),
     ) -> np.ndarray:
         """Return what ``Step`` in ``core/step.hpp`` reads.
 
@@ -257,12 +283,15 @@ class Layout:
             numbered: the arguments of the step with the numbers of leaves in their place.
             box: number of the leaf with the lower bounds of the box, before that of the upper ones; -1: by the limits.
             given: numbers of the leaves with the rows that JAX computes, by task (``_placed``).
+            limit_rows: numbers of the leaves with the rows of limits; empty for none.
         """
         robot, q, tasks, scheme, limits, dt, _ = numbered
         tree, nv, by_weight = self.robot.tree, self.robot.nv, self.kind == _WEIGHTED
         of_limits = [
             _leaves_of_limit(limit) for limit in limits if isinstance(limit, ConfigurationLimit | VelocityLimit)
         ]
+        if limit_rows:
+            of_limits.append([_HARD_ROWS, *limit_rows, limit_rows[0]])
         bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
         nq, *of_tree = tree_integers(tree)
         scalar, place = scalar_layout(self.robot)
@@ -319,25 +348,30 @@ def _leaves_of_limit(limit: Any) -> list[Any]:
 
 
 def _placed(
-    rows: Mapping[str, TaskRows], places: dict[int, tuple[int, int, int]], array: int
-) -> tuple[dict[str, list[int]], list[Array]]:
-    """Return numbers of new leaves with the rows of lanes that JAX computes, by task, and the leaves.
+    rows: Mapping[str, TaskRows], of_limits: LimitRows | None, places: dict[int, tuple[int, int, int]], array: int
+) -> tuple[dict[str, list[int]], list[int], list[Array]]:
+    """Return numbers of new leaves with the rows of lanes that JAX computes, by task and of limits, and the leaves.
 
     The leaves stand side by side in one array; ``places`` gets theirs. Numbers are in the order of
     ``StepRows::add_given``, -1 for what it does not need.
     """
-    found: dict[str, list[int]] = {name: [] for name in rows}
+    found: dict[str, list[int]] = {}
     parts: list[Array] = []
-    end = 0
+
+    def add(part: Array | None) -> int:
+        if part is None:
+            return -1
+        end = sum(own[0].size for own in parts)
+        places[len(places)] = array, end, part[0].size
+        parts.append(part)
+        return len(places) - 1
+
     for name, own in rows.items():
         upper, jacobian = (None if own.is_equality else own.upper), (None if own.dofs is not None else own.jacobian)
-        for part in (own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None):
-            found[name].append(-1 if part is None else len(places))
-            if part is not None:
-                places[len(places)] = array, end, part[0].size
-                end += part[0].size
-                parts.append(part)
-    return found, parts
+        fields = own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None
+        found[name] = [add(part) for part in fields]
+    limit_rows = [] if of_limits is None else [add(part) for part in jax.tree.leaves(of_limits)]
+    return found, limit_rows, parts
 
 
 def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:
@@ -382,21 +416,21 @@ def _steps(plain: Step, *given: Any) -> Solution:
 def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     """Return all numbers and all integers of the solutions, those of a lane one after another."""
     robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
-    rows = over_lanes(given_rows)(robot, q, tasks, scheme, dt)
-    layout, numbered = Layout(robot, tasks, scheme, rows), packed.numbered()
+    rows, of_limits = over_lanes(given_rows)(robot, q, tasks, scheme, limits, dt)
+    layout, numbered = Layout(robot, tasks, scheme, rows, row_count(of_limits)), packed.numbered()
     guesses, box = jax.tree.leaves(warm_start), -1
     given = [a for a in arrays if jnp.issubdtype(a.dtype, jnp.floating)]
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    if not (q.dtype == jnp.float64 and all(type(limit) in _LIMITS for limit in limits)):
+    if not (q.dtype == jnp.float64 and all(type(limit) in _LIMITS for limit in limits if has_box(limit))):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv
             given.append(bound)
-    rows_at, parts = _placed(rows, places, len(given))
+    rows_at, limit_rows_at, parts = _placed(rows, of_limits, places, len(given))
     given += [side_by_side(*parts)] if parts else []
-    integers = layout.integers(places, numbered, box, rows_at)
+    integers = layout.integers(places, numbered, box, rows_at, limit_rows_at)
     labels = sum(int(np.prod(shape)) for shape in layout.labels)
     shapes = ((packed.lanes, robot.tree.nv + 2 + 2 * layout.rows), float), ((packed.lanes, 3 + labels), int)
     numbers, integers = _library.call("step", shapes, integers, *guesses, *given, layout.constants(q.dtype))

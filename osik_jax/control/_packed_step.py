@@ -48,22 +48,37 @@ class PackedStep(NamedTuple):
         return slice(first, first + count)
 
 
-def pack(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float) -> PackedStep:
-    """Return the step of tasks, scheme and all limits, of which the core has every part."""
+def pack(
+    robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float, limit_rows: int = 0
+) -> PackedStep:
+    """Return the step of tasks, scheme and all limits, of which the core has every part.
+
+    Args:
+        robot: the robot.
+        tasks: by name.
+        scheme: how they share the robot.
+        bounds: all limits.
+        dt: time of a step [s].
+        limit_rows: number of rows of limits, for which there is room in the last three leaves: Jacobian, bounds.
+    """
     tasks = dict(sorted(tasks.items()))  # as in a program of JAX, so that roundoff is the same
     given = robot, robot.q0, tasks, scheme, tuple(bounds), dt, None
     leaves, tree = jax.tree.flatten(given)
     leaves = [np.asarray(leaf, np.float64).ravel() for leaf in leaves]
+    numbered = jax.tree.unflatten(tree, range(len(leaves)))
+    room = np.zeros(limit_rows * robot.nv), np.full(limit_rows, -np.inf), np.full(limit_rows, np.inf)
+    of_limits = [*range(len(leaves), len(leaves) + 3)] if limit_rows else []
+    leaves += room if limit_rows else ()
     sizes = [len(leaf) for leaf in leaves]
     firsts = (np.cumsum(sizes) - sizes).tolist()
-    numbered, rows = jax.tree.unflatten(tree, range(len(leaves))), Layout(robot, tasks, scheme)
+    rows = Layout(robot, tasks, scheme, limit_rows=limit_rows)
     of_one_array = {i: (0, first, size) for i, (first, size) in enumerate(zip(firsts, sizes, strict=True))}
     return PackedStep(
         np.concatenate(leaves),
         list(zip(firsts, sizes, strict=True)),
         numbered,
         rows,
-        rows.integers(of_one_array, numbered, -1),
+        rows.integers(of_one_array, numbered, -1, limit_rows=of_limits),
         rows.constants(np.dtype(np.float64)),
     )
 

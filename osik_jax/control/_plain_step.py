@@ -19,7 +19,7 @@ import numpy as np
 from jax.core import Tracer
 
 from ..core._plain import functions
-from ..limits import Limit, NoLimits, with_own_limits
+from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, with_own_limits
 from ..numerics._host import float_now, is_traced
 from ..robot import Robot
 from ..schemes import HierarchicalQP, Scheme, WeightedQP
@@ -29,6 +29,7 @@ from ..tasks import Task
 from ._checks import LARGEST_GAIN, plain_configuration
 from ._compiled_step import is_compiled, leaf_places, missing_part
 from ._packed_step import pack
+from ._plain_rows import PlainRows, with_plain_rows
 from ._solution import Solution
 
 _MOST = 64
@@ -101,7 +102,8 @@ def plain_step(
     bounds = with_own_limits(robot, _given(limits))
     if not is_compiled(robot, robot.q0, dict(tasks), chosen, bounds, np.float64(dt), None):
         return None
-    if missing_part(robot, tasks, chosen, bounds) is not None:
+    others = [limit for limit in bounds if limit not in with_plain_rows(bounds)]
+    if missing_part(robot, tasks, chosen, others) is not None:
         return None
     return PlainStep(robot, tasks, scheme, limits, float(dt), chosen, bounds)
 
@@ -184,7 +186,8 @@ class PlainStep(Checked):
         bounds: Sequence[Limit],
     ) -> None:
         super().__init__(robot, tasks, scheme, limits)
-        packed = pack(robot, tasks, chosen, bounds, dt)
+        avoiding = with_plain_rows(bounds)
+        packed = pack(robot, tasks, chosen, bounds, dt, sum(limit.max_pairs for limit in avoiding))
         of_robot, q, numbered, of_scheme, of_limits, of_dt, _ = packed.numbered
         self._q, self._of_dt = packed.place(q), packed.place(of_dt)
         self._dt: Any = dt
@@ -196,6 +199,7 @@ class PlainStep(Checked):
         self._structures = {name: jax.tree.structure(task) for name, task in tasks.items()}
         self._labels = packed.rows.labels
         self._numbers, self._constants = packed.numbers, packed.constants
+        self._rows = self._rows_in(packed, avoiding)
         self._result = np.zeros(robot.nv + 2 + 2 * packed.rows.rows)
         sizes = [int(np.prod(shape)) for shape in self._labels]
         self._guess, self._integers = np.zeros(sum(sizes), np.int32), np.zeros(3 + sum(sizes), np.int32)
@@ -206,6 +210,7 @@ class PlainStep(Checked):
         if not self._handle:
             raise MemoryError("there is no memory for a step")
         self._inputs = self._handle, self._constants.ctypes.data, self._numbers.ctypes.data
+        self._q_address = self._numbers[self._q].ctypes.data
         guess = self._guess.ctypes.data
         self._guesses = guess, guess + self._guess.itemsize * sizes[0] if len(sizes) > 1 else None
         self._results = self._result.ctypes.data, self._integers.ctypes.data
@@ -299,11 +304,23 @@ class PlainStep(Checked):
             try:
                 for name, parts in aims.items():
                     self._aim(name, tasks[name], parts, own)
+                for rows in self._rows:
+                    rows.fill(self._q_address, dt)
                 functions().step(*self._inputs, *guesses, self._clean, *self._results)
             finally:  # also where Ctrl-C ends the call
                 for place, numbers in own:
                     self._numbers[place] = numbers
             return self._result.copy(), self._integers.copy()
+
+    def _rows_in(self, packed: Any, avoiding: Sequence[CollisionAvoidanceLimit]) -> list[PlainRows]:
+        """Return the rows of limits, each in its part of the last leaves."""
+        if not avoiding:
+            return []
+        count = len(packed.places)
+        jacobian, lower = (self._numbers[packed.place(count - k)] for k in (3, 2))
+        jacobian, ends = jacobian.reshape(len(lower), -1), np.cumsum([limit.max_pairs for limit in avoiding])
+        parts = zip(np.split(jacobian, ends[:-1]), np.split(lower, ends[:-1]), strict=True)
+        return [PlainRows(limit, *part) for limit, part in zip(avoiding, parts, strict=True)]
 
     def _converted(self, name: str, task: Task, target: Any) -> list[Any]:
         """Return the parts of a target as ``replace`` converts it."""
@@ -321,6 +338,8 @@ class PlainStep(Checked):
         self._setting = (_UNKNOWN,)
         if structure != self._structure or not self._fill(self._parts, leaves):
             return False
+        for rows, limit in zip(self._rows, with_plain_rows(given), strict=True):
+            rows.take(limit)
         self._own, self._own_robot, self._setting = own, robot, (robot, *given)
         return True
 

@@ -16,6 +16,10 @@ class Functions(NamedTuple):
     free: Any
     step: Any
     integrate: Any
+    rows_new: Any
+    rows_free: Any
+    rows_set: Any
+    rows: Any
 
 
 @cache
@@ -33,6 +37,21 @@ def functions() -> Functions:
     library.osik_plain_step.restype = None
     library.osik_plain_integrate.argtypes = [number] * 2 + [pointer] * 5
     library.osik_plain_integrate.restype = None
+    library.osik_plain_rows_new.argtypes = [pointer] * 2 + [number]
+    library.osik_plain_rows_new.restype = pointer
+    library.osik_plain_rows_free.argtypes = [pointer]
+    library.osik_plain_rows_free.restype = None
+    library.osik_plain_rows_set.argtypes = [pointer] * 3
+    library.osik_plain_rows_set.restype = None
+    library.osik_plain_rows.argtypes = [pointer] * 5
+    library.osik_plain_rows.restype = None
     return Functions(
-        library.osik_plain_new, library.osik_plain_free, library.osik_plain_step, library.osik_plain_integrate
+        library.osik_plain_new,
+        library.osik_plain_free,
+        library.osik_plain_step,
+        library.osik_plain_integrate,
+        library.osik_plain_rows_new,
+        library.osik_plain_rows_free,
+        library.osik_plain_rows_set,
+        library.osik_plain_rows,
     )

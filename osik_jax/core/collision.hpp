@@ -15,27 +15,30 @@ namespace osik {
 // A robot's tree and shapes, as collision/_core.py lays them out.
 template <class Real> struct ShapedRobot {
   using In = const Real*;
-  int bodies, joints, dofs, full, shapes, pairs, vertices;
+  int bodies, joints, dofs, full, shapes, pairs, vertices, nv;
   const int *parents, *types, *owners, *source;          // [bodies], [joints] twice, [full]
   const int *moves, *group;  // [bodies] whether the search moves it; its rigid group, 0 if not
   const int *kind, *body, *first, *count, *world;  // [shapes] each
-  const int* pair;  // [pairs, 2]
+  const int *pair, *column;  // [pairs, 2]; [dofs] entry of the velocity that each dof adds to, -1 for none
+  const int *first_next, *next;  // [vertices + 1]; Convex has the meaning
   In factor, offset, reference, position, quaternion, joint_position, joint_axis;
   In size, place, turn, center, bound, points;  // [shapes, 3] twice, [shapes, 9], centre [shapes, 3] and radius of
   // a sphere in the body's axes, [vertices, 3]
+  In column_factor;  // [dofs]
   ShapedRobot(const int* integers, In numbers) {
     Reader<const int*> i{integers};
     bodies = *i.take(1), joints = *i.take(1), dofs = *i.take(1), full = *i.take(1);
-    shapes = *i.take(1), pairs = *i.take(1), vertices = *i.take(1);
+    shapes = *i.take(1), pairs = *i.take(1), vertices = *i.take(1), nv = *i.take(1);
     parents = i.take(bodies), types = i.take(joints), owners = i.take(joints), source = i.take(full);
     moves = i.take(bodies), group = i.take(bodies), kind = i.take(shapes), body = i.take(shapes), first = i.take(shapes),
     count = i.take(shapes);
-    world = i.take(shapes), pair = i.take(2 * pairs);
+    world = i.take(shapes), pair = i.take(2 * pairs), column = i.take(dofs), first_next = i.take(vertices + 1);
+    next = i.at;
     Reader<In> r{numbers};
     factor = r.take(full), offset = r.take(full), reference = r.take(full), position = r.take(3 * bodies);
     quaternion = r.take(4 * bodies), joint_position = r.take(3 * joints), joint_axis = r.take(3 * joints);
     size = r.take(3 * shapes), place = r.take(3 * shapes), turn = r.take(9 * shapes), center = r.take(3 * shapes);
-    bound = r.take(shapes), points = r.take(3 * vertices);
+    bound = r.take(shapes), points = r.take(3 * vertices), column_factor = r.take(dofs);
   }
   Tree<In> tree() const {
     return {bodies, joints, dofs, parents, types, owners, reference, position, quaternion, joint_position, joint_axis};
@@ -87,9 +90,7 @@ template <class Real> class Collision {
   explicit Collision(const ShapedRobot<Real>& robot)
       : robot(robot), turns(9 * robot.bodies), positions(3 * robot.bodies), unused(9 * robot.dofs) {
     for (int k = 0; k < robot.shapes; ++k)
-      add({robot.kind[k], robot.count[k], V::of(robot.size + 3 * k), V::of(robot.place + 3 * k), M::of(robot.turn + 9 * k),
-           robot.points + 3 * robot.first[k]},
-          robot.body[k], V::of(robot.center + 3 * k), robot.bound[k]);
+      add(shape_of(robot, k), robot.body[k], V::of(robot.center + 3 * k), robot.bound[k]);
   }
 
   // Take a scene in place of the last one.
@@ -117,10 +118,14 @@ template <class Real> class Collision {
     place_bodies(robot.tree(), Configuration<const Real*>{q, robot.factor, robot.offset, robot.source},
                  Placed<Real*>{positions.data(), turns.data(), unused.data(), unused.data() + 3 * robot.dofs,
                                unused.data() + 6 * robot.dofs});
+    place(positions.data(), turns.data());
+  }
+  // Place the shapes where the bodies are: [bodies, 3] and [bodies, 9].
+  void place(const Real* body_positions, const Real* body_turns) {
     for (size_t k = 0; k < local.size(); ++k) {
       if (carrier[k] < 0) continue;
-      const M turn = M::of(turns.data() + 9 * carrier[k]);
-      const V at = V::of(positions.data() + 3 * carrier[k]);
+      const M turn = M::of(body_turns + 9 * carrier[k]);
+      const V at = V::of(body_positions + 3 * carrier[k]);
       world[k].rotation = turn * local[k].rotation, world[k].position = turn * local[k].position + at;
       center[k] = turn * local_center[k] + at;
     }
@@ -153,6 +158,19 @@ template <class Real> class Collision {
     return std::max(world[p.j].beyond(center[p.i], center[p.j], bound[p.j]) - bound[p.i],
                     world[p.i].beyond(center[p.j], center[p.i], bound[p.i]) - bound[p.j]);
   }
+  // Whether the bounding spheres of a pair are farther apart than `far`: the quickest test.
+  bool is_out_of_reach(Pair p, Real far) const {
+    const V way = center[p.j] - center[p.i];
+    const Real reach = bound[p.i] + bound[p.j] + far;
+    return inner(way, way) > reach * reach;
+  }
+  // f(number, shapes) of each pair whose distance changes
+  template <class F> void each_moving_pair(F f) const {
+    for (int k = fixed; k < int(pairs.size()); ++k) f(k, pairs[k]);
+  }
+  Pair pair(int number) const { return pairs[number]; }
+  int body(int shape) const { return carrier[shape]; }
+  const Convex<Real>& shape(int number) const { return world[number]; }
   template <class F> bool any_pair(F f) const {
     for (const Pair p : pairs)
       if (f(p.i, p.j)) return true;
@@ -168,6 +186,18 @@ template <class Real> class Collision {
   Real reach(int shape, V from) const { return sqrt(inner(center[shape] - from, center[shape] - from)) + bound[shape]; }
 
  private:
+  static Convex<Real> shape_of(const ShapedRobot<Real>& robot, int k) {
+    const int* neighbours = robot.first_next + robot.first[k];
+    const bool climbs = robot.count[k] && neighbours[1] > neighbours[0];
+    return {robot.kind[k],
+            robot.count[k],
+            V::of(robot.size + 3 * k),
+            V::of(robot.place + 3 * k),
+            M::of(robot.turn + 9 * k),
+            robot.points + 3 * robot.first[k],
+            climbs ? neighbours : nullptr,
+            robot.next};
+  }
   static int padded(int count) { return (count + HULL_PACK - 1) / HULL_PACK * HULL_PACK; }
   void resize(int count) {
     local.resize(count), world.resize(count), local_center.resize(count), center.resize(count), bound.resize(count);

@@ -25,13 +25,18 @@ template <class Real> struct Convex {
   V size, position;
   Mat3<Real> rotation;   // from the shape's axes
   const Real* vertices;  // [3, count] in the shape's axes
+  // neighbours of vertex k of a large hull: next[first_next[k]] and on, up to next[first_next[k + 1]]; or null
+  const int *first_next = nullptr, *next = nullptr;
+  static constexpr int SPREAD = 32;  // so many of the first vertices of such a hull lie in all directions
 
   OSIK_FN Real radius() const { return kind == SPHERE || kind == CAPSULE || kind == HULL ? size.x : Real(0); }
   OSIK_FN V axis() const { return {rotation.a.z, rotation.b.z, rotation.c.z}; }
   OSIK_FN static Real toward(Real size, Real direction) { return direction < 0 ? -size : size; }
   // The point of the core that is farthest along a unit vector; both in the shape's axes.
-  OSIK_FN V support(V d) const {
-    if (kind == HULL) return farthest(d);
+  // near: a vertex of a hull to begin with, -1 for none; then the one that was found
+  OSIK_FN V support(V d, int& near) const {
+    if (kind == HULL)
+      return vertex(near = first_next ? climb(d, near < 0 ? farthest(d, SPREAD) : near) : farthest(d, count));
     if (kind == BOX) return {toward(size.x, d.x), toward(size.y, d.y), toward(size.z, d.z)};
     if (kind == CAPSULE) return {0, 0, toward(size.y, d.z)};
     if (kind == SPHERE) return {0, 0, 0};
@@ -39,20 +44,36 @@ template <class Real> struct Convex {
     return {share * d.x, share * d.y, toward(size.y, d.z)};
   }
   OSIK_FN V vertex(int k) const { return {vertices[k], vertices[count + k], vertices[2 * count + k]}; }
-  OSIK_FN V farthest(V d) const {
+  OSIK_FN V support(V d) const {
+    int near = -1;
+    return support(d, near);
+  }
+  OSIK_FN int climb(V d, int best) const {
+    Real most = inner(d, vertex(best));
+    for (int from = -1; from != best;) {
+      from = best;
+      for (int k = first_next[from]; k < first_next[from + 1]; ++k) {
+        const Real along = inner(d, vertex(next[k]));
+        if (along > most) most = along, best = next[k];
+      }
+    }
+    return best;
+  }
+  // Of the first vertices.
+  OSIK_FN int farthest(V d, int number_of_first) const {
 #ifdef __CUDACC__
     int best = 0;
     Real most = inner(d, vertex(0));
-    for (int k = 1; k < count; ++k) {
+    for (int k = 1; k < number_of_first; ++k) {
       const Real along = inner(d, vertex(k));
       if (along > most) most = along, best = k;
     }
-    return vertex(best);
+    return best;
 #else
     typedef Real Pack __attribute__((vector_size(4 * sizeof(Real))));
     Pack most{}, at{}, number{0, 1, 2, 3};
     most += -std::numeric_limits<Real>::infinity();
-    for (int k = 0; k < count; k += 4, number += Real(4)) {
+    for (int k = 0; k < number_of_first; k += 4, number += Real(4)) {
       Pack x, y, z;
       std::memcpy(&x, vertices + k, sizeof x), std::memcpy(&y, vertices + count + k, sizeof y);
       std::memcpy(&z, vertices + 2 * count + k, sizeof z);
@@ -62,7 +83,7 @@ template <class Real> struct Convex {
     }
     int best = 0;
     for (int k = 1; k < 4; ++k) best = most[k] > most[best] ? k : best;
-    return vertex(int(at[best]));
+    return int(at[best]);
 #endif
   }
   // A lower bound on the distance from a point of the world; exact outside of all kinds but hulls.
@@ -115,13 +136,14 @@ template <class Real> class Difference : Simplex<Real> {
   // Whether the distance of the cores is at least `least` > 0.
   bool is_apart(Real least) {
     if (!is_known_place()) return false;
-    approach(least);
+    approach(least, true);
     return is_known ? is_far : !overlaps && size >= least;
   }
-  // Signed distance of the cores, in world axes.
-  Gap<Real> gap() {
+  // Signed distance of the cores, in world axes; `most` alone, if it is positive and the distance not less.
+  Gap<Real> gap(Real most = -1) {
     if (!is_known_place()) return {offset.x * Real(0) / Real(0), offset, offset, offset};
-    approach(Real(-1));
+    approach(most, false);
+    if (is_far) return {most, {}, {}, {}};
     V normal, on_a{0, 0, 0};
     Real distance = size;
     if (overlaps) {
@@ -131,8 +153,14 @@ template <class Real> class Difference : Simplex<Real> {
       for (int k = 0; k < count; ++k) on_a = on_a + share[k] * simplex[k].a;
     }
     const V on_b = on_a + distance * normal;
-    auto world = [&](V p) { return a.rotation * p + a.position; };
     return {distance, world(on_a), world(on_b), a.rotation * normal};
+  }
+  // After `gap` of cores that are apart: four points of each, in world axes, between which the nearest points lie.
+  void put_points(V* on_a, V* on_b) const {
+    for (int k = 0; k < 4; ++k) {
+      const Point p = simplex[k < count ? k : 0];
+      on_a[k] = world(p.a), on_b[k] = world(p.a - p.w);
+    }
   }
 
  private:
@@ -145,9 +173,10 @@ template <class Real> class Difference : Simplex<Real> {
   const V offset;
   using Simplex<Real>::simplex, Simplex<Real>::share, Simplex<Real>::size, Simplex<Real>::v, Simplex<Real>::count;
   bool overlaps, is_known, is_far;
+  int near_a = -1, near_b = -1;  // vertices of hulls that the last direction found
 
-  Point support(V d) const {
-    const V on_a = a.support(d), on_b = turn * b.support(Real(-1) * (back * d)) + offset;
+  Point support(V d) {
+    const V on_a = a.support(d, near_a), on_b = turn * b.support(Real(-1) * (back * d), near_b) + offset;
     return {on_a - on_b, on_a};
   }
   // Whether the shapes' places are finite numbers.
@@ -156,10 +185,11 @@ template <class Real> class Difference : Simplex<Real> {
     return sum - sum == 0;
   }
   static Real length(V p) { return sqrt(inner(p, p)); }
+  V world(V p) const { return a.rotation * p + a.position; }
 
-  // Find the point of the difference that is nearest to the origin. With `least` > 0, stop as soon as it is known
-  // whether its distance is at least that.
-  void approach(Real least) {
+  // Find the point of the difference that is nearest to the origin. With `least` > 0, stop as soon as it is known that
+  // its distance is at least that, or, if one only `decides`, that it is less.
+  void approach(Real least, bool decides) {
     v = Real(-1) * offset, count = 0, overlaps = is_known = is_far = false;
     size = length(v);
     if (!(size > TOLERANCE)) v = {1, 0, 0}, size = 1;
@@ -174,7 +204,7 @@ template <class Real> class Difference : Simplex<Real> {
       reduce();
       if (overlaps || size <= TOLERANCE) return void(overlaps = true);
       if (step && size >= nearest) return void(static_cast<Simplex<Real>&>(*this) = before);  // roundoff
-      if (least > 0 && size < least) return void(is_known = true);
+      if (decides && size < least) return void(is_known = true);
       nearest = size;
     }
   }
@@ -359,15 +389,16 @@ template <class Real> Gap<Real> gap_to_plane(const Convex<Real>& a, const Convex
   return {distance, lowest, lowest + distance * down, down};
 }
 
-// Signed distance of two shapes, one of which may be a half space.
-template <class Real> Gap<Real> gap_between(const Convex<Real>& a, const Convex<Real>& b) {
+// Signed distance of two shapes, one of which may be a half space. If `most` is positive and the distance not less, `most`
+// or more is all that is found.
+template <class Real> Gap<Real> gap_between(const Convex<Real>& a, const Convex<Real>& b, Real most = -1) {
   if (b.kind == HALF_SPACE) return gap_to_plane(a, b);
   if (a.kind == HALF_SPACE) {
     const Gap<Real> turned = gap_to_plane(b, a);
     return {turned.distance, turned.on_b, turned.on_a, Real(-1) * turned.normal};
   }
-  const Gap<Real> core = Difference<Real>(a, b).gap();
   const Real first = a.radius(), second = b.radius();
+  const Gap<Real> core = Difference<Real>(a, b).gap(most > 0 ? most + first + second : most);
   return {core.distance - first - second, core.on_a + first * core.normal, core.on_b - second * core.normal, core.normal};
 }
 

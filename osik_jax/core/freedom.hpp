@@ -12,9 +12,10 @@ namespace osik {
 constexpr double TOUCH = 1e-6;  // solutions keep so much more, against rounding of their numbers [m]
 
 // The scene of a target: argument `k` has integers, `k + 1` numbers, each with a row for each scene or one for all.
+inline bool has_many_scenes(const xla::Call& call, int k) { return call.size(k, 0) > 1 || call.size(k + 1, 0) > 1; }
 inline SceneRows<double> scene_of(const xla::Call& call, int k, int shapes, int target) {
   const size_t row = call.size(k, 0) > 1 ? target : 0;
-  return {call.in<int>(k) + call.size(k, 1) * row, call.in<double>(k + 1) + call.size(k + 1, 1) * row, shapes};
+  return {call.in<int>(k) + call.size(k, 1) * row, xla::lane_of(call, k + 1, target), shapes};
 }
 
 // Call a worker that `make` makes with each number below `count`, in threads that take `least` of them or more.
@@ -60,7 +61,7 @@ class Freedom {
 
   // Take a target's scene; false if shapes touch that no joint of the search parts.
   bool begin(const xla::Call& call, int target, const double* home) {
-    const int own = call.size(7, 0) > 1 ? target : 0;
+    const int own = has_many_scenes(call, 7) ? target : 0;
     if (own != row) collision.set(scene_of(call, 7, robot.shapes, target)), row = own;
     clearance = call.in<double>(9)[0], is_blocked = false, rejected.clear();
     collision.place(home);
@@ -130,7 +131,7 @@ inline void find_clearances(const xla::Call& call) {
   Collision<double> collision(robot);
   const int lanes = call.result_size(0, 0);
   for (int lane = 0; lane < lanes; ++lane) {
-    if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
+    if (lane == 0 || has_many_scenes(call, 3)) collision.set(scene_of(call, 3, robot.shapes, lane));
     collision.place(xla::lane_of(call, 0, lane));
     const auto nearest = collision.nearest();
     double* to = call.out<double>(0) + 10 * lane;
@@ -145,7 +146,7 @@ inline void find_free_ones(const xla::Call& call) {
   const ShapedRobot<double> robot(call.in<int>(1), call.in<double>(2));
   Collision<double> collision(robot);
   for (int lane = 0; lane < call.result_size(0, 0); ++lane) {
-    if (lane == 0 || call.size(3, 0) > 1) collision.set(scene_of(call, 3, robot.shapes, lane));
+    if (lane == 0 || has_many_scenes(call, 3)) collision.set(scene_of(call, 3, robot.shapes, lane));
     collision.place(xla::lane_of(call, 0, lane));
     const double least = *xla::lane_of(call, 5, lane);
     call.out<int>(0)[lane] = collision.nearer(least, false).i < 0 && collision.nearer(least, true).i < 0;

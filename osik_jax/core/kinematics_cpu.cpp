@@ -3,6 +3,7 @@
 
 #include "chain_find.hpp"
 #include "way_around.hpp"
+#include "near_rows.hpp"
 #include "xla.hpp"
 
 using namespace osik;
@@ -31,6 +32,7 @@ extern "C" {
 void* osik_free_find(xla::CallFrame* frame) { return xla::handle<find_free>(frame); }
 void* osik_are_free(xla::CallFrame* frame) { return xla::handle<find_free_ones>(frame); }
 void* osik_clearances(xla::CallFrame* frame) { return xla::handle<find_clearances>(frame); }
+void* osik_near_rows(xla::CallFrame* frame) { return xla::handle<find_near_rows>(frame); }
 void* osik_shape_gaps(xla::CallFrame* frame) { return xla::handle<find_gaps>(frame); }
 void* osik_ways(xla::CallFrame* frame) { return xla::handle<find_ways>(frame); }
 void* osik_chain_find(xla::CallFrame* frame) { return xla::handle<find_chain>(frame); }

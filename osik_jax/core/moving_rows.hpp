@@ -13,7 +13,7 @@ namespace osik {
 
 enum StepScheme { WEIGHTED = 0, HIERARCHICAL = 1, CLASSICAL = 2, SATURATED = 3 };  // the last two: NullSpace
 enum StepTask { POSE = 0, CENTER = 1, POSTURE = 2, GIVEN = 3 };  // the last one: rows that JAX has computed
-enum StepLimit { SPEED = 0, RANGE = 1 };  // in the order in which they narrow the box
+enum StepLimit { SPEED = 0, RANGE = 1, HARD_ROWS = 2 };  // in the order in which they narrow the box; the last one does not
 
 // Sizes of a step; m, p, L and h are those of QPSizes and Sizes.
 struct StepSizes {
@@ -28,8 +28,8 @@ struct StepSizes {
 struct StepLayout {
   struct Task {
     int kind, m, first, out, level, bounded, diagonal;  // out: of its slack and error; diagonal: equality of single dofs
-    const int* leaves;                                  // gain, weight, target velocity, bounds, then those of its kind
-    int count;                                          // of the options
+    const int* leaves;  // gain, weight, target velocity, bounds, then those of its kind
+    int count;  // of the options
     const int* options;
   };
   struct Place {  // of a leaf
@@ -54,9 +54,9 @@ struct StepLayout {
   std::vector<int> numbers;
   std::vector<Task> tasks;
   const Place* places;
-  const int *of_step, *of_robot;                 // leaves, those of the box -1 for none
+  const int *of_step, *of_robot;  // leaves, those of the box -1 for none
   const int *source, *owner, *turning, *scalar;  // [nq] entry of the given q, [dofs] body, [nv], [nv] place in q or -1
-  const int* limits;                             // [limits, 5] kind and leaves of each
+  const int* limits;  // [limits, 5] kind and leaves of each
   const int *parents, *types, *owners, *column;  // those of Tree and DofColumns
   const int *row_counts, *level_of_hard, *row_of_hard;
 

@@ -3,11 +3,48 @@
 #include <new>
 
 #include "manifold.hpp"
+#include "near_rows.hpp"
 #include "step.hpp"
 
 using namespace osik;
 
+namespace {
+// The rows of a CollisionAvoidanceLimit of one robot.
+struct PlainRows {
+  const ShapedRobot<double> robot;
+  NearRows rows;
+  std::vector<double> space, distance;
+  std::vector<int> pair;
+
+  PlainRows(const int* integers, const double* numbers, int most)
+      : robot(integers, numbers), rows(robot), space(12 * robot.bodies + 9 * robot.dofs), distance(most), pair(4 * most) {}
+  void find(const double* q, const double* limit, double* J, double* lower) {
+    double *position = space.data(), *turn = position + 3 * robot.bodies, *axes = turn + 9 * robot.bodies;
+    const int dofs = 3 * robot.dofs;
+    place_bodies(robot.tree(), Configuration<const double*>{q, robot.factor, robot.offset, robot.source},
+                 Placed<double*>{position, turn, axes, axes + dofs, axes + 2 * dofs});
+    rows.find({position, turn, axes, axes + dofs, axes + 2 * dofs}, *reinterpret_cast<const AvoidanceNumbers*>(limit),
+              int(distance.size()), J, lower, distance.data(), pair.data());
+  }
+};
+}  // namespace
+
 extern "C" {
+// Rows that keep shapes apart. The arrays of the robot stay where they are; those of a scene are copied.
+void* osik_plain_rows_new(const int* robot_integers, const double* robot_numbers, int most) {
+  try {
+    return new PlainRows(robot_integers, robot_numbers, most);
+  } catch (const std::bad_alloc&) { return nullptr; }
+}
+void osik_plain_rows_free(void* rows) { delete static_cast<PlainRows*>(rows); }
+void osik_plain_rows_set(void* rows, const int* scene_integers, const double* scene_numbers) {
+  auto& own = *static_cast<PlainRows*>(rows);
+  own.rows.set({scene_integers, scene_numbers, own.robot.shapes});
+}
+void osik_plain_rows(void* rows, const double* q, const double* limit, double* J, double* lower) {
+  static_cast<PlainRows*>(rows)->find(q, limit, J, lower);
+}
+
 // layout: of control/_compiled_step.py. NULL: there is no memory.
 void* osik_plain_new(const int* layout, int count) {
   try {

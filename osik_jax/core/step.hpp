@@ -19,6 +19,7 @@ class Step : StepRows {
   void take(const StepData& d, const StepResult& to, bool clean, int robot = -1) {
     const int n = s.nv;
     const bool valid = find_rows(d, clean, robot);
+    contradicts = false;
     std::fill(to.integers, to.integers + 3 + s.labels(), 0);
     if (s.scheme == CLASSICAL || s.scheme == SATURATED) to.integers[2] = s.L - 1;
     if (s.scheme == CLASSICAL) to.integers[1] = s.L - 1;
@@ -29,7 +30,7 @@ class Step : StepRows {
               : s.scheme == HIERARCHICAL ? solve_hierarchy(d, to)
                                          : solve_null_space(to);
       const bool finite = found.residual <= LARGEST_DOUBLE && all_finite(to.numbers, n);
-      status = !finite ? NUMERICAL_ERROR : !ordered ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
+      status = !finite ? NUMERICAL_ERROR : !ordered || contradicts ? INFEASIBLE : found.holds ? SOLVED : MAX_ITERATIONS;
     }
     for (int j = 0; j < n && status == NUMERICAL_ERROR; ++j)
       to.numbers[j] = s.scheme == CLASSICAL ? 0
@@ -123,7 +124,8 @@ class Step : StepRows {
   }
 
   // ---- the weighted scheme (schemes/_weighted.py)
-  Numbers solver_space, qp_bounds, diagonal, compliance, multipliers, above;
+  Numbers solver_space, qp_bounds, diagonal, compliance, multipliers, above, hard_and_soft;
+  bool contradicts;  // whether no velocity of the box satisfies the rows of limits
   std::vector<WeightedQP<Team>> qp;
   std::vector<QPCertificate<Team>> certificate;
 
@@ -144,30 +146,30 @@ class Step : StepRows {
       e.put(held, diagonal.data()), e.put(e(center.data()) / select(held > 0.0, held, one), center.data());
     });
     if (!all_finite(diagonal.data(), n)) return {false, INFINITE};
-    for (int i = 0; i < s.p; ++i) {  // a row of weight 0 has no bounds
+    const int soft = s.p - limit_rows;
+    for (int i = 0; i < soft; ++i) {  // a row of weight 0 has no bounds
       const double own = weight[s.m + i];
       compliance[i] = 1 / (own > 0 ? own : 1);
       qp_bounds[n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], -1) : -INFINITE;
       qp_bounds[N + n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], 1) : INFINITE;
     }
+    if (limit_rows) add_hard(soft);
     const QPData<double> data{J,
                               low,
                               weight,
                               diagonal.data(),
                               center.data(),
-                              J + s.m * n,
+                              limit_rows ? hard_and_soft.data() : J + s.m * n,
                               compliance.data(),
                               qp_bounds.data(),
                               qp_bounds.data() + N,
                               d.guess ? d.guess : no_labels.data(),
                               tolerances[0]};
-    int report[3], *active = to.integers + 3;
-    qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
-    to.integers[0] = 0, to.integers[1] = report[1], to.integers[2] = report[2];
-    Certificate found{false, 0};
-    if (report[0] && report[1] <= s.max_iterations)
-      found = certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
-    if (!found.holds) {
+    int* active = to.integers + 3;
+    to.integers[0] = to.integers[1] = to.integers[2] = 0;
+    Certificate found = solve_qp(data, to);
+    if (!found.holds && limit_rows) found = solve_softened(data, to);
+    if (!found.holds && !contradicts) {
       move_downhill(data, to.numbers);
       for (int i = 0; i < N; ++i) active[i] = i < n && data.lower[i] == data.upper[i] ? EQUALITY : INACTIVE;
       found.residual = certificate[0].judge(data, to.numbers, zeros.data(), active, tolerances[1]).residual;
@@ -175,24 +177,68 @@ class Step : StepRows {
     for (int j = 0; j < n; ++j) to.numbers[j] = nearest(to.numbers[j], lower[j], upper[j]);
     return found;
   }
+  // The rows of limits behind the soft ones, which a step without them takes from where all rows are.
+  void add_hard(int soft) {
+    const int n = s.nv, N = n + s.p;
+    std::copy_n(J + s.m * n, soft * n, hard_and_soft.data());
+    int i = soft;
+    each_hard([&](Hard rows) {
+      std::copy_n(rows.jacobian.at, rows.jacobian.size, &hard_and_soft[i * n]);
+      for (int k = 0; k < rows.lower.size; ++k, ++i) {
+        compliance[i] = 0;
+        qp_bounds[n + i] = order(rows.lower[k], rows.upper[k], -1),
+                      qp_bounds[N + n + i] = order(rows.lower[k], rows.upper[k], 1);
+      }
+    });
+  }
+  Certificate solve_qp(const QPData<double>& data, const StepResult& to) {
+    int report[3], *active = to.integers + 3;
+    qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
+    to.integers[1] += report[1], to.integers[2] += report[2];
+    if (!report[0] || report[1] > s.max_iterations) return {false, 0};
+    return certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
+  }
+  // The least violation of rows that contradict each other or the box: solvers/qp/_search.py, _by_newton. It minimises the
+  // cost too where the rows have this little compliance, as in the derivative.
+  Certificate solve_softened(QPData<double> data, const StepResult& to) {
+    const int n = s.nv;
+    double largest = 0;
+    for (int j = 0; j < n; ++j) center[n + j] = data.damping[j];
+    for (int i = 0; i < s.m; ++i)
+      for (int j = 0; j < n; ++j) center[n + j] += weight[i] * square(J[i * n + j]);
+    for (int i = 0; i < s.p; ++i) {
+      double length = 0;
+      for (int j = 0; j < n; ++j) length += square(data.rows[i * n + j]) / center[n + j];
+      largest = larger(largest, length);
+    }
+    for (int i = s.p - limit_rows; i < s.p; ++i) compliance[i] = INFEASIBLE_COMPLIANCE * largest;
+    const Certificate softened = solve_qp(data, to);
+    const double after = softened.holds ? 0 : largest;  // for move_downhill
+    for (int i = s.p - limit_rows; i < s.p; ++i) compliance[i] = after;
+    if (!softened.holds) return softened;
+    const Certificate given = certificate[0].judge(data, to.numbers, multipliers.data(), to.integers + 3, tolerances[1]);
+    contradicts = given.residual > tolerances[1];
+    return given;
+  }
   // A point of the box that is no worse than zero: solvers/qp/_projected_gradient.py. The rows are soft.
   void move_downhill(const QPData<double>& d, double* x) {
     const int n = s.nv, rows = s.m + s.p;
     double *size = center.data() + n, *gradient = size + n;
     auto stiffness = [&](int i) { return i < s.m ? d.weight[i] : 1 / d.compliance[i - s.m]; };
+    auto row = [&](int i) { return i < s.m ? d.matrix + i * n : d.rows + (i - s.m) * n; };
     for (int j = 0; j < n; ++j) x[j] = nearest(0, d.lower[j], d.upper[j]), size[j] = d.damping[j];
     for (int i = 0; i < rows; ++i) {
       double length = 0;
-      for (int j = 0; j < n; ++j) length += fabs(J[i * n + j]);
-      for (int j = 0; j < n; ++j) size[j] += stiffness(i) * length * fabs(J[i * n + j]);
+      for (int j = 0; j < n; ++j) length += fabs(row(i)[j]);
+      for (int j = 0; j < n; ++j) size[j] += stiffness(i) * length * fabs(row(i)[j]);
     }
     for (int step = 0; step < GRADIENT_STEPS; ++step) {
       for (int j = 0; j < n; ++j) gradient[j] = d.damping[j] * (x[j] - d.center[j]);
       for (int i = 0; i < rows; ++i) {
         const int q = n + i - s.m;
-        const double value = Team::own_dot(&J[i * n], x, 0, n);
+        const double value = Team::own_dot(row(i), x, 0, n);
         const double force = stiffness(i) * (value - (i < s.m ? d.target[i] : nearest(value, d.lower[q], d.upper[q])));
-        for (int j = 0; j < n; ++j) gradient[j] += force * J[i * n + j];
+        for (int j = 0; j < n; ++j) gradient[j] += force * row(i)[j];
       }
       for (int j = 0; j < n; ++j) x[j] = nearest(x[j] - gradient[j] / (size[j] > 0 ? size[j] : 1), d.lower[j], d.upper[j]);
     }
@@ -397,7 +443,8 @@ class Step : StepRows {
     if (s.scheme == WEIGHTED) {
       const QPSizes of{m, n, s.p, s.max_iterations};
       solver_space.resize(WeightedQP<Team>::bytes(of) / sizeof(double));
-      qp_bounds.resize(2 * (n + s.p)), diagonal.resize(n + 8), compliance.resize(s.p), multipliers.resize(s.p);
+      hard_and_soft.resize((limit_rows ? s.p * n : 0) + 8), qp_bounds.resize(2 * (n + s.p)), diagonal.resize(n + 8),
+          compliance.resize(s.p), multipliers.resize(s.p);
       qp.emplace_back(of, reinterpret_cast<char*>(solver_space.data()));
       certificate.emplace_back(of, reinterpret_cast<char*>(solver_space.data()));
       return;
@@ -426,6 +473,12 @@ class Step : StepRows {
     double *v = to.numbers, *slack = v + n + 2, *errors = slack + s.rows, outside = 0;
     auto finite = [](double a) { return fabs(a) <= LARGEST_DOUBLE ? a : 0.0; };
     for (int j = 0; j < n; ++j) outside = larger(outside, larger(finite(lower[j] - v[j]), finite(v[j] - upper[j])));
+    each_hard([&](Hard rows) {
+      for (int i = 0; i < rows.lower.size; ++i) {
+        const double value = Team::own_dot(rows.jacobian.at + i * n, v, 0, n);
+        outside = larger(outside, larger(finite(rows.lower[i] - value), finite(value - rows.upper[i])));
+      }
+    });
     v[n] = residual, v[n + 1] = outside;
     for (const Task& task : tasks)
       for (int i = 0; i < task.m; ++i) {

@@ -80,6 +80,7 @@ class StepRows {
   const double* tolerances;
   double dt, damping, kappa;
   bool ordered;  // whether no lower bound is above its upper one
+  int limit_rows = 0;
 
  public:
   StepRows(const int* given, int count)
@@ -88,6 +89,8 @@ class StepRows {
     parts.resize(s.rows + s.nv + 3 * s.tasks + 8);
     for (Numbers* v : {&lower, &upper, &low_speed, &high_speed}) v->resize(s.nv);
     for (const StepLayout::Task& task : layout.tasks) tasks.emplace_back(task);
+    for (int k = 0; k < s.limits; ++k)
+      limit_rows += layout.limits[5 * k] == HARD_ROWS ? layout.places[layout.limits[5 * k + 2]].size : 0;
   }
   bool has(const int* given, int count) const { return layout.has(given, count); }
 
@@ -104,6 +107,14 @@ class StepRows {
     return {arrays[place.array] + place.offset, place.size};
   }
   const double* of_step(int k) const { return leaf(layout.of_step[k]).at; }
+  // f(rows) of each limit with rows. Leaves: Jacobian, lower and upper bounds.
+  struct Hard {
+    Leaf<const double*> jacobian, lower, upper;
+  };
+  template <class F> void each_hard(F f) const {
+    for (const int* limit = layout.limits; limit < layout.limits + 5 * s.limits; limit += 5)
+      if (limit[0] == HARD_ROWS) f(Hard{leaf(limit[1]), leaf(limit[2]), leaf(limit[3])});
+  }
   // Whether a number of these leaves is NaN.
   bool spoiled(int from, int to, int count) const {
     for (int k = from; k < to; ++k)
@@ -121,7 +132,8 @@ class StepRows {
     tolerances = d.constants + s.nq + s.dofs + 1;
     if (!(dt > 0)) dt = NAN;
     const int first = layout.of_step[StepLayout::DAMPING], end = layout.of_step[StepLayout::DT];
-    const bool has_box = find_box(given), set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(first, end, d.count));
+    const bool has_box = find_box(given) && has_hard_rows(),
+               set_up = dt <= LARGEST_DOUBLE && (clean || !spoiled(first, end, d.count));
     const bool finite = all_finite(given, s.given);
     bool valid = has_box && set_up && finite;
     if (!(dt <= LARGEST_DOUBLE)) dt = 1;
@@ -175,6 +187,7 @@ class StepRows {
     }
     bool valid = true;
     for (const int* limit = layout.limits; limit < layout.limits + 5 * s.limits; limit += 5) {
+      if (limit[0] == HARD_ROWS) continue;
       const Leaf<const double*> low = leaf(limit[1]), high = leaf(limit[2]), gain = leaf(limit[3]), speed = leaf(limit[4]);
       const bool of_speed = limit[0] == SPEED;
       valid &= of_speed || all_finite(gain.at, gain.size);
@@ -184,6 +197,18 @@ class StepRows {
       const auto from = e(a), to = e(b);
       if (s.scheme != CLASSICAL) valid &= !any(!((from < INFINITE) & (to > -INFINITE))), ordered &= !any(!(from <= to));
       e.put(order(from, to, -1), low_speed.data()), e.put(order(from, to, 1), high_speed.data());
+    });
+    return valid;
+  }
+  // Whether a solver takes the rows of limits.
+  bool has_hard_rows() {
+    bool valid = true;
+    each_hard([&](Hard rows) {
+      valid &= all_finite(rows.jacobian.at, rows.jacobian.size);
+      for (int i = 0; i < rows.lower.size; ++i) {
+        valid &= rows.lower[i] < INFINITE && rows.upper[i] > -INFINITE;
+        ordered &= !(rows.lower[i] > rows.upper[i]);
+      }
     });
     return valid;
   }

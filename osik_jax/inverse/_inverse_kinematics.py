@@ -164,6 +164,8 @@ def inverse_kinematics(
         route = route._replace(by_core=False)
     if all and traced:
         raise OsikTypeError("all=True counts solutions, which are not known while tracing; leave it out inside jit")
+    if scene is None and (srdf is not None or not (isinstance(clearance, float | int) and clearance == 0.0)):
+        raise OsikValueError("clearance and srdf go with a scene: Scene({}) has the robot's own shapes alone")
     how, given = Searches(seeds, warm=q0 is not None, near=nearest, every=all), (robot, problem.goals, settings)
     if scene is not None:
         obstacles = read_obstacles(robot, route, scene, clearance, srdf)

@@ -13,17 +13,21 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
+from ..collision._core import check_scene, require_core
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, padded
 from ..collision._hulls import Hulls, read_hulls
+from ..collision._near_rows import KeptShapes, all_distances, kept_shapes, near_rows, pair_names
 from ..collision._pair_layout import PairLayout, Placed, grouped, nearest, place, separation_jacobian
 from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
+from ..collision._robot_shapes import Given, robot_shapes
+from ..collision._scene import Scene
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
 from ..kinematics._home import home_kinematics
 from ..numerics._arguments import as_scalar, as_vector, concrete
 from ..numerics._guarded import at_most_inverse
-from ..numerics._host import to_jax
+from ..numerics._host import Numbers, is_traced, to_jax, tree_to_jax
 from ..robot import Robot
 from ._box import Limit
 from ._rows import LimitRows
@@ -54,6 +58,11 @@ class CollisionAvoidanceLimit(Limit):
 
     Args:
         robot: the robot.
+        scene: obstacles, as of ``inverse_kinematics``. The ``max_pairs`` nearest pairs that are nearer than
+            ``detection_distance`` then give the rows, by the exact distances of the convex shapes, and the core finds
+            them, on a CPU. The robot's own shapes are kept apart too; ``Scene({})`` for these alone. It goes without
+            ``pairs``, ``exclude`` and ``shapes``.
+        srdf: with a scene: pairs that may touch, as for ``inverse_kinematics``.
         pairs: pairs to keep apart: names or globs of geoms, shapes, links or bodies (``"world"``), such as
             ``[("*hand*", "torso")]``. Masks then do not count, and pairs given by names, not by a glob, are kept
             however near they are. None: all default pairs.
@@ -70,7 +79,9 @@ class CollisionAvoidanceLimit(Limit):
 
     Raises:
         KeyError: a name matches nothing.
-        ValueError: no pair is left, or a number or shape does not fit.
+        OsikError: a scene without the compiled core, or on a GPU.
+        TypeError: no scene, or a scene together with ``pairs``, ``exclude`` or ``shapes``.
+        ValueError: no pair is left, a stack of scenes, or a number or shape does not fit.
 
     Warns:
         OsikWarning: pairs are left out because they are too near at ``q0``.
@@ -86,7 +97,9 @@ class CollisionAvoidanceLimit(Limit):
     recovery_speed: Float[Array, ""]
     shapes: Placed
     hulls: UnitCore | None
-    scene: PairLayout = eqx.field(static=True, repr=False)
+    layout: PairLayout = eqx.field(static=True, repr=False)
+    scene: Scene | None
+    kept: KeptShapes | None = eqx.field(static=True, repr=False)
     max_pairs: int = eqx.field(static=True)
     left_out: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
@@ -94,6 +107,8 @@ class CollisionAvoidanceLimit(Limit):
         self,
         robot: Robot,
         *,
+        scene: Scene | None = None,
+        srdf: Given = None,
         pairs: Patterns | None = None,
         exclude: Iterable[str | tuple[str, str]] = (),
         shapes: Mapping[str, CollisionShape] | None = None,
@@ -112,6 +127,10 @@ class CollisionAvoidanceLimit(Limit):
         self.gain = _number(gain, "gain", dtype)
         self.recovery_speed = _number(recovery_speed, "recovery_speed", dtype)
         self._check()
+        self.scene, self.kept = (scene if scene is None else tree_to_jax(scene)), None
+        if scene is not None or srdf is not None:
+            self._keep_off(robot, srdf, q0_distance, max_pairs, pairs is None and shapes is None and not exclude)
+            return
         shapes, pairs = dict(shapes or {}), None if pairs is None else list(pairs)
         found = members(robot, shapes)
         possible = candidate_pairs(robot, found, pairs, exclude)
@@ -122,17 +141,41 @@ class CollisionAvoidanceLimit(Limit):
         self.left_out = tuple((found[i].name, found[j].name) for i, j in near)
         if q0_distance is None and near:
             _warn_of_left_out(_shown(found, near), self.minimum_distance)
-        self.scene, self.shapes, self.hulls = _assembled(robot, found, shapes, hulls, kept)
+        self.layout, self.shapes, self.hulls = _assembled(robot, found, shapes, hulls, kept)
         self.max_pairs = min(max_pairs, len(kept))
+
+    def _keep_off(self, robot: Robot, srdf: Given, q0_distance: float | None, max_pairs: int, alone: bool) -> None:
+        """Keep the exact shapes of the robot off each other and off the scene."""
+        if self.scene is None:
+            raise OsikTypeError(
+                "srdf goes with a scene: give scene=osik_jax.Scene({}) for the robot's own shapes alone"
+            )
+        if not alone:
+            raise OsikTypeError(
+                "scene goes without pairs, exclude and shapes: obstacles are in the scene; srdf and scene.allow say "
+                "what may touch"
+            )
+        require_core("a CollisionAvoidanceLimit with a scene")
+        check_one_scene(self.scene)
+        least = concrete(self.minimum_distance) if q0_distance is None else q0_distance
+        if least is None:
+            raise OsikTypeError("which pairs are apart at q0 cannot be told from traced numbers; give q0_distance=-inf")
+        kept = kept_shapes(robot, robot_shapes(robot, srdf), least=float(least))
+        if q0_distance is None and kept.left_out:
+            _warn_of_left_out(", ".join(map("-".join, kept.left_out)), self.minimum_distance)
+        self.kept, self.left_out, self.max_pairs = kept, kept.left_out, max_pairs
+        self.layout, self.shapes, self.hulls = _assembled(robot, [], {}, {}, [])
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
         """Return the names of the shapes of each pair that is kept apart, in the order of ``distances``."""
-        return self.scene.pair_names
+        return self.layout.pair_names if self.kept is None or self.scene is None else pair_names(self.kept, self.scene)
 
     def distances(self, robot: Robot, kinematics: Kinematics) -> Float[Array, " pairs"]:
         """Return signed distances [m] of all ``pairs``, negative where they overlap."""
-        return _distances(self, robot, kinematics)
+        if self.kept is None or self.scene is None:
+            return _distances(self, robot, kinematics)
+        return all_distances(self.kept, kinematics, self.scene)
 
     def sought(self, robot: Robot) -> Limit:
         """Return the limit with a gain of 1."""
@@ -144,8 +187,11 @@ class CollisionAvoidanceLimit(Limit):
     ) -> LimitRows:
         """Return lower bounds [m/s] on the rates of distances that could vanish soonest; -inf where free."""
         del q
+        if self.kept is not None and self.scene is not None:
+            jacobian, lower = near_rows(self.kept, kinematics, self.scene, self.numbers(dt), self.max_pairs)
+            return LimitRows(jacobian, lower, jnp.full_like(lower, jnp.inf))
         near = self._nearest(robot, kinematics)
-        jacobian = separation_jacobian(robot.tree, kinematics, near, self.scene.pair_bodies)
+        jacobian = separation_jacobian(robot.tree, kinematics, near, self.layout.pair_bodies)
         gap = near.distance - self.minimum_distance
         soonest = jax.lax.top_k(-_time_to_meet(gap, jacobian), self.max_pairs)[1]
         # with a gain of 1 / dt one step closes the gap; a negative gap asks to part at no more than the recovery speed
@@ -156,9 +202,18 @@ class CollisionAvoidanceLimit(Limit):
     @property
     def replaceable(self) -> tuple[str, ...]:
         """Return names that ``replace`` takes; for shapes use ``moved``."""
-        return _NUMBERS
+        return _NUMBERS if self.scene is None else (*_NUMBERS, "scene")
+
+    def numbers(self, dt: Float[Array, ""] | float) -> Float[Numbers, "5"]:
+        """Return what the core reads of the limit (``AvoidanceNumbers``), by NumPy unless traced."""
+        own = *(getattr(self, name) for name in _NUMBERS), dt
+        numbers = jnp if is_traced(own) else np
+        return numbers.stack([numbers.asarray(number, self.gain.dtype) for number in own])
 
     def _convert(self, name: str, value: Any) -> Any:
+        if name == "scene":
+            check_one_scene(value)
+            return value
         return _number(value, name, self.gain.dtype)
 
     def moved(
@@ -183,7 +238,9 @@ class CollisionAvoidanceLimit(Limit):
             KeyError: no added shape of this name takes part; the message lists those that do.
             ValueError: a wrong shape.
         """
-        added = self.scene.names[len(self.scene.geoms) :]
+        if self.scene is not None:
+            raise OsikTypeError(f"{shape!r} is moved in the scene: limit.replace(scene=scene.moved({shape!r}, pose))")
+        added = self.layout.names[len(self.layout.geoms) :]
         if shape not in added:
             raise unknown_name("added shape", shape, added)
         place, given = added.index(shape), dict(position=position, rotation=rotation, size=size)
@@ -197,12 +254,22 @@ class CollisionAvoidanceLimit(Limit):
         return eqx.tree_at(lambda limit: [getattr(limit.shapes, name) for name in changes], self, new)
 
     def _nearest(self, robot: Robot, kinematics: Kinematics) -> Nearest:
-        return nearest(self.scene, place(self.scene, robot, kinematics, self.shapes), self.hulls)
+        return nearest(self.layout, place(self.layout, robot, kinematics, self.shapes), self.hulls)
 
     def _check(self) -> None:
         least, most = concrete(self.minimum_distance), concrete(self.detection_distance)
         if least is not None and most is not None and not (most > least).all():
             raise OsikValueError(f"detection_distance is {most}; it has to be more than minimum_distance, {least}")
+
+
+def check_one_scene(scene: Any) -> None:
+    """Raise TypeError unless this is a scene, ValueError if it is a stack of scenes."""
+    check_scene(scene)
+    if scene.is_stack:
+        raise OsikValueError(
+            "scene is a stack of scenes, and a limit has one; take them apart with "
+            "jax.vmap(lambda scene: limit.replace(scene=scene))(scenes)"
+        )
 
 
 def _time_to_meet(gap: Float[Array, " pairs"], jacobian: Float[Array, "pairs nv"]) -> Float[Array, " pairs"]:

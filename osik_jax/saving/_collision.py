@@ -28,6 +28,8 @@ _CORE = UnitCore._fields
 
 def collision_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, Any]:
     """Return the constructor's arguments for the pairs that are kept apart, and the pairs left out as a record."""
+    if limit.scene is not None:
+        raise OsikValueError("a CollisionAvoidanceLimit has a scene, which a file cannot hold: make it after loading")
     numbers = {name: np.asarray(getattr(limit, name)).tolist() for name in limit.replaceable}
     pairs = {name: [list(pair) for pair in getattr(limit, name)] for name in ("pairs", "left_out")}
     return {**pairs, "shapes": _shapes_data(limit, robot), **numbers, "max_pairs": limit.max_pairs}
@@ -50,7 +52,7 @@ def collision_arguments(given: Mapping[str, Any]) -> tuple[dict[str, Any], tuple
 
 def _shapes_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, dict[str, Any]]:
     """Return the shapes added to the robot's own, by name."""
-    scene, out = limit.scene, {}
+    scene, out = limit.layout, {}
     own = len(scene.geoms)
     for number, name in enumerate(scene.names[own:]):
         kind = scene.kinds[own + number]

@@ -9,6 +9,7 @@ import sys
 import mujoco
 import numpy as np
 import pytest
+from core_checks import needs_core
 from model_files import MJCF
 from mujoco_states import mujoco_at
 from PIL import Image
@@ -207,6 +208,31 @@ def test_ik_finds_a_configuration_or_says_what_stops_it(arm, capsys):
     assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "4", "0", "0", "--seeds", "2"]) == 1
     assert "out of reach" in capsys.readouterr().out
     assert "no frame 'hnd'" in refused(capsys, "ik", "arm7", "--frame", "hnd", "--position", "0", "0", "0")
+
+
+SCENE = """<mujoco><worldbody>
+  <geom name="floor" type="plane" size="1 1 1" pos="0 0 -0.02"/>
+  <geom name="crate" type="box" size="0.1 0.1 0.1" pos="{}"/>
+</worldbody></mujoco>"""
+
+
+@needs_core
+def test_ik_keeps_off_a_scene_or_says_what_is_in_the_way(tmp_path, capsys):
+    """The printed joints are free of the crate by ``is_free``; inside the crate there is no answer."""
+    scene, arm = tmp_path / "scene.xml", osik.load_robot("ur5")
+    wanted = "ik", "ur5", "--frame", "tool0", "--position", "0.5", "0.1", "0.4", "--scene", str(scene)
+    scene.write_text(SCENE.format("0.35 0.25 0.4"))
+    assert cli.main([*wanted, "--clearance", "0.005"]) == 0
+    values = [float(line.split()[5]) for line in capsys.readouterr().out.splitlines() if "_joint " in line]
+    assert osik.is_free(arm, np.array(values), osik.Scene.from_file(scene), 0.0049)
+    scene.write_text(SCENE.format("0.5 0.1 0.4"))
+    assert cli.main([*wanted, "--quaternion", "0", "1", "0", "0"]) == 1
+    assert "an obstacle stands around the target" in " ".join(capsys.readouterr().out.split())
+    assert "--clearance goes with --scene" in refused(capsys, *wanted[:-2], "--clearance", "0.1")
+    assert "no scene: there are" in refused(capsys, *wanted[:-1], str(tmp_path / "scene.stl"))
+    assert "clearance is -1.0" in refused(capsys, *wanted, "--clearance", "-1")
+    standing = "ik", "nao", "--frame", "l_gripper", "--position", "0.15", "0.12", "0.35", "--scene", str(scene)
+    assert "--scene goes with poses" in refused(capsys, *standing)
 
 
 def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):

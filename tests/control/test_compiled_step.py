@@ -306,6 +306,35 @@ def test_a_step_is_one_call_with_few_operations_around_it(scheme):
     assert "conditional" not in text and "while" not in text and len(text.splitlines()) < 300
 
 
+def test_rows_of_limits_are_answered_as_by_plain_jax(rng):
+    """Beside soft rows; with walls that are tight, contradict each other, or are not finite."""
+    robot = osik.load_robot("arm7")
+    hand, _ = frames_of(robot)
+    tasks, scheme = bounded(robot), osik.WeightedQP()
+    at = np.asarray(osik.forward_kinematics(robot, robot.q0).frame_pose(robot, hand)[0])
+    wall = osik.PositionBarrier(robot, hand, lower=at - 0.01, upper=at + 0.01, gain=20.0)
+    q = np.asarray(robot.q0) + 0.02 * rng.normal(size=(60, 7))
+
+    def step(limits: Any, q: Any, lower: Any) -> Any:
+        own = *limits, wall.replace(lower=lower)
+        return robot, q, tasks, scheme, own, jnp.asarray(DT), None
+
+    places = np.tile(at - 0.01, (60, 1))
+    places[:10] += 0.5  # above the upper bounds
+    places[10] = np.nan
+    limits = with_own_limits(robot, None)
+    found, wanted = (
+        jax.jit(jax.vmap(lambda q, lower, f=f: f(*step(limits, q, lower))))(q, places)
+        for f in (_step._compiled_step, _step._plain_step)
+    )
+    np.testing.assert_array_equal(found.status, wanted.status)
+    assert np.bincount(found.status, minlength=4).min() == 0 and (np.bincount(found.status)[[0, 2, 3]] > 0).all()
+    solved = np.asarray(found.status) == 0
+    np.testing.assert_allclose(found.velocity[solved], wanted.velocity[solved], atol=1e-9)
+    np.testing.assert_allclose(found.box_violation, wanted.box_violation, rtol=1e-6, atol=1e-9)
+    assert found.warm_start.shape == wanted.warm_start.shape
+
+
 def test_other_steps_take_the_plain_path():
     robot = osik.load_robot("arm7")
     hand, _ = frames_of(robot)
@@ -320,7 +349,9 @@ def test_other_steps_take_the_plain_path():
     assert known({"hand": osik.FrameTask(robot, hand, error="se3")})
     assert known(scheme=osik.NullSpace()) and not known(scheme=osik.NullSpace(method="reverse"))
     assert not known(scheme=osik.WeightedQP(backend="jax")) and not known(scheme=osik.NullSpace(backend="jax"))
-    assert not known(limits=(*limits, osik.PositionBarrier(robot, hand, lower=0.0)))
+    with_rows = *limits, osik.PositionBarrier(robot, hand, lower=0.0)
+    assert known(limits=with_rows) and known(limits=with_rows, warm=jnp.zeros(10, int))
+    assert not known(limits=with_rows, scheme=osik.HierarchicalQP())
     assert not known(warm=jnp.zeros(8, int))
 
 

@@ -166,7 +166,8 @@ def tiago_parks(names: Names) -> None:
 CHECKS: list[Callable[[Names], None]] = [
     ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
     g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye, panda_placed, tiago_parks,
+    retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye, panda_placed,
+    tiago_parks,
 ]  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def _slots(limit: Limit) -> Iterator[Obstacle]:
     """Return the balls and boxes that a collision limit has in the world, whether in use or put away."""
     if not isinstance(limit, CollisionAvoidanceLimit):
         return
-    scene, own = limit.scene, len(limit.scene.geoms)
+    scene, own = limit.layout, len(limit.layout.geoms)
     places = tuple(
         np.asarray(part, float) for part in (limit.shapes.position, limit.shapes.rotation, limit.shapes.size)
     )
@@ -88,7 +88,7 @@ def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."
     """Return the limits with an obstacle moved or resized."""
     return tuple(
         limit.moved(name, **changes)
-        if isinstance(limit, CollisionAvoidanceLimit) and name in limit.scene.names[len(limit.scene.geoms) :]
+        if isinstance(limit, CollisionAvoidanceLimit) and name in limit.layout.names[len(limit.layout.geoms) :]
         else limit
         for limit in limits
     )
