@@ -8,9 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from osik_jax.motion import PoseFilter, chunk, follow, move, retime
+import osik_jax as osik
+from osik_jax.motion import PoseFilter, chunk, connect, follow, move, retime
 
 from ._given import FAR, Add, K, T, V, arm
+from ._problems import ur5
 
 LIMITS: dict[str, Any] = {"velocity": 1.5, "acceleration": 4.0, "jerk": 40.0}
 TIMES = np.linspace(0.0, 1.0, 5)
@@ -30,6 +32,11 @@ def _chunk(**more: Any) -> Any:
 
 def _move(**more: Any) -> Any:
     return move(**({"robot": arm(), "start": arm().q0, "goal": arm().q0} | LIMITS | more))
+
+
+def _connect(**more: Any) -> Any:
+    scene = osik.Scene({"can": osik.CollisionShape.sphere(0.1, [0.3, 0.5, 0.2])})
+    return connect(**({"robot": ur5(), "q_from": ur5().q0, "q_to": ur5().q0, "scene": scene} | more))
 
 
 def motions(add: Add) -> None:
@@ -61,3 +68,10 @@ def motions(add: Add) -> None:
     add("a path of one pose", lambda: follow(arm(), {"hand": far[:1]}, acceleration=4.0), V, "two or more")
     add("a filter that is updated after 0 s", lambda: PoseFilter(FAR).update(FAR, 0.0), V, "dt is 0")
     add("a filter with a time constant of 0", lambda: PoseFilter(FAR, time_constant=jnp.zeros(())), V, "positive")
+    add("a way from 5 numbers for 6 joints", lambda: _connect(q_from=np.zeros(5)), V, "have 6 entries")
+    add("a way to a goal with a NaN", lambda: _connect(q_to=np.full(6, np.nan)), V, "q_to is not finite")
+    add("a way that a held joint prevents", lambda: _connect(q_to=np.ones(6), joints=["wrist*"]), V, "elbow_joint")
+    add("a way with joints that do not exist", lambda: _connect(joints=["elbw_joint"]), K, "elbow_joint")
+    add("a way that keeps -1 m", lambda: _connect(clearance=-1.0), V, "clearance is -1")
+    add("a way by no configuration", lambda: _connect(states=0), V, "states is 0")
+    add("a way in a dictionary of shapes", lambda: _connect(scene={}), T, "make an osik_jax.Scene")

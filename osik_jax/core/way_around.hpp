@@ -45,6 +45,7 @@ class WayAround {
   long tried = 0, limit = 0;  // states
   uint64_t random_state = 0;
   List q, travel, weight;  // [nq]; [joints] of slides; [n] of the metric
+  List middle, spread, curve, points;  // [n] of a part twice; a cubic Bezier curve [4, n]; [5, n] of a corner
   std::vector<Pair> pairs;
   std::vector<int> order, arena;
   std::vector<Part> parts;
@@ -53,7 +54,8 @@ class WayAround {
  public:
   WayAround(const xla::Call& call, const ShapedRobot<double>& robot)
       : robot(robot), collision(robot), n(call.in<int>(4)[0]), most(call.in<int>(4)[1]), longest(call.result_size(0, 1)),
-        entry(call.in<int>(4) + 3), low(call.in<double>(5)), high(low + n), q(call.size(0, 1)), travel(robot.joints) {}
+        entry(call.in<int>(4) + 3), low(call.in<double>(5)), high(low + n), q(call.size(0, 1)), travel(robot.joints),
+        middle(n), spread(n), curve(4 * n), points(5 * n) {}
 
   // Argument 0: starts [lanes, nq]; 1: goals [lanes, goals, nq]; 2, 3: robot; 4: n, states, key, entries; 5: ranges and step;
   // 6, 7: scene; 8: clearance. Results: vertices [lanes, longest, n], radii of corners [lanes, longest], and [lanes, 6] status,
@@ -108,8 +110,8 @@ class WayAround {
     return true;
   }
   void put_first(size_t k) { std::rotate(order.begin(), order.begin() + k, order.begin() + k + 1); }
-  // The middle of a part of a cubic Bezier curve [4, n], and how far its points are from it at most, by entry.
-  void split(const double* curve, double from, double to, double* middle, double* spread) const {
+  // The middle of a part of the curve, and how far the part's points are from it at most, by entry.
+  void split(double from, double to) {
     for (int k = 0; k < n; ++k) {
       const double a = curve[k], b = curve[n + k], c = curve[2 * n + k], d = curve[3 * n + k];
       auto blossom = [&](double r, double s, double t) {
@@ -124,14 +126,13 @@ class WayAround {
       spread[k] = most;
     }
   }
-  // Whether all pairs keep the clearance on a cubic Bezier curve [4, n].
-  bool is_free(const double* curve) {
-    double middle[64], spread[64];
+  // Whether all pairs keep the clearance on the curve.
+  bool is_free_curve() {
     parts.assign(1, {0, 1, 0, order.size()}), arena = order;
     for (size_t k = 0; k < parts.size(); ++k) {
       const Part part = parts[k];
       if (k >= MOST_PARTS || tried >= limit) return false;
-      split(curve, part.from, part.to, middle, spread), place(middle);
+      split(part.from, part.to), place(middle.data());
       const size_t first = arena.size();
       for (size_t e = part.first; e < part.end; ++e) {
         const Pair& pair = pairs[arena[e]];
@@ -142,8 +143,7 @@ class WayAround {
           put_first(std::find(order.begin(), order.end(), arena[e]) - order.begin());
           return false;
         }
-        const int left = arena[e];
-        arena.push_back(left);
+        arena.push_back(int(arena[e]));
       }
       if (arena.size() == first) continue;
       const double half = 0.5 * (part.from + part.to);
@@ -152,10 +152,9 @@ class WayAround {
     return true;
   }
   bool is_free_line(const double* from, const double* to) {
-    double curve[4 * 64];
     for (int e = 0; e < 4; ++e)
       for (int k = 0; k < n; ++k) curve[e * n + k] = from[k] + e / 3.0 * (to[k] - from[k]);
-    return is_free(curve);
+    return is_free_curve();
   }
 
   // ---- How far points move
@@ -355,7 +354,6 @@ class WayAround {
     }
     double radius = 0.5 * std::min(legs[0], legs[1]);
     for (int halving = 0; halving < HALVINGS; ++halving, radius *= 0.5) {
-      double points[5 * 64], curve[4 * 64];
       for (int k = 0; k < n; ++k) {
         const double a = radius / legs[0] * (v[n + k] - v[k]), b = radius / legs[1] * (v[2 * n + k] - v[n + k]);
         const double at = v[n + k];
@@ -365,11 +363,11 @@ class WayAround {
       bool holds = true;
       for (int piece = 0; piece < 2 && holds; ++piece) {  // of the uniform B-spline with these points
         for (int k = 0; k < n; ++k) {
-          const double* p = points + n * piece + k;
+          const double* p = points.data() + n * piece + k;
           curve[k] = (p[0] + 4 * p[n] + p[2 * n]) / 6, curve[n + k] = (2 * p[n] + p[2 * n]) / 3;
           curve[2 * n + k] = (p[n] + 2 * p[2 * n]) / 3, curve[3 * n + k] = (p[n] + 4 * p[2 * n] + p[3 * n]) / 6;
         }
-        holds = is_free(curve);
+        holds = is_free_curve();
       }
       if (holds) return radius;
     }
