@@ -1,6 +1,6 @@
-"""Timed motion: durations and rates of ``retime`` beside toppra, a raster by ``follow``, streams by ``chunk``.
+"""Timed motion: ``retime`` beside toppra and Ruckig, a raster by ``follow``, streams by ``chunk`` and ``PoseFilter``.
 
-python -m benchmarks.motion [--speeds 0.1 0.3]. Needs toppra.
+python -m benchmarks.motion [--speeds 0.1 0.3]. Needs toppra and ruckig.
 python -m benchmarks.motion --chunks
 python -m benchmarks.motion --noise
 """
@@ -84,6 +84,24 @@ def beside_toppra(name: str, velocity: np.ndarray, acceleration: np.ndarray) -> 
         f"{name}: duration / toppra's median {np.median(ratio):.4f}, largest {ratio.max():.4f}; "
         f"{1024 / took:,.0f} paths/s beside {1 / peer_took:,.0f}, {peer_took * 1024 / took:.0f} times"
     )
+
+
+def beside_ruckig(lines: int = 100) -> None:
+    """Print durations of straight lines of a Panda's joints with limits of jerk, by those of Ruckig along the line."""
+    import ruckig  # pyright: ignore[reportMissingImports]
+
+    ends = 0.8 * np.random.default_rng(0).normal(size=(lines, 2, 7))
+    durations = np.asarray(jax.jit(jax.vmap(lambda points: retime(points, **LIMITS).duration))(ends))
+    wanted = []
+    for way in np.abs(ends[:, 1] - ends[:, 0]):
+        given, found = ruckig.InputParameter(1), ruckig.Trajectory(1)
+        given.target_position = [1.0]
+        most = [[float((limit / way).min())] for limit in LIMITS.values()]
+        given.max_velocity, given.max_acceleration, given.max_jerk = most
+        ruckig.Ruckig(1).calculate(given, found)
+        wanted.append(found.duration)
+    ratio = durations / np.array(wanted)
+    print(f"straight lines with jerk: duration / Ruckig's median {np.median(ratio):.4f}, largest {ratio.max():.4f}")
 
 
 def _seconds(call: Any) -> float:
@@ -233,6 +251,7 @@ def main() -> None:
         return
     for name, limits in ROBOTS.items():
         beside_toppra(name, *limits)
+    beside_ruckig()
     for speed in arguments.speeds:
         follow_raster(speed)
 

@@ -26,7 +26,7 @@ from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ..solvers import Status, solve_least_squares_qp
 from ._jerk import CUBIC
-from ._motion import Motion, sample_times
+from ._motion import Motion, at_rest_outside, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
@@ -97,8 +97,7 @@ def _at(chunk: Chunk, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
     four = chunk.coefficients[cell[:, None] + jnp.arange(4)]
     cubics = jnp.einsum("ck,tkn->tcn", CUBIC.astype(time.dtype), four)
     states = cubic_derivatives(cubics, (place - cell)[:, None]) / chunk.width ** jnp.arange(4)[:, None, None]
-    moves = ((time >= chunk.begin) & (time <= chunk.end))[:, None]
-    return jnp.where(moves | (jnp.arange(4) == 0)[:, None, None], states, 0.0)
+    return at_rest_outside(states, time, chunk.begin, chunk.end)
 
 
 def chunk(

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ._cells import Cells, timed
 
-_STEPS, _LAST_STEPS = 50, 3
+_STEPS, _LAST_STEPS = 47, 3
 _SHRINK = 0.75  # of the barrier's weight in a step
 _LEAST_GAP = {"float32": 1e-3, "float64": 1e-5}
 """Least weight of the barrier, as a share of the duration: the rounding of margins bounds it from below."""

@@ -102,6 +102,21 @@ class Motion(eqx.Module):
         return table.replace_schema_metadata({"joints": "\n".join(self._names())})
 
 
+def at_rest_outside(
+    states: Float[Array, "k T n"], time: Float[Array, " T"], begin: Array | float, end: Array
+) -> Float[Array, "k T n"]:
+    """Return states whose derivatives are 0 before the begin and after the end of a motion, but for rounding of times.
+
+    Args:
+        states: positions and derivatives at times, held at the ends.
+        time: [s].
+        begin, end: of the motion [s].
+    """
+    rounding = 8.0 * jnp.finfo(time.dtype).eps * jnp.maximum(jnp.abs(end), jnp.abs(begin))
+    moves = ((time >= begin - rounding) & (time <= end + rounding))[:, None]
+    return jnp.where(moves | (jnp.arange(len(states)) == 0)[:, None, None], states, 0.0)
+
+
 def sample_times(duration: float, dt: float) -> Float[np.ndarray, " T"]:
     """Return times from 0 that are ``dt`` apart [s], the last of which is the end or just after it.
 

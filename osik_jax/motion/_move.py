@@ -15,7 +15,7 @@ from ..inverse._inverse_kinematics import joint_box
 from ..numerics._arguments import as_floats, concrete
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
-from ._motion import Motion, sample_times
+from ._motion import Motion, at_rest_outside, sample_times
 from ._retime import Limit, checked_limits
 from ._start import OUTSIDE, State, checked_state
 
@@ -61,8 +61,7 @@ def _at(move: Move, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
     q, v, a, j = jnp.moveaxis(jnp.take_along_axis(move.states, piece[:, None], axis=0), 1, 0)
     x = held - jnp.take_along_axis(move.starts, piece, axis=0)
     states = jnp.stack([q + x * (v + x * (a / 2.0 + x * j / 6.0)), v + x * (a + x * j / 2.0), a + x * j, j])
-    moves = ((time >= 0.0) & (time <= move.duration))[:, None]
-    return jnp.where(moves | (jnp.arange(4) == 0)[:, None, None], states, 0.0)
+    return at_rest_outside(states, time, 0.0, move.duration)
 
 
 def move(

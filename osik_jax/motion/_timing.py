@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ._cells import Cells
-from ._motion import Motion, sample_times
+from ._motion import Motion, at_rest_outside, sample_times
 from ._spline import Spline
 
 _KINDS = "speed", "acceleration", "jerk"
@@ -97,8 +97,7 @@ def by_progress(states: Float[Array, "4 T n"], progress: Float[Array, "4 T"]) ->
 def _at(path: Spline, progress: Cells, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
     moved = progress.at(time)
     states = by_progress(path.derivatives(moved[0]), moved)
-    moves = ((time >= progress.start[0]) & (time <= progress.start[-1]))[:, None]
-    return jnp.where(moves | (jnp.arange(4) == 0)[:, None, None], states, 0.0)
+    return at_rest_outside(states, time, progress.start[0], progress.start[-1])
 
 
 def sampled(timing: Timing, time: np.ndarray) -> Float[np.ndarray, "4 T n"]:

@@ -59,6 +59,21 @@ def so101_teleoperation(names: Names) -> None:
     assert np.ptp(names["goals"], axis=0).max() > 0.05
 
 
+def so101_chunks(names: Names) -> None:
+    position, velocity = names["states"][:2]
+    assert names["after"].feasible.all() and max(names["used"]) <= 1.0 + 1e-6
+    assert np.abs(np.diff(velocity, axis=0)).max() <= 20.0 * names["dt"] + 1e-9  # at joins too
+    assert np.abs(np.diff(position, n=2, axis=0)).max() <= 20.0 * names["dt"] ** 2 + 1e-9
+    assert names["lag"] < 0.02  # rad
+
+
+def weld_line(names: Names) -> None:
+    assert names["motion"].position_error < 1e-4 and names["motion"].orientation_error < 1.7e-3
+    assert names["at_speed"] > 0.97 and names["speed"].max() <= 1.001 * names["wanted"]
+    _, _, pull, jerk = np.abs(names["motion"].at(np.arange(0.0, names["motion"].duration, 1e-3)))
+    assert (pull <= 1.0001 * names["limits"]["acceleration"]).all() and (jerk <= 1.0001 * names["limits"]["jerk"]).all()
+
+
 def allegro_grasp(names: Names) -> None:
     assert names["grasp"].converged
     np.testing.assert_allclose(names["closing"].q[-1], names["grasp"].q, atol=0.01)
@@ -164,10 +179,10 @@ def tiago_parks(names: Names) -> None:
 
 
 CHECKS: list[Callable[[Names], None]] = [
-    ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, allegro_grasp, tiago_drives, go2_body,
-    g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets, tune_a_weight,
-    retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye, panda_placed,
-    tiago_parks,
+    ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, so101_chunks, weld_line, allegro_grasp,
+    tiago_drives, go2_body, g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets,
+    tune_a_weight, retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye,
+    panda_placed, tiago_parks,
 ]  # fmt: skip
 
 

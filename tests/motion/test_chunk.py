@@ -79,6 +79,14 @@ def test_the_answer_is_the_optimum_of_another_solver(rng) -> None:
         np.testing.assert_allclose(own, wanted.x, atol=1e-4)
 
 
+def test_a_time_that_rounding_puts_before_the_begin_is_in_motion(rng) -> None:
+    fast = np.full(7, 0.5)
+    found = planned(walk(rng, 0.05), (HOME, fast, REST), 0.1 + 0.2, LIMITS)
+    for time in (0.3, np.nextafter(0.3, 0.0)):
+        np.testing.assert_allclose(found.state(time)[1], fast, atol=1e-9)
+    np.testing.assert_array_equal(found.state(0.299)[1], 0.0)
+
+
 @pytest.mark.slow
 def test_a_minimum_jerk_move_stays_calm() -> None:
     share = np.linspace(0.0, 1.0, 30)
