@@ -11,10 +11,11 @@ import tyro
 from .._errors import OsikValueError
 from ._messages import told
 from ._robots import read_robot
+from ._scene import InScene
 
 
 @dataclasses.dataclass(frozen=True)
-class Follow:
+class Follow(InScene):
     """Leads a frame of a robot along the poses of a CSV file, within limits, and writes the timed motion.
 
     The file has a row a pose: x, y, z [m], or also a quaternion w, x, y, z. A line of column names may come first.
@@ -52,6 +53,7 @@ class Follow:
                 speed=self.speed,
                 acceleration=self.acceleration,
                 jerk=self.jerk,
+                **self.obstacles(),
             )
             found.sample(self.dt).save(self.out)
         print(

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ._messages import refuse, told
+from ._messages import told
 from ._robots import read_robot
+from ._scene import InScene
 
 if TYPE_CHECKING:
     from ..robot import Robot
 
 
 @dataclasses.dataclass(frozen=True)
-class Ik:
+class Ik(InScene):
     """Finds a configuration that brings a frame to a pose, and prints it; or says what stops the robot.
 
     The exit code is 1 where none is found.
@@ -47,12 +47,6 @@ class Ik:
     """Largest distance from the position [m]."""
     orientation_tolerance: float = 1e-2
     """Largest angle to the orientation [rad]."""
-    scene: Path | None = None
-    """File of obstacles that the robot keeps off, and off itself: .xml, .urdf, .yaml or .scene."""
-    srdf: Path | None = None
-    """With --scene: an SRDF, whose pairs may touch."""
-    clearance: float = 0.0
-    """With --scene: least distance of all shapes [m]."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -61,7 +55,6 @@ class Ik:
         from ..inverse import inverse_kinematics
         from ..inverse._report import print_found
 
-        refuse(self, self.scene is None, ("srdf", "clearance"), "--scene")
         robot = read_robot(self.robot, self.base)
         with told():
             held = _home_poses(robot, self.hold)
@@ -76,18 +69,10 @@ class Ik:
                 all=self.all,
                 position_tolerance=self.position_tolerance,
                 orientation_tolerance=self.orientation_tolerance,
-                **self._obstacles(),
+                **self.obstacles(),
             )
         print_found(Console(), robot, found)
         return 0 if found.converged else 1
-
-    def _obstacles(self) -> dict[str, Any]:
-        """Return the arguments of a search in a scene; none without one."""
-        from ..collision import Scene
-
-        if self.scene is None:
-            return {}
-        return dict(scene=Scene.from_file(self.scene), srdf=self.srdf, clearance=self.clearance)
 
 
 def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:

@@ -306,3 +306,19 @@ def ways(
     shapes = [((lanes, longest, n), float), ((lanes, longest), float), ((lanes, 6), int)]
     given = starts, goals, robot.integers, robot.numbers, options, ranges, *scene, clearance
     return Ways(*_library.call("ways", shapes, *given))
+
+
+def are_free_curves(
+    curves: Float[Array, "lanes 4 nq"],
+    robot: CoreRobot,
+    options: Int[Array, " k"],
+    ranges: Float[Array, " m"],
+    scene: CoreScene,
+    clearance: Float[Array, " 1"],
+) -> Bool[Array, " lanes"]:
+    """Return whether all pairs are proven to keep a distance on cubic Bezier curves, given by their control points.
+
+    Other arguments as in ``ways``.
+    """
+    given = curves[:, 0], curves[:, 1:], robot.integers, robot.numbers, options, ranges, *scene, clearance
+    return _library.call("free_curves", [((len(curves),), int)], *given)[0] > 0

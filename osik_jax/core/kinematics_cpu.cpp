@@ -34,7 +34,8 @@ void* osik_are_free(xla::CallFrame* frame) { return xla::handle<find_free_ones>(
 void* osik_clearances(xla::CallFrame* frame) { return xla::handle<find_clearances>(frame); }
 void* osik_near_rows(xla::CallFrame* frame) { return xla::handle<find_near_rows>(frame); }
 void* osik_shape_gaps(xla::CallFrame* frame) { return xla::handle<find_gaps>(frame); }
-void* osik_ways(xla::CallFrame* frame) { return xla::handle<find_ways>(frame); }
+void* osik_ways(xla::CallFrame* frame) { return xla::handle<find_ways<&WayAround::connect>>(frame); }
+void* osik_free_curves(xla::CallFrame* frame) { return xla::handle<find_ways<&WayAround::prove>>(frame); }
 void* osik_chain_find(xla::CallFrame* frame) { return xla::handle<find_chain>(frame); }
 void* osik_chain_steps(xla::CallFrame* frame) { return xla::handle<of_lanes<advance_chain<Robots>>>(frame); }
 void* osik_kinematics(xla::CallFrame* frame) { return xla::handle<of_lanes<place<Robots>>>(frame); }

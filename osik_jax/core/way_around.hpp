@@ -28,6 +28,7 @@ class WayAround {
     int count() const { return int(parents.size()); }
   };
   static constexpr double MARGIN = 1e-4;  // states in the middle of parts keep so much more than the clearance [m]
+  static constexpr double FINEST = 1e-6;  // the same, where curves are given
   static constexpr double GAIN = 0.01;    // part by which shortcuts have to make a way shorter
   static constexpr int MOST_PARTS = 1000, IDLE = 15, HALVINGS = 48;  // of a curve; shortcuts without gain; of a corner
 
@@ -37,9 +38,10 @@ class WayAround {
  private:
   const ShapedRobot<double>& robot;
   Collision<double> collision;
-  const int n, most, longest;  // entries that move; states that are tried; vertices of a way
+  const int n, most;           // entries that move; states that are tried
   const int* entry;            // [n]
   const double *low, *high;    // [n]
+  const double *start, *goals;  // [nq], [goals, nq]
   double clearance = 0, margin = 0, longest_step = 0;
   int row = -1;
   long tried = 0, limit = 0;  // states
@@ -52,30 +54,27 @@ class WayAround {
   Tree trees[2];
 
  public:
+  // Argument 0: configurations [lanes, nq]; 1: more of them [lanes, k, nq]; 2, 3: robot; 4: number of entries that move,
+  // states to try, key, the entries; 5: their ranges, and the longest step by the distance of the corners; 6, 7: scene;
+  // 8: clearance.
   WayAround(const xla::Call& call, const ShapedRobot<double>& robot)
-      : robot(robot), collision(robot), n(call.in<int>(4)[0]), most(call.in<int>(4)[1]), longest(call.result_size(0, 1)),
-        entry(call.in<int>(4) + 3), low(call.in<double>(5)), high(low + n), q(call.size(0, 1)), travel(robot.joints),
-        middle(n), spread(n), curve(4 * n), points(5 * n) {}
+      : robot(robot), collision(robot), n(call.in<int>(4)[0]), most(call.in<int>(4)[1]), entry(call.in<int>(4) + 3),
+        low(call.in<double>(5)), high(low + n), q(call.size(0, 1)), travel(robot.joints), middle(n), spread(n), curve(4 * n),
+        points(5 * n) {}
 
-  // Argument 0: starts [lanes, nq]; 1: goals [lanes, goals, nq]; 2, 3: robot; 4: n, states, key, entries; 5: ranges and step;
-  // 6, 7: scene; 8: clearance. Results: vertices [lanes, longest, n], radii of corners [lanes, longest], and [lanes, 6] status,
-  // goal, vertices, states that were tried, and the pair that touches.
-  void solve(const xla::Call& call, int lane) {
-    const double* start = xla::lane_of(call, 0, lane);
-    const double* goals = xla::lane_of(call, 1, lane);
-    const int nq = int(q.size()), count = call.size(1, 1), own = call.size(6, 0) > 1 ? lane : 0;
+  // From a configuration to one of more. Results: vertices [lanes, longest, n], radii of corners [lanes, longest], and
+  // [lanes, 6] status, goal, vertices, states that were tried, and the pair that touches.
+  void connect(const xla::Call& call, int lane) {
+    const int longest = call.result_size(0, 1);
     double* vertices = call.out<double>(0) + size_t(longest) * n * lane;
     double* radii = call.out<double>(1) + size_t(longest) * lane;
     int* labels = call.out<int>(2) + 6 * lane;
     std::fill(vertices, vertices + longest * n, 0.0), std::fill(radii, radii + longest, 0.0);
-    q.assign(start, start + nq);
-    if (own != row) collision.set(scene_of(call, 6, robot.shapes, lane)), row = own;
-    clearance = *xla::lane_of(call, 8, lane), tried = 0, limit = most, random_state = uint64_t(call.in<int>(4)[2]) + 1;
-    measure(start, goals, count);
+    begin(call, lane);
     Collision<double>::Nearest touching;
-    const Status status = plan(start, goals, count, nq, touching);
-    List way;
+    const Status status = plan(call.size(1, 1), touching);
     limit = tried + most;
+    List way;
     if (status == FOUND) way = shortened(straightened(path()));
     limit = std::numeric_limits<long>::max();
     const bool fits = int(way.size()) <= longest * n;
@@ -86,8 +85,24 @@ class WayAround {
     std::copy(way.begin(), way.end(), vertices);
     for (int k = 1; k + 1 < labels[2]; ++k) radii[k] = corner(vertices + n * (k - 1));
   }
+  // Whether a cubic Bezier curve with these four control points is free. Result: [lanes] flags.
+  void prove(const xla::Call& call, int lane) {
+    begin(call, lane), margin = FINEST;
+    for (int e = 0; e < 4; ++e)
+      for (int k = 0; k < n; ++k) curve[e * n + k] = (e ? goals + (e - 1) * q.size() : start)[entry[k]];
+    call.out<int>(0)[lane] = collision.nearer(clearance, false).i < 0 && is_free_curve();
+  }
 
  private:
+  // Take a lane's configurations and scene.
+  void begin(const xla::Call& call, int lane) {
+    const int own = call.size(6, 0) > 1 ? lane : 0;
+    start = xla::lane_of(call, 0, lane), goals = xla::lane_of(call, 1, lane);
+    q.assign(start, start + q.size());
+    if (own != row) collision.set(scene_of(call, 6, robot.shapes, lane)), row = own;
+    clearance = *xla::lane_of(call, 8, lane), tried = 0, limit = most, random_state = uint64_t(call.in<int>(4)[2]) + 1;
+    measure(call.size(1, 1)), collision.place(start);
+  }
   int chosen = 0, ends[2] = {0, 0};  // the goal; the nodes at which the trees meet
 
   double random() {  // splitmix64 (Steele, Lea and Flood, 2014)
@@ -160,7 +175,7 @@ class WayAround {
   // ---- How far points move
 
   // Find the pairs that the entries part, how far they move them, and the weights of the metric.
-  void measure(const double* start, const double* goals, int count) {
+  void measure(int count) {
     pairs.clear(), order.clear(), weight.assign(n, 0);
     for (int joint = 0, full = 0; joint < robot.joints; full += width(joint++)) {
       const double* own = std::find(entry, entry + n, robot.source[full]) - entry + low;
@@ -215,12 +230,12 @@ class WayAround {
 
   // ---- Search
 
-  Status plan(const double* start, const double* goals, int count, int nq, Collision<double>::Nearest& touching) {
+  Status plan(int count, Collision<double>::Nearest& touching) {
     for (Tree& tree : trees) tree.nodes.clear(), tree.parents.clear();
     goal_of_root.clear(), margin = MARGIN;
     if (!add_root(trees[0], start, touching)) return BAD_START;
     for (int g = 0; g < count; ++g)
-      if (add_root(trees[1], goals + g * nq, touching)) goal_of_root.push_back(g);
+      if (add_root(trees[1], goals + g * q.size(), touching)) goal_of_root.push_back(g);
     if (!trees[1].count()) return BAD_GOAL;
     touching = {};
     for (int g = 0; g < trees[1].count(); ++g)
@@ -375,9 +390,9 @@ class WayAround {
   }
 };
 
-inline void find_ways(const xla::Call& call) {
+template <void (WayAround::*method)(const xla::Call&, int)> void find_ways(const xla::Call& call) {
   const ShapedRobot<double> robot(call.in<int>(2), call.in<double>(3));
   in_threads(call.result_size(0, 0), 2,
-             [&] { return [&, way = WayAround(call, robot)](int lane) mutable { way.solve(call, lane); }; });
+             [&] { return [&, way = WayAround(call, robot)](int lane) mutable { (way.*method)(call, lane); }; });
 }
 }  // namespace osik

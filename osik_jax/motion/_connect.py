@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from ..collision import Scene, robot_shapes
+from ..collision import Scene
 from ..collision._clearance import shape_names
-from ..collision._core import check_length, check_scene, core_robot, core_scene, require_core, ways
+from ..collision._core import check_length, ways
 from ..collision._robot_shapes import Given
 from ..numerics._arguments import check_count
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dofs_of, select_all
+from ._obstacles import Obstacles
 from ._retime import Limit, check_scalar_joints, retime
 from ._spline import Spline
 from ._timing import Timing
@@ -125,28 +126,21 @@ def connect(
             at a goal.
         KeyError: no such joint.
     """
-    require_core("connect")
-    check_scene(scene)
     if is_traced((robot, q_from, q_to, scene, clearance)):
         raise OsikTypeError("connect makes paths of any length: call it outside jit, vmap and grad")
+    obstacles = Obstacles.read(robot, scene, clearance, srdf, "connect")
     check_scalar_joints(robot)
     starts, goals, many = _read(robot, q_from, q_to)
     if scene.is_stack and not many:
         raise OsikValueError("a stack of scenes goes with as many starts: give q_from as (scenes, n)")
     moving = np.array(dofs_of(robot, select_all(robot, joints)), np.int32)
     _check_held(robot, starts, goals, moving)
-    if not (np.isfinite(clearance) and clearance >= 0.0):
-        raise OsikValueError(f"clearance is {clearance!r}; it is one number, 0 or more, in metres")
     check_count("states", states)
-    shapes = robot_shapes(robot, srdf)
-    around = core_scene(scene, shapes)
-    check_length(around, len(starts), "starts")
-    low, high = _ranges(robot, starts, goals, moving)
-    own = core_robot(robot, shapes, entries=tuple(moving.tolist()))
-    options = np.concatenate([[len(moving), states, key], moving]).astype(np.int32)
-    given = starts, goals, own, options, np.concatenate([low, high, [_STEP]]), around, np.array([float(clearance)])
-    vertices, radii, labels = map(np.asarray, _ways(*given, longest=_LONGEST))
-    names = shapes.names, scene.names
+    check_length(obstacles.around, len(starts), "starts")
+    ranges = [*_ranges(robot, starts, goals, moving), np.array([_STEP])]
+    given = obstacles.for_core(robot, moving, ranges, states, key)
+    vertices, radii, labels = map(np.asarray, _ways(starts, goals, *given, longest=_LONGEST))
+    names = obstacles.shapes.names, scene.names
     found = []
     for lane, (status, goal, count, tried, *pair) in enumerate(labels.tolist()):
         problem = _outside(robot, starts[lane], goals[lane])

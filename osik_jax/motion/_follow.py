@@ -11,6 +11,8 @@ from jaxtyping import Array, ArrayLike, Float
 from scipy.interpolate import CubicSpline
 
 from .._errors import OsikTypeError, OsikValueError
+from ..collision import Scene
+from ..collision._robot_shapes import Given
 from ..control._checks import checked_start
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
@@ -19,6 +21,7 @@ from ..robot._joint_selection import dof_names
 from ..tasks._pose import RADIAN
 from ._joint_path import Free, PathSearch
 from ._motion import Motion, sample_times
+from ._obstacles import Obstacles, spline_curves
 from ._pose_path import Poses, corners, interpolated, lengths, read_poses
 from ._retime import Limit, checked_limits, checked_speed, frame_speeds, resampled, retimed_pieces
 from ._timing import SlowPart, Timing, sampled
@@ -95,6 +98,9 @@ def follow(
     orientation_tolerance: float = 1.7e-3,
     q0: Float[ArrayLike, " n"] | None = None,
     key: int | Array = 0,
+    scene: Scene | None = None,
+    clearance: float = 0.0,
+    srdf: Given = None,
 ) -> Followed:
     """Return a continuous, timed motion that leads frames along poses (outside jit).
 
@@ -115,6 +121,9 @@ def follow(
         orientation_tolerance: largest angle [rad].
         q0: configuration to begin near. (n,)
         key: other searches for the branches.
+        scene: obstacles, and what the robot holds. The whole path is proven free, not only samples.
+        clearance: with a scene, the distance that all pairs of shapes keep [m].
+        srdf: with a scene, pairs that may touch, as for ``inverse_kinematics``.
 
     Returns:
         The motion: ``at(time)``, ``sample(dt)``, ``slow_parts()``.
@@ -124,6 +133,7 @@ def follow(
         TypeError: ``free`` is no axis.
         ValueError: poses that are out of reach (the message says which, by how much and why), one pose, two equal
             poses in a row, or no continuous path through poses that are in reach one by one.
+        OsikError: a scene without the compiled core, or not on a CPU.
     """
     read, free = read_poses(robot, poses), _checked_free(poses, free)
     if robot.nq != robot.nv:
@@ -132,12 +142,29 @@ def follow(
     along = lengths(read)
     start = None if q0 is None else checked_start(robot, q0)
     lower, upper = (np.asarray(end) for end in joint_box(robot, None))
-    search = PathSearch(robot, free, lower, upper, start, key)
+    obstacles = None if scene is None else Obstacles.read(robot, scene, clearance, srdf, "follow with a scene")
+    search = PathSearch(robot, free, lower, upper, start, key, obstacles)
     path, errors = _within_tolerance(search, read, along, (position_tolerance, orientation_tolerance))
     frame = next(iter(read))
     timings = retimed_pieces(path, limits, robot, wanted, frame)
+    if obstacles is not None:
+        _check_clear(robot, obstacles, timings)
     starts = np.append(0.0, np.cumsum([float(one.duration) for one in timings]))
     return Followed(timings, starts, *errors, robot, frame)
+
+
+def _check_clear(robot: Robot, obstacles: Obstacles, timings: list[Timing]) -> None:
+    """Raise ValueError unless the splines of all pieces are proven free."""
+    for piece, timing in enumerate(timings):
+        curves = spline_curves(np.asarray(timing.path.knots), np.asarray(timing.path.coefficients))
+        is_clear = obstacles.are_clear(robot, curves)
+        if not is_clear.all():
+            first = int(np.argmin(is_clear))
+            pair = obstacles.nearest(robot, np.array([0.125, 0.375, 0.375, 0.125]) @ curves[first])
+            raise OsikValueError(
+                f"between two poses the path does not keep the clearance, {(first + 0.5) / len(curves):.0%} along "
+                f"piece {piece} of {len(timings)}: {pair}. Give more poses there, or a smaller clearance"
+            )
 
 
 def _checked_free(poses: Mapping[str, Any], free: Free | None) -> Free:
@@ -192,7 +219,9 @@ def _errors_between(
 
 def _why_not(search: PathSearch, poses: Mapping[str, Poses]) -> str:
     """Return why there is no path: the poses that cannot be reached, or that none is continuous."""
-    found = [inverse_kinematics(search.robot, targets, key=search.key) for targets in search.targets(poses)]
+    found = [
+        inverse_kinematics(search.robot, targets, key=search.key, **search.around) for targets in search.targets(poses)
+    ]
     missed = np.flatnonzero(~np.any([one.converged for one in found], axis=0))
     if len(missed) == 0:
         return "each pose can be reached, and no continuous path through all was found: try another key, free= or q0"

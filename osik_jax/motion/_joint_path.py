@@ -17,6 +17,7 @@ from scipy.linalg import solveh_banded
 from ..inverse import inverse_kinematics
 from ..kinematics import forward_kinematics
 from ..robot import Robot
+from ._obstacles import Obstacles, line_curves
 from ._pose_path import Poses
 
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -64,10 +65,21 @@ class PathSearch:
         lower, upper: ranges of the joints. (n,)
         q0: configuration to begin near, or None.
         key: of the searches.
+        obstacles: what the path keeps clear of, or None.
     """
 
-    def __init__(self, robot: Robot, free: Free, lower: np.ndarray, upper: np.ndarray, q0: Any, key: Any):
+    def __init__(
+        self,
+        robot: Robot,
+        free: Free,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        q0: Any,
+        key: Any,
+        obstacles: Obstacles | None = None,
+    ):
         self.robot, self.free, self.lower, self.upper, self.q0, self.key = robot, free, lower, upper, q0, key
+        self.obstacles, self.around = obstacles, {} if obstacles is None else obstacles.given
 
     def errors(self, q: np.ndarray, poses: Mapping[str, Poses]) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors (S, m) and Jacobians (S, m, n) at configurations; few numbers of them are compiled."""
@@ -88,7 +100,7 @@ class PathSearch:
         """Return all configurations found for each of some poses, (k, n) each."""
         found: list[list[np.ndarray]] = [[] for _ in next(iter(poses.values())).position]
         for targets in self.targets(poses):
-            answer = inverse_kinematics(self.robot, targets, all=True, q0=self.q0, key=self.key)
+            answer = inverse_kinematics(self.robot, targets, all=True, q0=self.q0, key=self.key, **self.around)
             for own, q, count in zip(found, *map(np.asarray, (answer.solutions, answer.count)), strict=True):
                 own.append(q[:count])
         return [np.concatenate(own) for own in found]
@@ -160,10 +172,12 @@ class PathSearch:
         return solveh_banded(band, -right.ravel(), lower=True).reshape(count, n)
 
     def broken(self, path: np.ndarray, poses: Mapping[str, Poses]) -> int | None:
-        """Return the number of the first pose where the path is off the poses or jumps, or None."""
+        """Return the number of the first pose where the path is off the poses, jumps or touches something, or None."""
         error = np.abs(self.errors(path, poses)[0]).max(axis=1)
         jumps = np.append(0.0, np.abs(np.diff(path, axis=0)).max(axis=1))
         wrong = (error > 1e-6) | (jumps > _JUMP)
+        if self.obstacles is not None and not wrong.any():
+            wrong[1:] = ~self.obstacles.are_clear(self.robot, line_curves(path))
         return int(wrong.argmax()) if wrong.any() else None
 
 

@@ -1,14 +1,16 @@
 """Timed motions along poses: tool and joints beside dense samples in NumPy, MuJoCo's kinematics as the judge."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax import cli
+from osik_jax.core import _library
 from osik_jax.motion import follow, load_motion
 
 ARM = osik.load_robot("arm7")
@@ -137,3 +139,32 @@ def test_a_command_follows_a_file(tmp_path, capsys) -> None:
 def test_what_cannot_be_is_refused(poses, more, message) -> None:
     with pytest.raises(osik.OsikError, match=message):
         follow(ARM, poses, **({"acceleration": 5.0} | more))
+
+
+@pytest.mark.skipif(not _library.installed(), reason="no compiled core")
+class TestObstacles:
+    """A line of UR5's tool, with a lamp where the elbow would be."""
+
+    LINE = np.stack([np.full(20, 0.5), np.linspace(-0.2, 0.2, 20), np.full(20, 0.35)], axis=1)
+    DOWN = np.tile([0.0, 1.0, 0.0, 0.0], (20, 1))
+    OPTIONS: ClassVar = {"speed": 0.1, "acceleration": 5.0, "q0": np.array([0.0, -1.5, 1.8, -1.9, -1.57, 0.0])}
+
+    def test_another_branch_is_taken_and_the_whole_motion_is_free(self):
+        ur5, poses = osik.load_robot("ur5"), {"tool0": (self.LINE, self.DOWN)}
+        plain = follow(ur5, poses, **self.OPTIONS)
+        middle = plain.at(np.array([plain.duration / 2]))[0, 0]
+        elbow = osik.forward_kinematics(ur5, middle).frame_pose(ur5, "forearm_link")[0]
+        scene = osik.Scene({"lamp": osik.CollisionShape.sphere(0.08, elbow + np.array([0.0, 0.0, 0.05]))})
+        found = follow(ur5, poses, scene=scene, clearance=0.01, **self.OPTIONS)
+        for motion, is_clear in ((plain, False), (found, True)):
+            q = motion.at(np.linspace(0.0, motion.duration, 2001))[0]
+            distance = np.asarray(osik.clearance(ur5, q, scene).distance)
+            assert (distance.min() >= 0.01) == is_clear
+        assert found.position_error < 1e-4
+
+    def test_an_obstacle_on_the_line_is_named(self):
+        scene = osik.Scene({"lamp": osik.CollisionShape.sphere(0.05, self.LINE[10])})
+        refuses(
+            ValueError, "(?s)9 of 20 poses.*Pose 6.*lamp", follow, osik.load_robot("ur5"),
+            {"tool0": (self.LINE, self.DOWN)}, scene=scene, **self.OPTIONS,
+        )  # fmt: skip
