@@ -255,7 +255,7 @@ def _warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], schem
         if first and _span(np.concatenate(first), rows[name]):
             warn(
                 f"the {type(tasks[name]).__name__} {name!r} does nothing: tasks that come first ({', '.join(others)}) "
-                "fix its joints. Use a lower gain against noise, or a WeightedQP, where its weight counts"
+                "fix its joints. Use motion.PoseFilter against noise, or a WeightedQP, where its weight counts"
             )
 
 

@@ -6,6 +6,7 @@ import os
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -100,5 +101,10 @@ def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
     fields: dict[str, Any] = {name: arrays[name] for name in _NUMBERS}
     for kind in _BY_TASK:
         fields[kind] = {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith(f"{kind}.")}
-    solution = Solution(**fields, warm_start=None)
-    return Trajectory(arrays["time"], arrays["q"], solution)
+
+    def made(time: Array, q: Array, fields: dict[str, Any]) -> Trajectory:
+        return Trajectory(time, q, jax.vmap(lambda own: Solution(**own, warm_start=None))(fields))
+
+    for _ in range(arrays["time"].ndim - 1):  # many rollouts
+        made = jax.vmap(made)
+    return made(arrays["time"], arrays["q"], fields)

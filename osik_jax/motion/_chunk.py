@@ -30,7 +30,7 @@ from ._motion import Motion, at_rest_outside, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
-from ._start import OUTSIDE, State, checked_state
+from ._start import State, checked_state, rounding
 
 _FEWEST = 16
 _HELD = 4
@@ -267,6 +267,8 @@ def _fitted(
     def solved(joint: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         """Return the coefficients of one joint, and whether limits hold."""
         wanted, state, bounds, limits = joint
+        home, state = state[0], state.at[0].set(0.0)  # from the start on: smaller numbers have less rounding
+        wanted, bounds = wanted - home, bounds - home
         first = _first_coefficients(state, width)
         fixed = jnp.zeros(cells + 3, first.dtype).at[:3].set(first)
         box, spans = _spans(first, width, bounds, limits, cells)
@@ -276,7 +278,7 @@ def _fitted(
         answer = solve_least_squares_qp(
             cost @ spread, target, weight, *box[:, :free], moved, lower - shift, upper - shift, damping=_DAMPING
         )
-        return fixed + spread @ answer.x, answer.status == Status.SOLVED
+        return home + fixed + spread @ answer.x, answer.status == Status.SOLVED
 
     # one by one: joints need different numbers of iterations
     found, feasible = jax.lax.map(solved, (wanted.T, state.T, bounds.T, limits.T))
@@ -354,7 +356,7 @@ def _below_peak(slopes: Float[Array, " K1"], speed: Array) -> Float[Array, " K"]
 def _is_inside(
     coefficients: Float[Array, "K3 n"], width: Array, bounds: Float[Array, "2 n"], limits: Float[Array, "3 n"]
 ) -> Bool[Array, " n"]:
-    """Return whether positions and speeds of each joint are within limits, at knots and where their slopes are 0."""
+    """Return whether each joint is within limits: positions and speeds at knots and where their slopes are 0 too."""
     four = jnp.stack([coefficients[i : len(coefficients) - 3 + i] for i in range(4)])
     cubics = jnp.einsum("ck,ktn->tcn", CUBIC.astype(width.dtype), four)
     _, b, c, d = (cubics[:, power] for power in range(4))
@@ -369,5 +371,8 @@ def _is_inside(
     places = [zero, zero + 1.0, share(-c, 3.0 * d), share(-b, c + root), share(-b, c - root)]
     states = jnp.stack([cubic_derivatives(cubics, x)[:2] for x in places])
     q, v = states[:, 0], jnp.abs(states[:, 1]) / width
-    above = jnp.maximum(q - bounds[1], bounds[0] - q), v / limits[0] - 1.0
-    return jnp.stack([(one <= 2.0 * OUTSIDE).all(axis=(0, 1)) for one in above]).all(axis=0)
+    place, rate = rounding(width)
+    past = jnp.maximum(q - bounds[1], bounds[0] - q)
+    pull, jerk = (jnp.abs(jnp.diff(coefficients, n=order, axis=0)).max(axis=0) / width**order for order in (2, 3))
+    slow = jnp.stack([v.max(axis=(0, 1)), pull, jerk]) <= (1.0 + 2.0 * rate) * limits
+    return (past <= 2.0 * place).all(axis=(0, 1)) & slow.all(axis=0)

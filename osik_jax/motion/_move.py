@@ -17,7 +17,7 @@ from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ._motion import Motion, at_rest_outside, sample_times
 from ._retime import Limit, checked_limits
-from ._start import OUTSIDE, State, checked_state
+from ._start import State, checked_state, rounding
 
 _SHARES = 0.0, 1e-9, 1e-8, 1e-7
 """Shares by which limits are lowered in turn: at the border between two kinds of profiles Ruckig may find none."""
@@ -129,7 +129,7 @@ def _trajectory(start: np.ndarray, goal: np.ndarray, limits: np.ndarray) -> Any:
     given.current_position, given.current_velocity, given.current_acceleration = start.astype(float).tolist()
     given.target_position, given.target_velocity = goal.astype(float).tolist()
     # a state beyond a limit by rounding would be refused
-    least = (1.0 + OUTSIDE) * np.abs([goal[1], start[2], 0.0 * start[2]])
+    least = np.abs([goal[1], start[2], 0.0 * start[2]])
     failed = None
     for share in _SHARES:
         used = np.maximum(limits * (1.0 - share * np.array([[1.0], [2.0], [3.0]])), least).astype(float)
@@ -172,7 +172,7 @@ def _check_ranges(robot: Robot, starts: np.ndarray, states: np.ndarray, duration
     ):
         own = reached[:, np.isfinite(starts[:, joint]), joint]
         past = max(low - own.min(), own.max() - high)
-        if past > OUTSIDE:
+        if past > rounding(robot.q0)[0]:
             raise OsikValueError(
                 f"{name!r} passes the end of its range by {past:.3g}: start or end slower, or give wider limits of "
                 "acceleration and jerk"

@@ -21,7 +21,7 @@ from ._cells import Cells
 from ._jerk import PLACES, reference, rows_of, stretched
 from ._least_time import largest_square, least_time
 from ._spline import Spline, chord_lengths, cubic_derivatives, spline_through
-from ._start import OUTSIDE
+from ._start import rounding
 from ._timing import Timing, by_progress
 
 Limit = ArrayLike | Mapping[str, float] | None
@@ -205,7 +205,8 @@ def check_scalar_joints(robot: Robot) -> None:
 
 def _check_ranges(robot: Robot, points: np.ndarray) -> None:
     lower, upper = (np.asarray(end) for end in joint_box(robot, None))
-    outside = (points < lower - OUTSIDE) | (points > upper + OUTSIDE)
+    most = rounding(points)[0]
+    outside = (points < lower - most) | (points > upper + most)
     if outside.any():
         row, joint = (int(i) for i in np.argwhere(outside)[0])
         raise OsikValueError(

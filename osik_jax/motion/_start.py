@@ -14,11 +14,19 @@ from ..numerics._arguments import as_floats, check_finite, concrete
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
 
-OUTSIDE = 1e-6
-"""Share of a limit, or of a range [rad or m], by which a state may be outside: rounding."""
+_OUTSIDE = {"float64": (1e-6, 1e-6), "float32": (1e-5, 2e-3)}
+"""By how much a position may be outside of its range [rad or m], and a rate outside of its limit, as a share of that.
+
+Rates are differences of positions over a few hundredths of a second, so they have few digits in single precision.
+"""
 _KINDS = "position", "velocity", "acceleration"
 
 State = tuple[Float[ArrayLike, " n"], Float[ArrayLike, " n"], Float[ArrayLike, " n"]]
+
+
+def rounding(numbers: Array | np.ndarray) -> tuple[float, float]:
+    """Return by how much positions of this precision may be outside [rad or m], and rates by a share of limits."""
+    return _OUTSIDE[str(numbers.dtype)]
 
 
 def checked_state(robot: Robot, given: Any, limits: Array, name: str = "start", kinds: int = 3) -> Float[Array, "k n"]:
@@ -39,8 +47,9 @@ def checked_state(robot: Robot, given: Any, limits: Array, name: str = "start", 
     if seen is None or most is None:
         return state
     lower, upper = (np.asarray(end) for end in joint_box(robot, None))
-    outside = [(seen[0] < lower - OUTSIDE) | (seen[0] > upper + OUTSIDE)]
-    outside += [np.abs(own) > (1.0 + OUTSIDE) * limit for own, limit in zip(seen[1:], most, strict=False)]
+    place, rate = rounding(state)
+    outside = [(seen[0] < lower - place) | (seen[0] > upper + place)]
+    outside += [np.abs(own) > (1.0 + rate) * limit for own, limit in zip(seen[1:], most, strict=False)]
     for row, where in enumerate(outside):
         if where.any():
             joint = int(where.argmax())

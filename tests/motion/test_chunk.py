@@ -1,5 +1,7 @@
 """Chunks of waypoints beside SciPy's splines and optimiser, NumPy's differences and central differences."""
 
+import subprocess
+import sys
 from functools import partial
 from typing import Any
 
@@ -85,6 +87,30 @@ def test_a_time_that_rounding_puts_before_the_begin_is_in_motion(rng) -> None:
     for time in (0.3, np.nextafter(0.3, 0.0)):
         np.testing.assert_allclose(found.state(time)[1], fast, atol=1e-9)
     np.testing.assert_array_equal(found.state(0.299)[1], 0.0)
+
+
+SINGLE = """
+import numpy as np
+import osik_jax as osik
+from osik_jax.motion import chunk
+arm, rng = osik.load_robot("arm7"), np.random.default_rng(0)
+limits, times, rest = {"velocity": 0.6, "acceleration": 4.0, "jerk": 40.0}, np.linspace(0.0, 1.0, 30), np.zeros(7)
+start, begin = (np.asarray(arm.q0), rest, rest), 0.0
+for _ in range(20):
+    points = np.asarray(start[0]) + np.cumsum(0.12 * rng.normal(size=(30, 7)), axis=0)
+    found = chunk(arm, points, times + begin - 0.1, start=start, begin=begin, **limits)
+    assert found.coefficients.dtype == np.float32 and found.feasible.all()
+    rates = np.abs(np.asarray(found.at(np.linspace(begin, float(found.end), 1000)))[1:])
+    assert (rates.max(axis=(1, 2)) <= 1.002 * np.array(list(limits.values()))).all()
+    begin += 0.1 + 0.4 * rng.random()
+    start = found.state(begin)
+"""
+
+
+@pytest.mark.slow
+def test_a_stream_in_single_precision() -> None:
+    """Each start is a state of the chunk before: its rates are at their limits but for rounding."""
+    subprocess.run([sys.executable, "-c", SINGLE], check=True)
 
 
 @pytest.mark.slow
