@@ -18,6 +18,7 @@ from benchmarks.data_file import DOCS
 from ._accepted import accepted
 from ._files import files
 from ._models import folder
+from ._places import calibrations, placements
 from ._problems import in_programs, limits, problems
 from ._tasks import configurations, targets, tasks
 
@@ -82,6 +83,8 @@ _GROUPS = {
     "Problems": problems,
     "Limits": limits,
     "Files": files,
+    "Placement": placements,
+    "Calibration": calibrations,
     "Inside a program": in_programs,
     "Accepted": accepted,
 }

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikTypeError, OsikValueError
-from ..collision import CollisionShape, Scene
-from ..collision._convex import shape_table
+from ..collision import Scene
+from ..collision._convex import ConvexShape, shape_table
 from ..collision._core import core_robot, core_scene, gaps_at
 from ..collision._robot_shapes import Given, robot_shapes
-from ..collision._scene import Labels, _convex_shapes, _with
+from ..collision._scene import Labels, _with
 from ..collision._table import RobotShapes
 from ..kinematics._rigid import compose, rotate
 from ..numerics._host import module_of
@@ -39,7 +39,7 @@ def checked_axis(name: str, given: Any) -> Float[np.ndarray, " n"]:
             f"{name} is {type(given).__name__}; it is numbers, such as np.linspace(-1, 1, 11)"
         ) from None
     if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
-        raise OsikValueError(f"{name} has shape {axis.shape}; it is finite numbers that increase: [0.0, 0.1]")
+        raise OsikValueError(f"{name} is {given!r}; it is finite numbers that increase, such as [0.0, 0.1]")
     return axis
 
 
@@ -85,7 +85,7 @@ def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
 
 
 def base_clearances(
-    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[CollisionShape]
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[ConvexShape]
 ) -> Float[np.ndarray, " n"]:
     """Return the distance from the scene to the shapes that stand with the base [m]; infinite if there are none.
 
@@ -103,9 +103,9 @@ def shape_clearances(
     return np.asarray(near.distance)
 
 
-def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[CollisionShape]) -> RobotShapes:
+def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[ConvexShape]) -> RobotShapes:
     """Return the shapes so that those that no joint moves, and the footprint, meet the scene, and nothing else does."""
-    more = shape_table(_convex_shapes("footprint", footprint))
+    more = shape_table(footprint)
     count, table = len(more.kind), shapes.table
     more = more._replace(first=more.first + len(table.vertices))
     return shapes._replace(

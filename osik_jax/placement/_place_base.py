@@ -14,11 +14,12 @@ from .._errors import OsikValueError
 from ..collision import CollisionShape, Scene
 from ..collision._core import check_scene
 from ..collision._robot_shapes import Given
-from ..control._checks import check_setting
+from ..collision._scene import _convex_shapes
+from ..control._checks import check_setting, checked_start
 from ..inverse._chain_problem import ChainRoute, search_of
 from ..inverse._chain_search import Goal
 from ..inverse._free import checked_clearance
-from ..inverse._inverse_kinematics import joint_box
+from ..inverse._inverse_kinematics import checked_tolerance, joint_box
 from ..inverse._poses import read_poses
 from ..inverse._seeds import shift_of
 from ..inverse._whole import carried_by
@@ -99,16 +100,16 @@ def place_base(
     check_setting("place_base(robot, poses)", robot, None, 1.0)
     for name, value, least in (("seeds", seeds, 1), ("refine", refine, 0), ("key", key, 0)):
         check_count(name, value, least=least)
-    axes = _axes(x, y, yaw, height)
+    axes, clearance = _axes(x, y, yaw, height), float(checked_clearance(clearance)[0])
     settings = dict(q0=q0, seeds=seeds, key=key, restarts=0, closest=False)
     settings |= dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
     if scene is not None:
         check_scene(scene)
         if scene.is_stack:
             raise OsikValueError("scene is a stack of scenes; give one scene, in world axes")
-        settings |= dict(clearance=float(checked_clearance(clearance)[0]), srdf=srdf)
+        settings |= dict(clearance=clearance, srdf=srdf)
     task = _read_task(robot, poses, scene, settings, key)
-    solid = [footprint] if isinstance(footprint, CollisionShape) else list(footprint)
+    solid = _convex_shapes("footprint", footprint)
 
     def gaps(bases: np.ndarray) -> np.ndarray:
         return np.full(len(bases), np.inf) if scene is None else base_clearances(robot, bases, scene, srdf, solid)
@@ -129,7 +130,7 @@ def place_base(
     return Placement(
         robot=robot,
         scene=scene,
-        clearance=float(clearance),
+        clearance=clearance,
         poses=np.asarray(task.goal.position).reshape(-1, 3),
         **dict(zip(AXES, axes, strict=True)),
         base_clearance=gap.reshape(shape),
@@ -159,8 +160,9 @@ def _read_task(robot: Robot, poses: Any, scene: Scene | None, settings: dict[str
     frames = tuple(read_frame(robot, name, None, key) for name in poses)
     goal, rows, _ = read_poses(robot, poses)
     lower, upper = joint_box(robot, None)
-    home = jnp.asarray(robot.q0 if settings["q0"] is None else settings["q0"])
-    tolerance = jnp.array([settings["position_tolerance"], settings["orientation_tolerance"]])
+    home = robot.q0 if settings["q0"] is None else checked_start(robot, settings["q0"])
+    sizes = (settings[f"{of}_tolerance"] for of in ("position", "orientation"))
+    tolerance = jnp.stack([checked_tolerance(size, home.dtype) for size in sizes])
     route, own = ChainRoute(tuple(poses), rows), carried_by(robot, lower, upper, frames=tuple(poses))
     shift = shift_of(key, len(own.lower))
     search = search_of(own, route, home, shift, tolerance, 1, warm=False, near=False)

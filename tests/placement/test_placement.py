@@ -277,7 +277,15 @@ def test_a_longer_tool_is_compared_with_a_shorter_one(found, scene, points):
 
 
 def test_what_is_wrong_is_told(arm, points):
-    refuses(ValueError, r"x has shape \(2,\)", place_base, arm, {"tip": points}, x=[1.0, 0.0], y=0.0)
+    refuses(
+        ValueError,
+        r"x is \[1.0, 0.0\]",
+        place_base,
+        arm,
+        {"tip": points},
+        x=[1.0, 0.0],
+        y=0.0,
+    )
     refuses(TypeError, "y is str", place_base, arm, {"tip": points}, x=0.0, y="wide")
     refuses(KeyError, "tap", place_base, arm, {"tap": points}, x=0.0, y=0.0)
     refuses(TypeError, "scene is a dict", place_base, arm, {"tip": points}, x=0.0, y=0.0, scene={})
