@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision import Scene
@@ -86,21 +86,27 @@ def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
 
 def base_clearances(
     robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[ConvexShape]
-) -> Float[np.ndarray, " n"]:
-    """Return the distance from the scene to the shapes that stand with the base [m]; infinite if there are none.
+) -> tuple[Float[np.ndarray, " n"], list[tuple[str, str]]]:
+    """Return the distance from the scene to the shapes that stand with each base [m], and the nearest object and link.
 
-    These are the robot's shapes that no joint moves, and the footprint. ``Scene.allow`` says what may touch them.
+    These are the robot's shapes that no joint moves, and the footprint; infinite if there are none. ``Scene.allow``
+    says what may touch them.
     """
-    return shape_clearances(robot, bases, scene, _fixed_shapes(robot_shapes(robot, srdf), footprint), robot.q0)
+    shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
+    distance, pairs = shape_clearances(robot, bases, scene, shapes, robot.q0)
+    objects, links = scene.labels.objects, shapes.links
+    return distance, [
+        (objects[max(pair) - len(links)], links[min(pair)]) if min(pair) >= 0 else ("", "") for pair in pairs
+    ]
 
 
 def shape_clearances(
     robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
-) -> Float[np.ndarray, " n"]:
-    """Return the distance of the nearest pair of shapes at each base, with one configuration at all of them [m]."""
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, "n 2"]]:
+    """Return the distance of the nearest pair of shapes at each base [m], and its numbers; q is the same at all."""
     q = np.broadcast_to(q, (len(bases), robot.nq))
     near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
-    return np.asarray(near.distance)
+    return np.asarray(near.distance), np.asarray(near.pair)
 
 
 def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[ConvexShape]) -> RobotShapes:

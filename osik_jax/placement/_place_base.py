@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -111,21 +112,24 @@ def place_base(
     task = _read_task(robot, poses, scene, settings, key)
     solid = _convex_shapes("footprint", footprint)
 
-    def gaps(bases: np.ndarray) -> np.ndarray:
-        return np.full(len(bases), np.inf) if scene is None else base_clearances(robot, bases, scene, srdf, solid)
+    def gaps(bases: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
+        if scene is None:
+            return np.full(len(bases), np.inf), []
+        return base_clearances(robot, bases, scene, srdf, solid)
 
     grid = grid_bases(axes)
-    gap = gaps(grid)
+    gap, pairs = gaps(grid)
     allowed = gap >= clearance
     if not allowed.any():
+        pair = pairs[int(gap.argmax())]
         raise OsikValueError(
-            f"no base of the grid stands free: the best one is {gap.max():.3g} m from the scene. Let the base touch "
-            "what it stands on by scene.allow, or give other x, y or height"
+            f"no base of the grid stands free: at the best one {pair[0]} and {pair[1]} are {gap.max():.3g} m apart. If "
+            f"the base stands on it, let them touch by scene=scene.allow({pair}); else give other x, y or height"
         )
     scores = score_grid(task, grid[allowed])
     best = grid[allowed][_order(*scores.table)[:_BEST]]
     reaches, margin, index = _spread(allowed, (scores.reached, *scores.table[1:]))
-    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases) >= clearance)
+    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases)[0] >= clearance)
     shape, count = tuple(map(len, axes)), len(task.goal.position)
     return Placement(
         robot=robot,
@@ -134,6 +138,7 @@ def place_base(
         poses=np.asarray(task.goal.position).reshape(-1, 3),
         **dict(zip(AXES, axes, strict=True)),
         base_clearance=gap.reshape(shape),
+        blocked_by=dict(Counter(pair for pair, free in zip(pairs, allowed, strict=False) if not free).most_common()),
         reaches=reaches.reshape(*shape, count),
         too_far=is_too_far(task, grid).sum(1).reshape(shape),
         margin=margin.reshape(shape),
