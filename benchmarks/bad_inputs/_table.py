@@ -19,6 +19,7 @@ from ._accepted import accepted
 from ._files import files
 from ._models import folder
 from ._motions import motions
+from ._places import calibrations, placements
 from ._problems import in_programs, limits, problems
 from ._tasks import configurations, targets, tasks
 
@@ -84,6 +85,8 @@ _GROUPS = {
     "Limits": limits,
     "Motions": motions,
     "Files": files,
+    "Placement": placements,
+    "Calibration": calibrations,
     "Inside a program": in_programs,
     "Accepted": accepted,
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -11,6 +10,7 @@ import numpy as np
 
 from .._errors import OsikKeyError, OsikValueError
 from .._whole_file import write_text
+from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot.loading._mjmodel import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
@@ -50,7 +50,7 @@ def read_measurements(
         KeyError: a column is no joint.
         ValueError: no columns of a kind, a missing ``other`` or ``intrinsics``, or a cell that is no number.
     """
-    columns = _columns(path)
+    columns = read_columns(path)
     known = (*_POSITION, *_QUATERNION, *_PIXEL, "distance", "height")
     q = _configurations(robot, {name: values for name, values in columns.items() if name not in known}, str(path))
     noise = {} if sigma is None else {"sigma": sigma}
@@ -77,20 +77,6 @@ def read_measurements(
     if has("distance"):
         return Distances(frame, other, q, columns["distance"], **noise)
     return PlaneContacts(frame, other, q, height=columns["height"], **noise)
-
-
-def _columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
-    """Return the numbers of a CSV file by the names of its columns."""
-    with open(path, newline="", encoding="utf-8") as file:
-        head, *lines = [row for row in csv.reader(file) if row and not row[0].startswith("#")] or [[]]
-    names = [name.strip() for name in head]
-    if not lines or len(set(names)) < len(names):
-        raise OsikValueError(f"{path}: a head with different names and at least one line of numbers are expected")
-    try:
-        table = np.array([[float(cell) for cell in line] for line in lines])
-        return dict(zip(names, table.T, strict=True))
-    except ValueError as error:
-        raise OsikValueError(f"{path}: {error}; each line has {len(names)} numbers") from None
 
 
 def _configurations(robot: Robot, joints: dict[str, np.ndarray], path: str) -> np.ndarray:

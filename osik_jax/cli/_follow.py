@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from .._errors import OsikValueError
 from ._messages import told
+from ._pose_file import read_pose_file
 from ._robots import read_robot
 from ._scene import InScene
 
@@ -18,7 +18,7 @@ from ._scene import InScene
 class Follow(InScene):
     """Leads a frame of a robot along the poses of a CSV file, within limits, and writes the timed motion.
 
-    The file has a row a pose: x, y, z [m], or also a quaternion w, x, y, z. A line of column names may come first.
+    The file has a row a pose: x,y,z,qw,qx,qy,qz or x,y,z, world axes [m]. A head with these names may come first.
     """
 
     path: Annotated[Path, tyro.conf.Positional]
@@ -48,7 +48,7 @@ class Follow(InScene):
         with told():
             found = follow(
                 robot,
-                {self.frame: _poses(self.path)},
+                {self.frame: read_pose_file(self.path)},
                 free=None if self.free is None else {self.frame: self.free},
                 speed=self.speed,
                 acceleration=self.acceleration,
@@ -63,19 +63,3 @@ class Follow(InScene):
         for part in found.slow_parts() if self.speed is not None else ():
             print(f"slower from {part.start:.2f} to {part.end:.2f} s: {part.joint} is near its limit of {part.limit}")
         return 0
-
-
-def _poses(path: Path) -> tuple:
-    """Return the positions of a file, and its quaternions or None."""
-    import numpy as np
-
-    with open(path, encoding="utf-8") as file:
-        lines = [line for line in file.read().splitlines() if line.strip()]
-    has_names = bool(lines) and any(character.isalpha() and character not in "eE" for character in lines[0])
-    try:
-        rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[has_names:]])
-    except ValueError as error:
-        raise OsikValueError(f"{path} cannot be read as a table of numbers: {error}") from error
-    if rows.ndim != 2 or rows.shape[1] not in (3, 7):
-        raise OsikValueError(f"{path} has rows of shape {rows.shape[1:]}; a pose is x, y, z or x, y, z, w, x, y, z")
-    return rows[:, :3], rows[:, 3:] if rows.shape[1] == 7 else None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ._messages import CommandError, told, writing
+from ._pose_file import read_pose_file
 from ._robots import read_robot
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class Place:
     frame: str
     """The frame: a link, body, site or geom, carried by hinges and slides."""
     poses: Path
-    """CSV file with a head: x,y,z,qw,qx,qy,qz or x,y,z; a pose a line, world axes [m]."""
+    """CSV file, a row a pose: x,y,z,qw,qx,qy,qz or x,y,z, world axes [m]. A head with these names may come first."""
     x: tuple[float, float, int]
     """First and last coordinate of the bases [m], and how many: -1 1 11."""
     y: tuple[float, float, int]
@@ -60,7 +61,7 @@ class Place:
         with told():
             found = place_base(
                 robot,
-                {self.frame: _read_poses(self.poses)},
+                {self.frame: read_pose_file(self.poses)},
                 x=np.linspace(*self.x),
                 y=np.linspace(*self.y),
                 yaw=self.yaw,
@@ -93,13 +94,3 @@ def _split(text: str, mark: str, kind: type) -> tuple[str, Any]:
         return name, kind(value)
     except ValueError:
         raise CommandError(f"{text}: it is NAME{mark}VALUE") from None
-
-
-def _read_poses(path: Path) -> Any:
-    """Return the positions, and the quaternions if the file has them."""
-    with path.open(encoding="utf-8") as file:
-        names = [name.strip() for name in file.readline().split(",")]
-        rows = np.loadtxt(file, delimiter=",", ndmin=2)
-    if names not in (["x", "y", "z"], ["x", "y", "z", "qw", "qx", "qy", "qz"]) or rows.shape[1:] != (len(names),):
-        raise CommandError(f"{path}: its first line is {','.join(names)}; it is x,y,z,qw,qx,qy,qz or x,y,z")
-    return rows if len(names) == 3 else (rows[:, :3], rows[:, 3:])

@@ -12,6 +12,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from .._errors import OsikValueError, unknown_name
+from ..inverse._poses import read_poses as read_targets
 from ..robot import Robot
 
 _CORNER = np.deg2rad(30.0)
@@ -42,41 +43,12 @@ def read_poses(robot: Robot, given: Mapping[str, Any]) -> dict[str, Poses]:
     for name in given:
         if name not in robot.tree.frame_names:
             raise unknown_name("frame", name, robot.tree.frame_names)
-    poses = {name: _read(name, value) for name, value in given.items()}
-    counts = {name: len(one.position) for name, one in poses.items()}
-    if len(set(counts.values())) > 1:
-        raise OsikValueError(f"frames have different numbers of poses: {counts}")
-    if min(counts.values()) < 2:
+    goal, rows, count = read_targets(robot, given)
+    if count is None or count < 2:
         raise OsikValueError("there is one pose; a path has two or more. inverse_kinematics answers a single one")
-    return poses
-
-
-def _read(name: str, value: Any) -> Poses:
-    position, rotation = value if isinstance(value, tuple) else (value, None)
-    position = np.asarray(position, float)
-    if position.ndim == 3 and position.shape[1:] == (4, 4):
-        position, rotation = position[:, :3, 3], position[:, :3, :3]
-    if position.ndim != 2 or position.shape[1] != 3:
-        raise OsikValueError(
-            f"the poses of {name!r} have shape {position.shape}; they are positions (N, 3), (positions, rotations "
-            "(N, 3, 3) or quaternions w x y z (N, 4)), or matrices (N, 4, 4)"
-        )
-    if rotation is not None:
-        rotation = _rotations(name, np.asarray(rotation, float), len(position))
-    for numbers in (position, rotation):
-        if numbers is not None and not np.isfinite(numbers).all():
-            raise OsikValueError(f"the poses of {name!r} have numbers that are not finite")
-    return Poses(position, rotation)
-
-
-def _rotations(name: str, given: np.ndarray, count: int) -> Float[np.ndarray, "N 3 3"]:
-    if given.shape == (count, 4) and np.linalg.norm(given, axis=1).all():
-        return Rotation.from_quat(given, scalar_first=True).as_matrix()
-    if given.shape == (count, 3, 3):
-        return given
-    raise OsikValueError(
-        f"the orientations of {name!r} have shape {given.shape}; they are ({count}, 4) or ({count}, 3, 3)"
-    )
+    position, rotation = (np.asarray(part, float) for part in goal)
+    parts = zip(given, rows, position.swapaxes(0, 1), rotation.swapaxes(0, 1), strict=True)
+    return {name: Poses(place, turn if all(own) else None) for name, own, place, turn in parts}
 
 
 def lengths(poses: Mapping[str, Poses]) -> Float[np.ndarray, " N"]:

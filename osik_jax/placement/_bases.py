@@ -8,14 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
-from ..collision import CollisionShape, Scene
-from ..collision._convex import shape_table
+from ..collision import Scene
+from ..collision._convex import ConvexShape, shape_table
 from ..collision._core import core_robot, core_scene, gaps_at
 from ..collision._robot_shapes import Given, robot_shapes
-from ..collision._scene import Labels, _convex_shapes, _with
+from ..collision._scene import Labels, _with
 from ..collision._table import RobotShapes
 from ..kinematics._rigid import compose, rotate
 from ..numerics._host import module_of
@@ -39,7 +39,7 @@ def checked_axis(name: str, given: Any) -> Float[np.ndarray, " n"]:
             f"{name} is {type(given).__name__}; it is numbers, such as np.linspace(-1, 1, 11)"
         ) from None
     if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or (np.diff(axis) <= 0.0).any():
-        raise OsikValueError(f"{name} has shape {axis.shape}; it is finite numbers that increase: [0.0, 0.1]")
+        raise OsikValueError(f"{name} is {given!r}; it is finite numbers that increase, such as [0.0, 0.1]")
     return axis
 
 
@@ -85,27 +85,33 @@ def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
 
 
 def base_clearances(
-    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[CollisionShape]
-) -> Float[np.ndarray, " n"]:
-    """Return the distance from the scene to the shapes that stand with the base [m]; infinite if there are none.
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, srdf: Given, footprint: Sequence[ConvexShape]
+) -> tuple[Float[np.ndarray, " n"], list[tuple[str, str]]]:
+    """Return the distance from the scene to the shapes that stand with each base [m], and the nearest object and link.
 
-    These are the robot's shapes that no joint moves, and the footprint. ``Scene.allow`` says what may touch them.
+    These are the robot's shapes that no joint moves, and the footprint; infinite if there are none. ``Scene.allow``
+    says what may touch them.
     """
-    return shape_clearances(robot, bases, scene, _fixed_shapes(robot_shapes(robot, srdf), footprint), robot.q0)
+    shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
+    distance, pairs = shape_clearances(robot, bases, scene, shapes, robot.q0)
+    objects, links = scene.labels.objects, shapes.links
+    return distance, [
+        (objects[max(pair) - len(links)], links[min(pair)]) if min(pair) >= 0 else ("", "") for pair in pairs
+    ]
 
 
 def shape_clearances(
     robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
-) -> Float[np.ndarray, " n"]:
-    """Return the distance of the nearest pair of shapes at each base, with one configuration at all of them [m]."""
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, "n 2"]]:
+    """Return the distance of the nearest pair of shapes at each base [m], and its numbers; q is the same at all."""
     q = np.broadcast_to(q, (len(bases), robot.nq))
     near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
-    return np.asarray(near.distance)
+    return np.asarray(near.distance), np.asarray(near.pair)
 
 
-def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[CollisionShape]) -> RobotShapes:
+def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[ConvexShape]) -> RobotShapes:
     """Return the shapes so that those that no joint moves, and the footprint, meet the scene, and nothing else does."""
-    more = shape_table(_convex_shapes("footprint", footprint))
+    more = shape_table(footprint)
     count, table = len(more.kind), shapes.table
     more = more._replace(first=more.first + len(table.vertices))
     return shapes._replace(

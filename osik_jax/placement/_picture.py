@@ -34,7 +34,7 @@ def draw_placement(found: Any) -> Figure:
     bar.set_label(f"of {len(found.q)} poses reached, best yaw and height [%]", color=_INK)
     for outline in [] if found.scene is None else _outlines(found.scene):
         place.fill(*outline.T, facecolor="none", edgecolor=_INK, linewidth=1.2)
-    place.plot(*found.poses[:, :2].T, ".", color="#c0392b", ms=4, label="poses")
+    place.plot(*found.poses[:, :2].T, ".", color="#c0392b", ms=7, mec="white", mew=0.6, label="poses")
     (x, y, yaw, height), length = found.best, 0.08 * float(np.ptp(place.get_xlim()))
     place.plot(x, y, "o", color=_BEST, ms=9, label=f"best base: {found.is_reached.sum()} poses, height {height:.3g} m")
     place.annotate(
@@ -46,7 +46,9 @@ def draw_placement(found: Any) -> Figure:
     place.set_aspect("equal")
     place.set_xlabel("x [m]", color=_INK)
     place.set_ylabel("y [m]", color=_INK)
-    place.set_title("grey: no pose reached; white: the base does not stand free", fontsize=9, color=_GREY)
+    place.set_title(
+        "grey: no pose reached; white: the base does not stand free, or is not tried", fontsize=9, color=_GREY
+    )
     place.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2)
     return figure
 

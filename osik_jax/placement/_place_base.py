@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -14,11 +15,12 @@ from .._errors import OsikValueError
 from ..collision import CollisionShape, Scene
 from ..collision._core import check_scene
 from ..collision._robot_shapes import Given
-from ..control._checks import check_setting
+from ..collision._scene import _convex_shapes
+from ..control._checks import check_setting, checked_start
 from ..inverse._chain_problem import ChainRoute, search_of
 from ..inverse._chain_search import Goal
 from ..inverse._free import checked_clearance
-from ..inverse._inverse_kinematics import joint_box
+from ..inverse._inverse_kinematics import checked_tolerance, joint_box
 from ..inverse._poses import read_poses
 from ..inverse._seeds import shift_of
 from ..inverse._whole import carried_by
@@ -99,40 +101,44 @@ def place_base(
     check_setting("place_base(robot, poses)", robot, None, 1.0)
     for name, value, least in (("seeds", seeds, 1), ("refine", refine, 0), ("key", key, 0)):
         check_count(name, value, least=least)
-    axes = _axes(x, y, yaw, height)
+    axes, clearance = _axes(x, y, yaw, height), float(checked_clearance(clearance)[0])
     settings = dict(q0=q0, seeds=seeds, key=key, restarts=0, closest=False)
     settings |= dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
     if scene is not None:
         check_scene(scene)
         if scene.is_stack:
             raise OsikValueError("scene is a stack of scenes; give one scene, in world axes")
-        settings |= dict(clearance=float(checked_clearance(clearance)[0]), srdf=srdf)
+        settings |= dict(clearance=clearance, srdf=srdf)
     task = _read_task(robot, poses, scene, settings, key)
-    solid = [footprint] if isinstance(footprint, CollisionShape) else list(footprint)
+    solid = _convex_shapes("footprint", footprint)
 
-    def gaps(bases: np.ndarray) -> np.ndarray:
-        return np.full(len(bases), np.inf) if scene is None else base_clearances(robot, bases, scene, srdf, solid)
+    def gaps(bases: np.ndarray) -> tuple[np.ndarray, list[tuple[str, str]]]:
+        if scene is None:
+            return np.full(len(bases), np.inf), []
+        return base_clearances(robot, bases, scene, srdf, solid)
 
     grid = grid_bases(axes)
-    gap = gaps(grid)
+    gap, pairs = gaps(grid)
     allowed = gap >= clearance
     if not allowed.any():
+        pair = pairs[int(gap.argmax())]
         raise OsikValueError(
-            f"no base of the grid stands free: the best one is {gap.max():.3g} m from the scene. Let the base touch "
-            "what it stands on by scene.allow, or give other x, y or height"
+            f"no base of the grid stands free: at the best one {pair[0]} and {pair[1]} are {gap.max():.3g} m apart. If "
+            f"the base stands on it, let them touch by scene=scene.allow({pair}); else give other x, y or height"
         )
     scores = score_grid(task, grid[allowed])
     best = grid[allowed][_order(*scores.table)[:_BEST]]
     reaches, margin, index = _spread(allowed, (scores.reached, *scores.table[1:]))
-    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases) >= clearance)
+    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases)[0] >= clearance)
     shape, count = tuple(map(len, axes)), len(task.goal.position)
     return Placement(
         robot=robot,
         scene=scene,
-        clearance=float(clearance),
+        clearance=clearance,
         poses=np.asarray(task.goal.position).reshape(-1, 3),
         **dict(zip(AXES, axes, strict=True)),
         base_clearance=gap.reshape(shape),
+        blocked_by=dict(Counter(pair for pair, free in zip(pairs, allowed, strict=False) if not free).most_common()),
         reaches=reaches.reshape(*shape, count),
         too_far=is_too_far(task, grid).sum(1).reshape(shape),
         margin=margin.reshape(shape),
@@ -159,8 +165,9 @@ def _read_task(robot: Robot, poses: Any, scene: Scene | None, settings: dict[str
     frames = tuple(read_frame(robot, name, None, key) for name in poses)
     goal, rows, _ = read_poses(robot, poses)
     lower, upper = joint_box(robot, None)
-    home = jnp.asarray(robot.q0 if settings["q0"] is None else settings["q0"])
-    tolerance = jnp.array([settings["position_tolerance"], settings["orientation_tolerance"]])
+    home = robot.q0 if settings["q0"] is None else checked_start(robot, settings["q0"])
+    sizes = (settings[f"{of}_tolerance"] for of in ("position", "orientation"))
+    tolerance = jnp.stack([checked_tolerance(size, home.dtype) for size in sizes])
     route, own = ChainRoute(tuple(poses), rows), carried_by(robot, lower, upper, frames=tuple(poses))
     shift = shift_of(key, len(own.lower))
     search = search_of(own, route, home, shift, tolerance, 1, warm=False, near=False)

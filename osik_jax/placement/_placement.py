@@ -34,6 +34,7 @@ class Placement:
         yaw: likewise [rad]. (nyaw,)
         height: likewise [m]. (nh,)
         base_clearance: signed distance from the scene to what stands with the base [m]. (nx, ny, nyaw, nh)
+        blocked_by: by the nearest object and link, how many bases of the grid do not stand free; most first.
         reaches: whether each pose is reached; False for bases that do not stand free. All searches are made at the
             eighth of the bases with the most poses. The others have an eighth of them for each pose, and all of them
             for one pose after another until one is missed: so much is sure of each. (nx, ny, nyaw, nh, poses)
@@ -62,6 +63,7 @@ class Placement:
     yaw: Float[np.ndarray, " nyaw"]
     height: Float[np.ndarray, " nh"]
     base_clearance: Float[np.ndarray, "nx ny nyaw nh"]
+    blocked_by: dict[tuple[str, str], int]
     reaches: Bool[np.ndarray, "nx ny nyaw nh poses"]
     too_far: Int[np.ndarray, "nx ny nyaw nh"]
     margin: Float[np.ndarray, "nx ny nyaw nh"]
@@ -127,8 +129,10 @@ class Placement:
             )
         full, free, seeds = int((self.reached == count).sum()), self.stands_free, self.task.settings["seeds"]
         far = int((free & (self.too_far > 0)).sum())
+        pairs = [f"{name} and {link}: {number}" for (name, link), number in self.blocked_by.items()]
+        why = f" ({', '.join(pairs[:3])}{', ...' if len(pairs) > 3 else ''})" if pairs else ""
         lines.append(
-            f"of {free.size} bases of the grid {full} reach all poses, {int((~free).sum())} do not stand free, "
+            f"of {free.size} bases of the grid {full} reach all poses, {int((~free).sum())} do not stand free{why}, "
             f"{far} have a pose out of reach even with all links in one line, "
             f"and {int(free.sum()) - far - full} miss one after {seeds} searches"
         )

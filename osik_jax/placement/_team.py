@@ -145,7 +145,7 @@ class _Member:
     def clear_of(self, others: Sequence[ConvexShape]) -> np.ndarray:
         """Return whether the robot at home keeps the clearance to some shapes, at each of its bases."""
         alone = self.shapes._replace(pairs=np.zeros((0, 2), np.int32), world=np.ones(len(self.shapes.names), bool))
-        gap = shape_clearances(self.task.robot, self.bases, Scene({"others": others}), alone, self.home)
+        gap = shape_clearances(self.task.robot, self.bases, Scene({"others": others}), alone, self.home)[0]
         return gap >= self.task.settings["clearance"]
 
 

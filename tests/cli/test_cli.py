@@ -19,6 +19,7 @@ from urdfs import joint, tree
 import osik_jax as osik
 from osik_jax import cli
 from osik_jax._progress import spoken
+from osik_jax.cli._pose_file import read_pose_file
 from osik_jax.demo import _demo
 from osik_jax.viewer import _opengl
 
@@ -256,3 +257,24 @@ def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch)
     assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
     assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
     assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
+
+
+def test_poses_are_read_with_a_head_in_any_order_and_without_one(tmp_path):
+    path, rows = tmp_path / "poses.csv", np.arange(14.0).reshape(2, 7)
+    for names in ([*"xyz", "qw", "qx", "qy", "qz"], ["qz", "qw", "qx", "qy", "z", "y", "x"], []):
+        order = [["x", "y", "z", "qw", "qx", "qy", "qz"].index(name) for name in names] or [*range(7)]
+        np.savetxt(path, rows[:, order], delimiter=",", header=",".join(names), comments="" if names else "# ")
+        position, quaternion = read_pose_file(path)
+        assert (position == rows[:, :3]).all() and (quaternion == rows[:, 3:]).all()
+    path.write_text("0.1,0.2,0.3\n# by hand\n0.4,0.5,0.6\n")
+    assert (read_pose_file(path) == [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]]).all()
+    for text, message in [
+        ("x,y\n1,2\n", "its columns are x,y"),
+        ("x,y,z\n1,2\n", "each line has 3 numbers"),
+        ("1,2,3,4\n", "its columns are x,y,z,qw"),
+        ("1,2,3,4,5,6,7,8\n", "each line has 7 numbers"),
+        ("x,y,z\n", "at least one line"),
+    ]:
+        path.write_text(text)
+        with pytest.raises(osik.OsikError, match=message):
+            read_pose_file(path)
