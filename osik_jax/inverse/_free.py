@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision._clearance import distances, shape_names
-from ..collision._core import CoreRobot, check_length, check_scene, core_robot, core_scene, require_core
+from ..collision._core import CoreRobot, CoreScene, check_length, check_scene, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
+from ..execution._blocks import first_axes_as_one
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
@@ -136,9 +140,55 @@ def _traced(
     fixed, there, around = jax.lax.stop_gradient((search, goals, obstacles.around))
     dofs, joints = tuple(dof_of_entries(robot)[entries].tolist()), tuple(dof_names(robot))
     counts = jnp.full(len(valid), most, jnp.int32)
-    results = by_core(fixed, there, counts, jnp.int32(steps), how, dofs, joints, around)
+    results = _in_one_call(how, dofs, joints)(fixed, there, counts, jnp.int32(steps), around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
     own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
     gap = distances(robot, obstacles.shapes, own.q, obstacles.scene)[0]
     is_free = own.converged & (gap >= around.clearance[0])
     return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)
+
+
+def _in_one_call(how: Searches, dofs: tuple[int, ...], joints: tuple[str, ...]) -> Callable[..., list[Array]]:
+    """Return ``by_core`` with a rule for ``vmap``: targets and scenes of all lanes in one call.
+
+    Where lanes have starts or settings of their own, one lane is solved after another.
+    """
+
+    @custom_vmap
+    def searched(search: Any, goal: Goal, most: Array, steps: Array, around: Around) -> list[Array]:
+        return by_core(search, goal, most, steps, how, dofs, joints, around)
+
+    @searched.def_vmap
+    def _(lanes: int, batched: list[Any], *given: Any) -> tuple[list[Array], list[bool]]:
+        (search, goal, most, steps, around), targets = given, given[2].shape[-1]
+        alike = batched[0], batched[3], batched[4].robot, batched[4].clearance
+        if any(jax.tree.leaves(alike)):
+            found = _one_after_another(searched, lanes, batched, given)
+            return found, [True] * len(found)
+
+        def together(array: Array, is_batched: bool) -> Array:
+            wide = array if is_batched else array[None]
+            return first_axes_as_one(jnp.broadcast_to(wide, (lanes, targets, *wide.shape[2:])))
+
+        def of_scene(array: Array, is_batched: bool) -> Array:
+            return together(array, is_batched) if is_batched or len(array) > 1 else array
+
+        goal, most = jax.tree.map(together, (goal, most), (batched[1], batched[2]))
+        scene = CoreScene(*map(of_scene, around.scene, batched[4].scene))
+        found = searched(search, goal, most, steps, around._replace(scene=scene))
+        return [a.reshape(lanes, targets, *a.shape[1:]) for a in found], [True] * len(found)
+
+    return searched
+
+
+def _one_after_another(searched: Callable[..., list[Array]], lanes: int, batched: Any, given: Any) -> list[Array]:
+    (leaves, tree), own = jax.tree.flatten(given), jax.tree.leaves(batched)
+    moving = [leaf for leaf, is_own in zip(leaves, own, strict=True) if is_own]
+
+    def one(moving: list[Array]) -> list[Array]:
+        rest = iter(moving)
+        return searched(
+            *tree.unflatten(next(rest) if is_own else leaf for leaf, is_own in zip(leaves, own, strict=True))
+        )
+
+    return jax.lax.map(one, moving)

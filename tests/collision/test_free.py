@@ -198,6 +198,53 @@ def test_gradients_through_the_search_and_inside_jit(panda, problems):
     np.testing.assert_allclose(many[0][1], q, atol=1e-6)
 
 
+def test_the_first_call_of_a_robot_may_be_inside_jit():
+    """Its shapes are made there, from numbers that are known."""
+    scene, q0 = osik.Scene({"post": board([0.05, 0.05, 0.5], [0.35, 0.25, 0.5])}), np.zeros(6)
+    arm, pose = osik.load_robot("ur5"), {"tool0": (np.array([0.5, 0.1, 0.4]), DOWN)}
+    found = jax.jit(lambda q0: osik.inverse_kinematics(arm, pose, q0=q0, scene=scene))(q0)
+    assert found.converged and osik.is_free(arm, found.q, scene)
+    arm = osik.load_robot("ur5")
+    inside = jax.jit(lambda q: osik.clearance(arm, q, scene).distance)(found.q)
+    np.testing.assert_allclose(inside, osik.clearance(arm, found.q, scene).distance, atol=1e-12)
+    arm = osik.load_robot("ur5")
+
+    @jax.jit
+    def lower(q):
+        limit = osik.CollisionAvoidanceLimit(arm, scene=scene, q0_distance=0.0)
+        return limit.rows(arm, osik.forward_kinematics(arm, q), q, 0.01).lower
+
+    assert (np.asarray(lower(found.q)) > -np.inf).any()
+
+
+@pytest.mark.slow
+def test_a_batch_inside_jit_is_one_call(panda, problems):
+    """Targets alone, and each with a scene: as one by one. Starts of their own are solved one after another."""
+    scenes, places, turns = zip(*problems[:3], strict=True)
+    stack, places, turns = osik.Scene.stack(scenes), np.stack(places), np.stack(turns)
+
+    def at(scene, place, turn, q0):
+        pose = {"panda_hand": (place, turn)}
+        found = osik.inverse_kinematics(panda, pose, scene=scene, q0=q0, clearance=0.002)
+        return found.q, found.converged, found.clearance
+
+    home = jnp.asarray(panda.q0)
+    starts = home + 0.1 * np.arange(3)[:, None]
+    one = jax.jit(at)
+    for axes, q0 in (((None, 0, 0, None), home), ((0, 0, 0, None), home), ((0, 0, 0, 0), starts)):
+        given = stack if axes[0] == 0 else scenes[0]
+        program = jax.jit(jax.vmap(at, axes)).lower(given, places, turns, q0).compile()
+        text = program.as_text() or ""
+        calls = [line for line in text.splitlines() if "custom-call" in line and "osik_free_find" in line]
+        assert len(calls) == 1 and f"f64[{1 if axes[3] == 0 else 3},7]" in calls[0]  # configurations of a call
+        found = program(given, places, turns, q0)
+        for k in range(3):
+            scene, start = scenes[k if axes[0] == 0 else 0], q0[k] if axes[3] == 0 else q0
+            for got, wanted in zip(found, one(scene, places[k], turns[k], start), strict=True):
+                np.testing.assert_allclose(got[k], wanted, atol=1e-8)
+        assert found[1].any()
+
+
 def test_all_and_nearest_are_free(panda, problems):
     scene, place, turn = problems[0]
     arm = osik.load_robot("ur5")
