@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikValueError
 from ..collision._clearance import distances, shape_names
 from ..collision._core import CoreRobot, CoreScene, check_length, check_scene, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
 from ..execution._blocks import first_axes_as_one
+from ..limits import CollisionAvoidanceLimit, Limit
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
@@ -29,8 +30,13 @@ from ._chain_search import Goal
 from ._fixed import Explored, Searches, or_far, with_placeholders
 from ._run import split
 from ._solution import InverseKinematicsSolution, with_fields
+from ._task_search import CLEAR
 from ._whole import Around, Whole, by_core, named, whole
 
+_SURE = 1e-6
+"""Distance beyond the clearance, against rounding [m]."""
+EVERY_SOLUTION = 3
+"""``InverseKinematicsSolution.obstruction`` where something is in the way of the best configuration."""
 SEEDS = 256
 """Searches for a target, to begin with: free solutions can be one in a hundred."""
 
@@ -56,20 +62,15 @@ class Obstacles(NamedTuple):
         return self.scene.is_stack
 
 
-def read_obstacles(robot: Robot, route: Any, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
+def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
     """Return the obstacles of a search.
 
     Raises:
         OsikError: there is no core for this device.
-        TypeError, ValueError: tasks, or limits with rows, instead of poses; a clearance that is negative.
+        TypeError, ValueError: no scene; a clearance that is negative.
     """
     require_core("inverse_kinematics with a scene")
     check_scene(scene)
-    if not isinstance(route, ChainRoute):
-        raise OsikTypeError(
-            "scene= goes with poses of frames that hinges and slides carry, and with limits of joints; tasks, a scheme "
-            "or a free base take a CollisionAvoidanceLimit"
-        )
     shapes, own = _known(robot, srdf, route=route)
     return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
 
@@ -118,11 +119,59 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
-    pairs, own, rows = np.asarray(results.pair), obstacles.shapes.names, obstacles.scene.names
-    names = [shape_names(own, rows, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
-    kinds = {pair: k for k, pair in enumerate(dict.fromkeys(names))}
-    number = np.array([kinds[pair] for pair in names], np.int32).reshape(pairs.shape[:-1])
-    return with_fields(results.answer, nearest_pair=number, pairs=tuple(kinds), obstruction=results.reason)
+    names = _pair_fields(np.asarray(results.pair), obstacles.shapes, obstacles.scene)
+    return with_fields(results.answer, **names, obstruction=results.reason)
+
+
+def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
+    """Return the fields of an answer that name its nearest pairs."""
+    named = [shape_names(shapes.names, scene.names, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
+    kinds = {pair: k for k, pair in enumerate(dict.fromkeys(named))}
+    number = np.array([kinds[pair] for pair in named], np.int32).reshape(pairs.shape[:-1])
+    return dict(nearest_pair=number, pairs=tuple(kinds))
+
+
+def find_free_by_steps(
+    robot: Robot,
+    solve: Callable[..., InverseKinematicsSolution],
+    limits: Sequence[Limit],
+    scene: Scene,
+    clearance: Any,
+    srdf: Given,
+    position_tolerance: Any,
+) -> InverseKinematicsSolution:
+    """Return free configurations for tasks, a scheme or a free base: steps keep off the nearest pairs.
+
+    Args:
+        robot: the robot.
+        solve: ``inverse_kinematics`` of the tasks, without limits.
+        limits: the user's.
+        scene: the obstacles.
+        clearance: distance that all pairs keep [m].
+        srdf: pairs that may touch.
+        position_tolerance: of the tasks [m]; rows of limits may be off by a part of it.
+
+    Raises:
+        OsikError: there is no core for this device.
+        TypeError, ValueError: no scene, or a stack of scenes; a clearance that is negative.
+    """
+    check_scene(scene)
+    if scene.is_stack:
+        raise OsikValueError(
+            "tasks take one scene for all targets, and this is a stack of scenes: call for each of them"
+        )
+    least = checked_clearance(clearance)[0]
+    apart = least + CLEAR * position_tolerance + _SURE
+    limit = CollisionAvoidanceLimit(robot, scene=scene, srdf=srdf, minimum_distance=apart, q0_distance=-np.inf)
+    found, shapes = solve(limits=(*limits, limit)), robot_shapes(robot, srdf)
+    gap, pair = distances(robot, shapes, found.q.reshape(-1, robot.nq), scene)
+    gap, pair = gap.reshape(found.converged.shape), pair.reshape(*found.converged.shape, 2)
+    is_free = found.converged & (gap >= least)
+    reason = jnp.where(is_free | (gap >= apart + _SURE), 0, EVERY_SOLUTION).astype(jnp.int32)
+    names: dict[str, Any] = dict(nearest_pair=None, pairs=())
+    if not is_traced((found.q, scene)):
+        names = _pair_fields(np.asarray(pair), shapes, scene)
+    return with_fields(found, converged=is_free, clearance=gap, obstruction=reason, **names)
 
 
 def _traced(
