@@ -62,6 +62,10 @@ def _scenes_for_targets() -> Any:
     return _free(osik.Scene.stack([_scene(), _scene()]), poses)
 
 
+def _scenes_for_tasks() -> Any:
+    return _free(osik.Scene.stack([_scene()]), {"p": osik.FrameTask(ur5(), "tool0")})
+
+
 def _clearance_alone() -> Any:
     return osik.inverse_kinematics(ur5(), {"tool0": ([0.5, 0.1, 0.4], [0.0, 1.0, 0.0, 0.0])}, clearance=0.01)
 
@@ -248,7 +252,7 @@ def limits(add: Add) -> None:
     add("a clearance for each target", lambda: _free(clearance=[0.0, 0.1]), V, "one number")
     add("a clearance without a scene", _clearance_alone, V, "scene")
     add("two scenes for three targets", _scenes_for_targets, V, "2 scenes and 3 targets")
-    add("a scene for tasks", lambda: _free(poses={"p": osik.FrameTask(ur5(), "tool0")}), T, "CollisionAvoidanceLimit")
+    add("scenes for tasks", _scenes_for_tasks, V, "one scene for all targets")
     add("an SRDF that is not there", lambda: _free(srdf="none.srdf"), FileNotFoundError, "none.srdf")
     add("an SRDF of broken text", lambda: _free(srdf="<robot"), V, "broken XML")
     add("clearance of q of another length", lambda: osik.clearance(ur5(), np.zeros(7), _scene()), V, "6 entries")

@@ -64,7 +64,6 @@ def told() -> Iterator[None]:
 
 def _as_options(text: str) -> str:
     """Return a message with arguments of Python as options of the command line."""
-    text = text.replace("scene= goes", "--scene goes")
     return text.replace("floating_base=False", "--base fixed").replace("floating_base=True", "--base floating")
 
 

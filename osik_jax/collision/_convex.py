@@ -76,7 +76,7 @@ def geom_shape(robot: Robot, number: int) -> ConvexShape:
         FileNotFoundError, ValueError: the file of a mesh cannot be read.
     """
     leaves = robot.geom_size, robot.geom_position, robot.geom_rotation
-    size, position, rotation = (np.asarray(leaf[number], float) for leaf in leaves)
+    size, position, rotation = (np.asarray(leaf, float)[number] for leaf in leaves)
     model, kind = robot.mj_model, robot.tree.geom_types[number]
     if kind != mujoco.mjtGeom.mjGEOM_MESH:
         return _simple(kind, size, position, rotation)

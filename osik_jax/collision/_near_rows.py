@@ -49,11 +49,13 @@ class KeptShapes:
 @remembered
 def kept_shapes(robot: Robot, shapes: RobotShapes, *, least: float) -> KeptShapes:
     """Return the shapes of a robot without the pairs that are nearer than ``least`` [m] at its ``q0``."""
-    every, none = KeptShapes(robot, shapes, np.zeros((0, 2), np.int32)), Scene({})
+    every = KeptShapes(robot, shapes, np.zeros((0, 2), np.int32))
     if not np.isfinite(least) or not len(shapes.pairs):
         return every
-    found = _nearest(every, home_kinematics(robot), none, [least, least, 0.0, 0.0, 1.0], len(shapes.pairs))
-    near = np.asarray(found.pair)[np.isfinite(found.distance), 2:]
+    with jax.ensure_compile_time_eval():  # the limit may be made inside a program
+        numbers, home = [least, least, 0.0, 0.0, 1.0], home_kinematics(robot)
+        found = _nearest(every, home, Scene({}), numbers, len(shapes.pairs))
+        near = np.asarray(found.pair)[np.isfinite(found.distance), 2:]
     return KeptShapes(robot, shapes, near) if len(near) else every
 
 

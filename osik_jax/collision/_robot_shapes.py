@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from typing import Any, Literal
 
+import jax
 import numpy as np
 
 from .._errors import OsikTypeError, OsikValueError, warn
@@ -55,10 +56,11 @@ def robot_shapes(robot: Robot, srdf: Given = None) -> RobotShapes:
         raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)
-    if srdf is None or isinstance(srdf, Srdf):
-        return _made(robot, srdf)
-    is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
-    return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
+    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has the robot as a constant
+        if srdf is None or isinstance(srdf, Srdf):
+            return _made(robot, srdf)
+        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
+        return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
 
 
 def covering_spheres(robot: Robot, given: Spheres | str | os.PathLike[str] | None = None) -> CoveringSpheres:

@@ -87,9 +87,7 @@ def _warn_once() -> None:
         warn(core().reason)
 
 
-def call(
-    method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, space: int = 0, vmap: str | None = None
-) -> list[Array]:
+def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, space: int = 0) -> list[Array]:
     """Call a method of the core on a batch of problems through XLA's FFI.
 
     There is no rule for ``vmap``: call it in a function under ``in_lanes``, which hands over a whole batch at once.
@@ -99,7 +97,6 @@ def call(
         outputs: shape and type of each result: float (double precision in the core) or int (int32).
         inputs: arrays; floats are passed in double precision, integers and flags as int32.
         space: numbers of workspace, for methods of ``core/kinematic_calls.hpp``.
-        vmap: rule of JAX's FFI for ``vmap``, such as "sequential".
 
     Returns:
         The results; floats in the precision of the first float among the inputs.
@@ -109,9 +106,7 @@ def call(
     with jax.enable_x64(True):
         wide = [a.astype(_kind(jnp.asarray(a).dtype)) for a in map(jnp.asarray, inputs)]
         shapes = [jax.ShapeDtypeStruct(shape, _kind(jnp.dtype(kind))) for shape, kind in outputs]
-        results = jax.ffi.ffi_call(name, shapes, vmap_method=vmap)(
-            *wide, **({"space": np.int32(space)} if space else {})
-        )
+        results = jax.ffi.ffi_call(name, shapes)(*wide, **({"space": np.int32(space)} if space else {}))
         return [a.astype(given) if a.dtype == jnp.float64 else a for a in results]
 
 

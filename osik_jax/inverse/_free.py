@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
+from jaxtyping import Array, Int
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikValueError
 from ..collision._clearance import distances, shape_names
-from ..collision._core import CoreRobot, check_length, check_scene, core_robot, core_scene, require_core
+from ..collision._core import CoreRobot, CoreScene, check_length, check_scene, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
+from ..execution._blocks import first_axes_as_one
+from ..limits import CollisionAvoidanceLimit, Limit
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
@@ -25,8 +30,13 @@ from ._chain_search import Goal
 from ._fixed import Explored, Searches, or_far, with_placeholders
 from ._run import split
 from ._solution import InverseKinematicsSolution, with_fields
+from ._task_search import CLEAR
 from ._whole import Around, Whole, by_core, named, whole
 
+_SURE = 1e-6
+"""Distance beyond the clearance, against rounding [m]."""
+EVERY_SOLUTION = 3
+"""``InverseKinematicsSolution.obstruction`` where something is in the way of the best configuration."""
 SEEDS = 256
 """Searches for a target, to begin with: free solutions can be one in a hundred."""
 
@@ -52,20 +62,15 @@ class Obstacles(NamedTuple):
         return self.scene.is_stack
 
 
-def read_obstacles(robot: Robot, route: Any, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
+def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
     """Return the obstacles of a search.
 
     Raises:
         OsikError: there is no core for this device.
-        TypeError, ValueError: tasks, or limits with rows, instead of poses; a clearance that is negative.
+        TypeError, ValueError: no scene; a clearance that is negative.
     """
     require_core("inverse_kinematics with a scene")
     check_scene(scene)
-    if not isinstance(route, ChainRoute):
-        raise OsikTypeError(
-            "scene= goes with poses of frames that hinges and slides carry, and with limits of joints; tasks, a scheme "
-            "or a free base take a CollisionAvoidanceLimit"
-        )
     shapes, own = _known(robot, srdf, route=route)
     return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
 
@@ -116,11 +121,59 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
-    pairs, own, rows = np.asarray(results.pair), obstacles.shapes.names, obstacles.scene.names
-    names = [shape_names(own, rows, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
-    kinds = {pair: k for k, pair in enumerate(dict.fromkeys(names))}
-    number = np.array([kinds[pair] for pair in names], np.int32).reshape(pairs.shape[:-1])
-    return with_fields(results.answer, nearest_pair=number, pairs=tuple(kinds), obstruction=results.reason)
+    names = _pair_fields(np.asarray(results.pair), obstacles.shapes, obstacles.scene)
+    return with_fields(results.answer, **names, obstruction=results.reason)
+
+
+def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
+    """Return the fields of an answer that name its nearest pairs."""
+    named = [shape_names(shapes.names, scene.names, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
+    kinds = {pair: k for k, pair in enumerate(dict.fromkeys(named))}
+    number = np.array([kinds[pair] for pair in named], np.int32).reshape(pairs.shape[:-1])
+    return dict(nearest_pair=number, pairs=tuple(kinds))
+
+
+def find_free_by_steps(
+    robot: Robot,
+    solve: Callable[..., InverseKinematicsSolution],
+    limits: Sequence[Limit],
+    scene: Scene,
+    clearance: Any,
+    srdf: Given,
+    position_tolerance: Any,
+) -> InverseKinematicsSolution:
+    """Return free configurations for tasks, a scheme or a free base: steps keep off the nearest pairs.
+
+    Args:
+        robot: the robot.
+        solve: ``inverse_kinematics`` of the tasks, without limits.
+        limits: the user's.
+        scene: the obstacles.
+        clearance: distance that all pairs keep [m].
+        srdf: pairs that may touch.
+        position_tolerance: of the tasks [m]; rows of limits may be off by a part of it.
+
+    Raises:
+        OsikError: there is no core for this device.
+        TypeError, ValueError: no scene, or a stack of scenes; a clearance that is negative.
+    """
+    check_scene(scene)
+    if scene.is_stack:
+        raise OsikValueError(
+            "tasks take one scene for all targets, and this is a stack of scenes: call for each of them"
+        )
+    least = checked_clearance(clearance)[0]
+    apart = least + CLEAR * position_tolerance + _SURE
+    limit = CollisionAvoidanceLimit(robot, scene=scene, srdf=srdf, minimum_distance=apart, q0_distance=-np.inf)
+    found, shapes = solve(limits=(*limits, limit)), robot_shapes(robot, srdf)
+    gap, pair = distances(robot, shapes, found.q.reshape(-1, robot.nq), scene)
+    gap, pair = gap.reshape(found.converged.shape), pair.reshape(*found.converged.shape, 2)
+    is_free = found.converged & (gap >= least)
+    reason = jnp.where(is_free | (gap >= apart + _SURE), 0, EVERY_SOLUTION).astype(jnp.int32)
+    names: dict[str, Any] = dict(nearest_pair=None, pairs=())
+    if not is_traced((found.q, scene)):
+        names = _pair_fields(np.asarray(pair), shapes, scene)
+    return with_fields(found, converged=is_free, clearance=gap, obstruction=reason, **names)
 
 
 def _traced(
@@ -138,9 +191,55 @@ def _traced(
     fixed, there, around = jax.lax.stop_gradient((search, goals, obstacles.around))
     dofs, joints = tuple(dof_of_entries(robot)[entries].tolist()), tuple(dof_names(robot))
     counts = jnp.full(len(valid), most, jnp.int32)
-    results = by_core(fixed, there, counts, jnp.int32(steps), how, dofs, joints, around)
+    results = _in_one_call(how, dofs, joints)(fixed, there, counts, jnp.int32(steps), around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
     own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
     gap = distances(robot, obstacles.shapes, own.q, obstacles.scene)[0]
     is_free = own.converged & (gap >= around.clearance[0])
     return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)
+
+
+def _in_one_call(how: Searches, dofs: tuple[int, ...], joints: tuple[str, ...]) -> Callable[..., list[Array]]:
+    """Return ``by_core`` with a rule for ``vmap``: targets and scenes of all lanes in one call.
+
+    Where lanes have starts or settings of their own, one lane is solved after another.
+    """
+
+    @custom_vmap
+    def searched(search: Any, goal: Goal, most: Array, steps: Array, around: Around) -> list[Array]:
+        return by_core(search, goal, most, steps, how, dofs, joints, around)
+
+    @searched.def_vmap
+    def _(lanes: int, batched: list[Any], *given: Any) -> tuple[list[Array], list[bool]]:
+        (search, goal, most, steps, around), targets = given, given[2].shape[-1]
+        alike = batched[0], batched[3], batched[4].robot, batched[4].clearance
+        if any(jax.tree.leaves(alike)):
+            found = _one_after_another(searched, lanes, batched, given)
+            return found, [True] * len(found)
+
+        def together(array: Array, is_batched: bool) -> Array:
+            wide = array if is_batched else array[None]
+            return first_axes_as_one(jnp.broadcast_to(wide, (lanes, targets, *wide.shape[2:])))
+
+        def of_scene(array: Array, is_batched: bool) -> Array:
+            return together(array, is_batched) if is_batched or len(array) > 1 else array
+
+        goal, most = jax.tree.map(together, (goal, most), (batched[1], batched[2]))
+        scene = CoreScene(*map(of_scene, around.scene, batched[4].scene))
+        found = searched(search, goal, most, steps, around._replace(scene=scene))
+        return [a.reshape(lanes, targets, *a.shape[1:]) for a in found], [True] * len(found)
+
+    return searched
+
+
+def _one_after_another(searched: Callable[..., list[Array]], lanes: int, batched: Any, given: Any) -> list[Array]:
+    (leaves, tree), own = jax.tree.flatten(given), jax.tree.leaves(batched)
+    moving = [leaf for leaf, is_own in zip(leaves, own, strict=True) if is_own]
+
+    def one(moving: list[Array]) -> list[Array]:
+        rest = iter(moving)
+        return searched(
+            *tree.unflatten(next(rest) if is_own else leaf for leaf, is_own in zip(leaves, own, strict=True))
+        )
+
+    return jax.lax.map(one, moving)

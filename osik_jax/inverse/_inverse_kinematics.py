@@ -33,7 +33,7 @@ from ._branches import Coordinates, all_solutions
 from ._chain_problem import ChainRoute, Settings
 from ._fixed import Explored, Searches
 from ._free import SEEDS as FREE_SEEDS
-from ._free import find_free, read_obstacles
+from ._free import find_free, find_free_by_steps, read_obstacles
 from ._host import in_chunks
 from ._problem import read_problem
 from ._run import explored, explored_by_core, found_at_once, isolated_at_answers, searched, searched_on
@@ -124,7 +124,7 @@ def inverse_kinematics(
             quicker where many targets are out of reach and only ``converged`` is wanted.
         scene: obstacles. Only a configuration in which nothing touches is a solution then: no shape of the robot
             comes nearer than ``clearance`` to the scene or to another shape of the robot. A scene with a leading axis
-            has one for each target. For poses of frames that hinges and slides carry, on a CPU, with the compiled core.
+            has one for each target, for poses of frames that hinges and slides carry. On a CPU, with the compiled core.
             Default: none, and shapes of the robot may touch.
         clearance: smallest distance of all pairs of shapes [m].
         srdf: pairs that may touch, besides those of neighbouring bodies: path or text of an SRDF; ``True``: the file
@@ -155,6 +155,12 @@ def inverse_kinematics(
         [checked_tolerance(position_tolerance, dtype), checked_tolerance(orientation_tolerance, dtype)]
     )
     route = problem.route
+    if scene is not None and not isinstance(route, ChainRoute):
+        more: dict[str, Any] = dict(targets=targets, scheme=scheme, q0=q0, seeds=seeds, key=key, nearest=nearest)
+        more |= dict(all=all, steps=steps, restarts=restarts, closest=closest)
+        more |= dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
+        solve = partial(inverse_kinematics, robot, tasks, **more)
+        return find_free_by_steps(robot, solve, limits or (), scene, clearance, srdf, position_tolerance)
     once = (_SEEDS if scene is None else FREE_SEEDS) if seeds is None else seeds
     seeds = default_seeds(len(route.entries(robot)), nearest or all) if seeds is None else seeds
     check_count("seeds", seeds)
@@ -167,7 +173,7 @@ def inverse_kinematics(
     if scene is None and (srdf is not None or not (isinstance(clearance, float | int) and clearance == 0.0)):
         raise OsikValueError("clearance and srdf go with a scene: Scene({}) has the robot's own shapes alone")
     how, given = Searches(seeds, warm=q0 is not None, near=nearest, every=all), (robot, problem.goals, settings)
-    if scene is not None:
+    if scene is not None and isinstance(route, ChainRoute):
         obstacles = read_obstacles(robot, route, scene, clearance, srdf)
         many = problem.many or obstacles.many
         results = find_free(*given, once * (1 + restarts), steps, how, obstacles, single=not (many or all))

@@ -121,7 +121,8 @@ class TaskRoute(NamedTuple):
         q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
         here = jax.lax.stop_gradient(q)
         residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(search, q, goal))(q, goal)
-        limit = next((limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit)), None)
+        avoiding = (limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit))
+        limit = next((limit for limit in avoiding if limit.scene is None), None)  # names of a scene are unknown in here
         clearance, pair = (None, None) if limit is None else jax.vmap(lambda q: _clearance(robot, limit, q))(here)
         return InverseKinematicsSolution(
             q=q,

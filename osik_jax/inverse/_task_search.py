@@ -41,7 +41,7 @@ _LOOK, _MOST, _PROGRESS = 20, 400, 1e-4
 """Search for a local optimum: steps between checks, most steps, and the least relative decrease of the cost."""
 _RADIAN = 0.1
 """Length that a radian of a task's error counts as [m], where rows are compared."""
-_CLEAR = 0.1
+CLEAR = 0.1
 """Fraction of the position tolerance by which limits with rows may be off."""
 _SPREADS = 8
 """Searches start at this many distances from the first configuration, in turn."""
@@ -169,7 +169,7 @@ class TaskSearch(eqx.Module):
         sizes = [sizes_of(goals[name], own) for name, own in rows.items()]
         position, orientation = (jnp.max(jnp.stack(part)) for part in zip(*sizes, strict=True))
         score = jnp.maximum(position / self.tolerance[0], orientation / self.tolerance[1])
-        score = jnp.maximum(score, self._beyond_limits(kinematics, q) / (_CLEAR * self.tolerance[0]))
+        score = jnp.maximum(score, self._beyond_limits(kinematics, q) / (CLEAR * self.tolerance[0]))
         cost = sum((p / self.tolerance[0]) ** 2 + (o / self.tolerance[1]) ** 2 for p, o in sizes)
         return rows, Errors(position, orientation, score, jnp.asarray(cost))
 
@@ -181,9 +181,7 @@ class TaskSearch(eqx.Module):
             _ABOVE ** (len(levels) - 1 - levels.index(rank[name])) * jnp.sum(own.weight * own.pull**2)
             for name, own in rows.items()
         ]
-        beyond = jnp.maximum(
-            self._beyond_limits(forward_kinematics(self.robot, q), q) - _CLEAR * self.tolerance[0], 0.0
-        )
+        beyond = jnp.maximum(self._beyond_limits(forward_kinematics(self.robot, q), q) - CLEAR * self.tolerance[0], 0.0)
         return sum(squares, _ABOVE ** len(levels) * beyond**2)
 
     def _beyond_limits(self, kinematics: Kinematics, q: Float[Array, " nq"]) -> Float[Array, ""]:

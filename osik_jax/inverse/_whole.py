@@ -198,7 +198,6 @@ def by_core(
         *(method, shapes, goals, most, jnp.concatenate([jnp.ravel(a) for a in numbers])),
         *(integers_of(search, 0), jnp.concatenate([jnp.array(a, jnp.int32) for a in options])),
         *more,
-        vmap="sequential",
     )
 
 

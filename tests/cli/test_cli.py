@@ -232,8 +232,6 @@ def test_ik_keeps_off_a_scene_or_says_what_is_in_the_way(tmp_path, capsys):
     assert "--clearance goes with --scene" in refused(capsys, *wanted[:-2], "--clearance", "0.1")
     assert "no scene: there are" in refused(capsys, *wanted[:-1], str(tmp_path / "scene.stl"))
     assert "clearance is -1.0" in refused(capsys, *wanted, "--clearance", "-1")
-    standing = "ik", "nao", "--frame", "l_gripper", "--position", "0.15", "0.12", "0.35", "--scene", str(scene)
-    assert "--scene goes with poses" in refused(capsys, *standing)
 
 
 def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):

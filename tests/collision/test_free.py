@@ -198,6 +198,53 @@ def test_gradients_through_the_search_and_inside_jit(panda, problems):
     np.testing.assert_allclose(many[0][1], q, atol=1e-6)
 
 
+def test_the_first_call_of_a_robot_may_be_inside_jit():
+    """Its shapes are made there, from numbers that are known."""
+    scene, q0 = osik.Scene({"post": board([0.05, 0.05, 0.5], [0.35, 0.25, 0.5])}), np.zeros(6)
+    arm, pose = osik.load_robot("ur5"), {"tool0": (np.array([0.5, 0.1, 0.4]), DOWN)}
+    found = jax.jit(lambda q0: osik.inverse_kinematics(arm, pose, q0=q0, scene=scene))(q0)
+    assert found.converged and osik.is_free(arm, found.q, scene)
+    arm = osik.load_robot("ur5")
+    inside = jax.jit(lambda q: osik.clearance(arm, q, scene).distance)(found.q)
+    np.testing.assert_allclose(inside, osik.clearance(arm, found.q, scene).distance, atol=1e-12)
+    arm = osik.load_robot("ur5")
+
+    @jax.jit
+    def lower(q):
+        limit = osik.CollisionAvoidanceLimit(arm, scene=scene, q0_distance=0.0)
+        return limit.rows(arm, osik.forward_kinematics(arm, q), q, 0.01).lower
+
+    assert (np.asarray(lower(found.q)) > -np.inf).any()
+
+
+@pytest.mark.slow
+def test_a_batch_inside_jit_is_one_call(panda, problems):
+    """Targets alone, and each with a scene: as one by one. Starts of their own are solved one after another."""
+    scenes, places, turns = zip(*problems[:3], strict=True)
+    stack, places, turns = osik.Scene.stack(scenes), np.stack(places), np.stack(turns)
+
+    def at(scene, place, turn, q0):
+        pose = {"panda_hand": (place, turn)}
+        found = osik.inverse_kinematics(panda, pose, scene=scene, q0=q0, clearance=0.002)
+        return found.q, found.converged, found.clearance
+
+    home = jnp.asarray(panda.q0)
+    starts = home + 0.1 * np.arange(3)[:, None]
+    one = jax.jit(at)
+    for axes, q0 in (((None, 0, 0, None), home), ((0, 0, 0, None), home), ((0, 0, 0, 0), starts)):
+        given = stack if axes[0] == 0 else scenes[0]
+        program = jax.jit(jax.vmap(at, axes)).lower(given, places, turns, q0).compile()
+        text = program.as_text() or ""
+        calls = [line for line in text.splitlines() if "custom-call" in line and "osik_free_find" in line]
+        assert len(calls) == 1 and f"f64[{1 if axes[3] == 0 else 3},7]" in calls[0]  # configurations of a call
+        found = program(given, places, turns, q0)
+        for k in range(3):
+            scene, start = scenes[k if axes[0] == 0 else 0], q0[k] if axes[3] == 0 else q0
+            for got, wanted in zip(found, one(scene, places[k], turns[k], start), strict=True):
+                np.testing.assert_allclose(got[k], wanted, atol=1e-8)
+        assert found[1].any()
+
+
 def test_all_and_nearest_are_free(panda, problems):
     scene, place, turn = problems[0]
     arm = osik.load_robot("ur5")
@@ -277,8 +324,6 @@ def test_wrong_arguments_are_refused(panda, problems):
     two, stack = {"panda_hand": (np.stack([place] * 2), np.stack([turn] * 2))}, osik.Scene.stack([scene] * 3)
     refuses(ValueError, "clearance is -0.1; it is one number, 0 or more", solve, pose, scene=scene, clearance=-0.1)
     refuses(ValueError, "there are 3 scenes and 2 targets", solve, two, scene=stack)
-    task = {"tool": osik.FrameTask(panda, "panda_hand")}
-    refuses(TypeError, "scene= goes with poses of frames", solve, task, scene=scene)
     refuses(ValueError, "the last axis has the robot's 7 entries", osik.is_free, panda, np.zeros(6), scene)
     refuses(ValueError, "there are 3 scenes and 2 configurations", osik.clearance, panda, np.zeros((2, 7)), stack)
     refuses(TypeError, "scene is a dict", osik.clearance, panda, np.zeros(7), {})
@@ -291,3 +336,45 @@ def test_bad_configurations_are_not_free_and_harm_no_others(panda, problems):
     assert np.isnan(found.distance[1]) and found.distance[0] == found.distance[2]
     free = osik.is_free(panda, q, scene)
     assert not free[1] and free[0] == free[2] == (found.distance[0] >= 0)
+
+
+@pytest.mark.slow
+def test_tasks_are_met_in_free_configurations(panda):
+    """By steps of a scheme: a hand with a preference, judged by ``is_free``; the last target is inside an obstacle."""
+    scene = osik.Scene({"wall": board([0.02, 0.5, 0.5], [0.35, 0.0, 0.5]), "floor": board([1, 1, 0.1], [0, 0, -0.16])})
+    places = np.random.default_rng(1).uniform([0.45, -0.3, 0.2], [0.55, 0.3, 0.6], (12, 3))
+    places[-1] = [0.35, 0.0, 0.5]
+    tasks = {"hand": osik.FrameTask(panda, "panda_hand", rows="position"), "posture": osik.PostureTask(panda)}
+    targets, solve = {"hand": (places, np.tile(np.eye(3), (12, 1, 1)))}, partial(osik.inverse_kinematics, panda)
+    found = solve(tasks, targets=targets, scene=scene, clearance=0.005, closest=False, restarts=1)
+    met = np.asarray(found.converged)
+    assert met.sum() >= 8 and (np.asarray(found.obstruction)[met] == 0).all()
+    assert osik.is_free(panda, found.q[met], scene, 0.005).all()
+    np.testing.assert_allclose(found.clearance, osik.clearance(panda, found.q, scene).distance, atol=1e-12)
+    hands = jax.vmap(lambda q: osik.forward_kinematics(panda, q).frame_pose(panda, "panda_hand")[0])(found.q)
+    np.testing.assert_allclose(hands[met], places[met], atol=1e-3)
+    assert not met[-1] and found.obstruction[-1] == 3 and "wall" in found.explain(11)
+    refuses(ValueError, "one scene for all targets", solve, tasks, scene=osik.Scene.stack([scene, scene]))
+
+
+@pytest.mark.release
+def test_a_standing_g1_reaches_into_a_shelf_and_keeps_its_balance():
+    robot = osik.load_robot("g1")
+    home, feet = osik.forward_kinematics(robot, robot.q0), ("left_ankle_roll_link", "right_ankle_roll_link")
+    soles = {foot: home.frame_pose(robot, foot) for foot in feet}
+    middle = np.mean([np.asarray(pose[0]) for pose in soles.values()], 0)
+    low, high = middle[:2] + np.array([-0.03, -0.1]), middle[:2] + np.array([0.09, 0.1])
+    tasks = {foot: osik.FrameTask(robot, foot, target=pose) for foot, pose in soles.items()}
+    tasks["hand"] = osik.FrameTask(robot, "right_rubber_hand", rows="position")
+    tasks["balance"] = osik.ComTask(robot, axes="xy", lower=low, upper=high)
+    tasks["posture"] = osik.PostureTask(robot)
+    boards = {"low": ([0.15, 0.4, 0.01], [0.5, 0.0, 0.65]), "high": ([0.15, 0.4, 0.01], [0.5, 0.0, 1.1])}
+    boards |= {"left": ([0.15, 0.01, 0.25], [0.5, 0.4, 0.87]), "right": ([0.15, 0.01, 0.25], [0.5, -0.4, 0.87])}
+    scene = osik.Scene({name: board(size, middle + np.array(place)) for name, (size, place) in boards.items()})
+    places = np.random.default_rng(0).uniform([0.33, -0.3, 0.72], [0.5, 0.1, 1.03], (100, 3)) + middle
+    targets = {"hand": (places, np.tile(np.eye(3), (100, 1, 1)))}
+    found = osik.inverse_kinematics(robot, tasks, targets=targets, scene=scene)
+    met = np.asarray(found.converged)
+    assert met.mean() >= 0.984 and osik.is_free(robot, found.q[met], scene).all()
+    center = jax.vmap(lambda q: osik.center_of_mass(robot, osik.forward_kinematics(robot, q)))(found.q)[met, :2]
+    assert ((center > low - 1e-3) & (center < high + 1e-3)).all()

@@ -9,9 +9,11 @@ from functools import cache
 from typing import Any
 
 import equinox as eqx
+import jax
 import mujoco
 import numpy as np
 import pytest
+from core_checks import needs_core
 from waiting import until
 
 import osik_jax as osik
@@ -54,6 +56,33 @@ def desk() -> Iterator[Desk]:
     with desk.loop as loop:
         assert loop.wait_until_ready(300.0)
         yield desk
+
+
+@needs_core
+def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
+    """The arm gives way to a box that is dragged onto its tool; nothing compiles."""
+    arm = osik.load_robot("ur5")
+    shapes = {"box": osik.CollisionShape.box([0.1, 0.1, 0.1], [0.0, 2.0, 0.5]), "ball": osik.CollisionShape.sphere(0.1)}
+    shapes["post"] = osik.CollisionShape.cylinder(0.05, [-1.0, 0.0, 0.0], [-1.0, 0.0, 1.0])
+    apart = osik.CollisionAvoidanceLimit(arm, scene=osik.Scene(shapes).moved("ball", ([0.0, -2.0, 0.5], np.eye(3))))
+    session = default_session(arm, source=RobotSource("ur5"))
+    desk = Desk(dataclasses.replace(session, limits=(*session.limits, apart)), robot_parts(arm))
+    assert list(desk.obstacles) == ["box", "ball"] and desk.obstacles["ball"].size[0] == 0.1
+    with desk.loop as loop:
+        assert loop.wait_until_ready(300.0)
+        program = desk.loop._job
+        tool = np.asarray(osik.forward_kinematics(arm, desk.session.q).frame_pose(arm, "tool0")[0])
+        place = tool * [1.1, 1.1, 1.0]  # farther out, with the tool inside
+        desk.move_obstacle("box", position=place)
+        desk.move_obstacle("box", size=np.array([0.12, 0.12, 0.12]))
+        moved = desk.session.limits[-1]
+        assert isinstance(moved, osik.CollisionAvoidanceLimit) and moved.scene is not None
+        np.testing.assert_allclose(moved.scene.table.size[0], 0.12)
+        np.testing.assert_allclose(desk.obstacles["box"].position, place)
+        gaps = jax.jit(lambda q: moved.distances(arm, osik.forward_kinematics(arm, q)).min())
+        assert gaps(desk.session.q) < -0.01
+        assert until(lambda: float(gaps(loop.snapshot.q)) > 0.009)
+        assert program is not None and loop._job is not None and loop._job.program is program.program
 
 
 @pytest.mark.parametrize("robot", [ARM, NAO])

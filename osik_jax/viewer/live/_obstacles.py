@@ -1,7 +1,8 @@
 """Obstacles of a page, and the limits that avoid them and self-collision.
 
-Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s. The limit that the page adds has a fixed
-number of each kind. Unused ones are far below the floor, so adding, moving and removing one compiles nothing.
+Obstacles are the world's shapes of the session's ``CollisionAvoidanceLimit``s, and the balls and boxes of their scenes.
+The limit that the page adds has a fixed number of each kind. Unused ones are far below the floor, so adding, moving and
+removing one compiles nothing.
 """
 
 from __future__ import annotations
@@ -10,6 +11,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +21,9 @@ from ..._errors import OsikValueError
 from ...collision import CollisionShape
 from ...collision._geometry import Kind
 from ...collision._pairs import candidate_pairs, members
+from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
+from ...numerics._host import replaced_at
 from ...robot import Robot
 from ...robot._mujoco import mujoco_frame_pose, mujoco_poses
 
@@ -51,7 +56,8 @@ class Obstacle(NamedTuple):
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
     """Return the obstacles in use by name."""
-    return {one.name: one for limit in limits for one in _slots(limit) if not _is_parked(one)}
+    own = (one for limit in limits for one in (*_slots(limit), *_in_scene(limit)))
+    return {one.name: one for one in own if not _is_parked(one)}
 
 
 def free_slot(limits: Sequence[Limit], kind: str) -> str | None:
@@ -61,7 +67,7 @@ def free_slot(limits: Sequence[Limit], kind: str) -> str | None:
 
 
 def keeps_off_world(limit: Limit) -> bool:
-    """Return whether a limit has obstacles, used or not."""
+    """Return whether a limit has obstacles of a page, used or not."""
     return any(True for _ in _slots(limit))
 
 
@@ -84,11 +90,34 @@ def _slots(limit: Limit) -> Iterator[Obstacle]:
             yield Obstacle(name, kind, position, rotation, size)
 
 
+def _in_scene(limit: Limit) -> Iterator[Obstacle]:
+    """Return the balls and boxes of a limit's scene that nothing carries."""
+    scene = limit.scene if isinstance(limit, CollisionAvoidanceLimit) else None
+    if scene is None:
+        return
+    kinds, table = {ShapeKind.SPHERE: "ball", ShapeKind.BOX: "box"}, jax.tree.map(np.asarray, scene.table)
+    for row, name in enumerate(scene.names):
+        kind = kinds.get(ShapeKind(int(table.kind[row])))
+        if kind and int(scene.body[row]) < 0:
+            yield Obstacle(name, kind, table.position[row], table.rotation[row], table.size[row])
+
+
+def _with_scene(limit: CollisionAvoidanceLimit, name: str, **changes: Float[np.ndarray, "..."]) -> Limit:
+    """Return the limit with an obstacle of its scene moved or resized."""
+    one, scene = next(one for one in _in_scene(limit) if one.name == name)._replace(**changes), limit.scene
+    assert scene is not None
+    scene, row = scene.moved(name, (one.position, one.rotation)), scene.names.index(name)
+    size = replaced_at(scene.table.size, row, one.size)
+    return limit.replace(scene=eqx.tree_at(lambda scene: scene.table.size, scene, size))
+
+
 def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."]) -> tuple[Limit, ...]:
     """Return the limits with an obstacle moved or resized."""
     return tuple(
         limit.moved(name, **changes)
         if isinstance(limit, CollisionAvoidanceLimit) and name in limit.layout.names[len(limit.layout.geoms) :]
+        else _with_scene(limit, name, **changes)
+        if isinstance(limit, CollisionAvoidanceLimit) and any(one.name == name for one in _in_scene(limit))
         else limit
         for limit in limits
     )

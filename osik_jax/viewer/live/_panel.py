@@ -26,6 +26,7 @@ _LIMIT_WORDS = {
     "AccelerationLimit": "joint accelerations",
 }
 _ITSELF, _WORLD = "collisions with itself", "collisions with obstacles"
+_SCENE = "collisions with itself and with the scene"
 _PLURALS = {"ball": "balls", "box": "boxes"}
 _NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
@@ -304,6 +305,6 @@ class Panel:
 def _words(limit: Limit) -> str:
     """Return the label of a limit's switch."""
     if isinstance(limit, CollisionAvoidanceLimit):
-        return _WORLD if keeps_off_world(limit) else _ITSELF
+        return _SCENE if limit.scene is not None else _WORLD if keeps_off_world(limit) else _ITSELF
     kind = type(limit).__name__
     return _LIMIT_WORDS.get(kind, kind)
