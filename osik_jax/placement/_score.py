@@ -137,14 +137,13 @@ def is_too_far(task: Task, bases: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, 
     count, frames = task.goal.position.shape[:2]
     origin, turn = base_poses(bases)
     position = rotate(turn.swapaxes(-1, -2)[:, None], np.asarray(task.goal.position).reshape(-1, 3) - origin[:, None])
-    asked: Any = np.array(task.rows)[:, :3].all(-1)
-    away = np.asarray(_beyond(task.search, position.reshape(-1, frames, 3), asked))
+    away = np.asarray(_beyond(task.search, position.reshape(-1, frames, 3)))
     return away.reshape(-1, count) > task.settings["position_tolerance"]
 
 
 @jax.jit
-def _beyond(search: ChainSearch, position: Any, asked: Any) -> Array:
-    return beyond(search.reaches, position, asked)
+def _beyond(search: ChainSearch, position: Any) -> Array:
+    return beyond(search.reaches, position, np.array(search.rows)[:, :3].all(-1))  # pyright: ignore[reportArgumentType]
 
 
 def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndarray, **settings: Any) -> Scores:
