@@ -320,15 +320,17 @@ def _spans(
 ) -> tuple[Float[Array, "2 K"], Float[Array, "3 2 K"]]:
     """Return lower and upper bounds of the coefficients to come, and of their differences.
 
-    Where even the hardest braking exceeds a limit, as right after a start near it, that braking is the bound.
+    Where even the hardest braking exceeds a limit, as right after a start near it, that braking is the bound. It is a
+    little softer than the limits allow: with rounding, bounds that leave one answer would leave none.
     """
+    hard = 1.0 - 0.1 * rounding(width)[1]
     speed, pull, jerk = limits * width ** jnp.arange(1, 4)
     steps = jnp.arange(1, cells + 1)
 
     def least(sign: float) -> tuple[Array, Array, Array]:
         """Return the upper bounds (sign 1), or the lower ones (-1), of coefficients and two differences."""
         before, slope = jnp.diff(sign * first)
-        seconds = jnp.maximum(slope - before - steps * jerk, -pull)  # the hardest braking
+        seconds = jnp.maximum(slope - before - steps * hard * jerk, -hard * pull)
         slopes = slope + jnp.cumsum(seconds)
         places = sign * first[2] + jnp.cumsum(slopes)
         fastest = jnp.minimum(speed, _below_peak(jnp.concatenate([jnp.stack([before, slope]), slopes[:-1]]), speed))

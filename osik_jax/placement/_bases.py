@@ -18,7 +18,7 @@ from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Labels, _with
 from ..collision._table import RobotShapes
 from ..kinematics._rigid import compose, rotate
-from ..numerics._host import module_of
+from ..numerics._host import Numbers, module_of
 from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
@@ -48,7 +48,7 @@ def grid_bases(axes: Sequence[np.ndarray]) -> Float[np.ndarray, "n 4"]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(AXES))
 
 
-def base_poses(bases: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3 3"]]:
+def base_poses(bases: Float[Numbers, "n 4"]) -> tuple[Float[Numbers, "n 3"], Float[Numbers, "n 3 3"]]:
     """Return position [m] and rotation (base axes to world axes) of bases."""
     numbers = module_of(bases)
     cos, sin, zero = numbers.cos(bases[:, 2]), numbers.sin(bases[:, 2]), numbers.zeros(len(bases))
@@ -56,7 +56,7 @@ def base_poses(bases: Float[np.ndarray, "n 4"]) -> tuple[Float[np.ndarray, "n 3"
     return bases[:, [0, 1, 3]], numbers.stack([numbers.stack(row, -1) for row in rows], -2)
 
 
-def in_bases(bases: Float[np.ndarray, "n 4"], position: Any, rotation: Any) -> tuple[np.ndarray, np.ndarray]:
+def in_bases(bases: Float[Numbers, "n 4"], position: Any, rotation: Any) -> tuple[Numbers, Numbers]:
     """Return poses in the axes of each base, from the world's.
 
     Args:
@@ -72,13 +72,12 @@ def in_bases(bases: Float[np.ndarray, "n 4"], position: Any, rotation: Any) -> t
 def scenes_in_bases(scene: Scene, bases: Float[np.ndarray, "n 4"]) -> Scene:
     """Return a stack of the scene in the axes of each base; held objects stay in their hands."""
     count, table = len(bases), scene.table
-    numbers = module_of(bases)
-    given, held = [numbers.asarray(part) for part in (table.position, table.rotation)], scene.body >= 0
+    given, held = [np.asarray(part) for part in (table.position, table.rotation)], np.asarray(scene.body) >= 0
     moved = in_bases(bases, *given)
-    position = numbers.where(held[:, None], given[0], moved[0])
-    rotation = numbers.where(held[:, None, None], given[1], moved[1])
+    position = np.where(held[:, None], given[0], moved[0])
+    rotation = np.where(held[:, None, None], given[1], moved[1])
     parts = table, scene.body, scene.contact, scene.among
-    table, body, contact, among = jax.tree.map(lambda a: numbers.broadcast_to(a, (count, *np.shape(a))), parts)
+    table, body, contact, among = jax.tree.map(lambda a: np.broadcast_to(a, (count, *np.shape(a))), parts)
     labels = Labels((scene.labels.names,) * count, (scene.labels.objects,) * count)
     table = table._replace(position=position, rotation=rotation)
     return _with(scene, table=table, body=body, contact=contact, among=among, labels=labels)

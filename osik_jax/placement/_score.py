@@ -15,10 +15,11 @@ from ..inverse._chain_search import ChainSearch, Goal
 from ..inverse._inverse_kinematics import inverse_kinematics
 from ..inverse._reach import beyond
 from ..inverse._solution import InverseKinematicsSolution
+from ..kinematics._rigid import rotate
 from ..numerics._host import module_of
 from ..reachability._frame import Frame
 from ..robot import Robot
-from ._bases import in_bases, scenes_in_bases
+from ._bases import base_poses, in_bases, scenes_in_bases
 
 _PAIRS = 64, 1024
 """Pairs of a base and a pose in one call, if they are few or many: each number compiles anew."""
@@ -72,15 +73,13 @@ class Scores(NamedTuple):
     def empty(cls, task: Task, count: int) -> Scores:
         """Return the scores of bases that reach nothing."""
         shape = count, len(task.goal.position)
-        none = np.full(shape, np.nan)
-        return cls(np.zeros(shape, bool), none, none, np.full((*shape, task.robot.nq), np.nan))
+        sizes = shape, shape, (*shape, task.robot.nq)
+        return cls(np.zeros(shape, bool), *(np.full(size, np.nan) for size in sizes))
 
-    def updated(self, pairs: Any, scores: Scores) -> Scores:
-        """Return the scores with those of some pairs, numbers of bases and of poses, in their place."""
-        fields = [np.array(field) for field in self]
-        for field, new in zip(fields, scores, strict=True):
+    def put(self, pairs: Any, scores: Scores) -> None:
+        """Write the scores of some pairs, given by numbers of bases and of poses, into these arrays."""
+        for field, new in zip(self, scores, strict=True):
             field[tuple(pairs)] = new
-        return Scores(*fields)
 
     @property
     def table(self) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -95,26 +94,28 @@ def score_grid(task: Task, bases: Float[np.ndarray, "n 4"]) -> Scores:
     """Return the scores of bases, with all searches only where they can matter.
 
     Poses that are out of reach even with all links in one line have none. All others have an eighth of the searches at
-    each base. Then the eighth of the bases with the most poses get all
-    searches for the poses that they miss. The other bases get them for one pose after another, those first that fewest
-    bases reach, until one is missed: such a base does not reach all poses.
+    each base. Then the eighth of the bases with the most poses get all searches for the poses that they miss. The other
+    bases get them for one pose after another, those first that fewest bases reach, until one is missed: such a base
+    does not reach all poses.
     """
-    seeds = task.settings["seeds"]
-    far = is_too_far(task, bases)
+    scores, far = Scores.empty(task, len(bases)), is_too_far(task, bases)
     near = np.nonzero(~far)
-    scores = Scores.empty(task, len(bases)).updated(near, _search_pairs(task, bases, *near, seeds=-(-seeds // 8)))
-    reached = scores.reached
-    rank = np.argsort(np.argsort(-reached.sum(1), kind="stable"))
-    rare, searched = np.argsort(reached.sum(0), kind="stable"), reached | far
+    scores.put(near, _search_pairs(task, bases, *near, seeds=-(-task.settings["seeds"] // 8)))
+    reached = scores.reached.sum(1)
+    rank, rare = np.argsort(np.argsort(-reached, kind="stable")), np.argsort(scores.reached.sum(0), kind="stable")
+    searched = scores.reached | far
     wanted = ~searched & (8 * rank < len(bases))[:, None]
-    while wanted.any():
-        scores = scores.updated(np.nonzero(wanted), _search_pairs(task, bases, *np.nonzero(wanted)))
+    while True:
+        pairs = np.nonzero(wanted)
+        scores.put(pairs, _search_pairs(task, bases, *pairs))
         searched |= wanted
-        left = ~searched & (searched == scores.reached).all(1)[:, None]
+        may_reach_all = (searched == scores.reached).all(1)
+        left = ~searched & may_reach_all[:, None]
+        if not left.any():
+            return scores
         wanted = np.zeros_like(left)
-        wanted[np.arange(len(left)), rare[left[:, rare].argmax(1)]] = True
-        wanted &= left
-    return scores
+        some = np.flatnonzero(left.any(1))
+        wanted[some, rare[left[some][:, rare].argmax(1)]] = True
 
 
 def score_bases(task: Task, bases: Float[np.ndarray, "n 4"], *, every: bool = False) -> Scores:
@@ -125,22 +126,24 @@ def score_bases(task: Task, bases: Float[np.ndarray, "n 4"], *, every: bool = Fa
         bases: x, y, yaw, height. (n, 4)
         every: take the configuration with the largest margin of all that are found, not the first one.
     """
-    pairs = np.indices((len(bases), len(task.goal.position))).reshape(2, -1)
-    return Scores.empty(task, len(bases)).updated(pairs, _search_pairs(task, bases, *pairs, all=every))
+    scores = Scores.empty(task, len(bases))
+    pairs = np.indices(scores.reached.shape).reshape(2, -1)
+    scores.put(pairs, _search_pairs(task, bases, *pairs, all=every))
+    return scores
 
 
 def is_too_far(task: Task, bases: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, "n poses"]:
     """Return whether each pose is out of reach of each base, even with all links in one line."""
     count, frames = task.goal.position.shape[:2]
-    position = in_bases(bases, *(np.asarray(part).reshape(-1, *part.shape[2:]) for part in task.goal))[0]
-    asked: Any = np.array(task.rows)[:, :3].all(-1)
-    away = np.asarray(_beyond(task.search, position.reshape(-1, frames, 3), asked))
+    origin, turn = base_poses(bases)
+    position = rotate(turn.swapaxes(-1, -2)[:, None], np.asarray(task.goal.position).reshape(-1, 3) - origin[:, None])
+    away = np.asarray(_beyond(task.search, position.reshape(-1, frames, 3)))
     return away.reshape(-1, count) > task.settings["position_tolerance"]
 
 
 @jax.jit
-def _beyond(search: ChainSearch, position: Any, asked: Any) -> Array:
-    return beyond(search.reaches, position, asked)
+def _beyond(search: ChainSearch, position: Any) -> Array:
+    return beyond(search.reaches, position, np.array(search.rows)[:, :3].all(-1))  # pyright: ignore[reportArgumentType]
 
 
 def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndarray, **settings: Any) -> Scores:

@@ -152,6 +152,19 @@ def test_fewer_searches_find_the_base_that_all_searches_find(arm, scene, points)
     assert (found.reached[full] == len(points)).all()
 
 
+def test_the_bases_that_reach_all_poses_are_those_that_all_searches_find(arm, scene, points):
+    """With 8 searches the first round is one search, after which the best bases lack nothing."""
+    grid: dict[str, Any] = dict(x=np.linspace(-0.2, 0.8, 11), y=np.linspace(-0.6, 0.6, 7), yaw=[0.0], refine=0, seeds=8)
+    found = place_base(arm, {"tip": points[:1]}, **grid, scene=scene)
+    for at in np.argwhere(found.stands_free):
+        shift = np.array([found.x[at[0]], found.y[at[1]], 0.0])
+        boxes = {name: osik.CollisionShape.box(size, center - shift) for name, (size, center) in BOXES.items()}
+        alone = osik.inverse_kinematics(
+            arm, {"tip": points[0] - shift}, scene=osik.Scene(boxes), seeds=8, restarts=0, closest=False
+        )
+        assert found.reached[tuple(at)] == alone.converged
+
+
 def test_which_bases_stand_free_is_as_mujoco_says(found):
     gaps = np.zeros(found.reached.shape)
     for at in np.ndindex(gaps.shape):
