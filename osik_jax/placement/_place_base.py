@@ -34,7 +34,9 @@ from ._placement import Placement
 from ._score import Task, is_too_far, joint_margin, manipulability, score_bases, score_grid, solve_pairs
 
 _BEST = 6
-"""Number of bases of the grid that are improved."""
+"""Number of bases of the grid of which the best one is improved."""
+_TURNS, _WHOLE = np.array([False, False, True, False]), 2.0 * np.pi - 1e-6
+"""Which coordinates of a base turn it, and from which spread on they have no ends [rad]."""
 
 
 def place_base(
@@ -63,10 +65,10 @@ def place_base(
     no joint moves, and ``footprint``. Bases are compared by the number of poses reached, then by the smallest margin
     of a joint to its limits. Bases that cannot be the best get fewer searches (``Placement.reaches``).
 
-    The best base is then moved off the grid, within its range. While it misses poses, bases around it are tried, at
-    half the grid's spacing and less. Base and configurations together climb the smallest margin of the poses reached:
-    each step is a linear program of the exact derivatives, and is made only if the frames come back to their poses and
-    nothing touches. The same arguments give the same answer.
+    The best base is then moved off the grid, within its range; a yaw of a whole turn has no ends. While it misses
+    poses, bases around it are tried, at half the grid's spacing and less. Base and configurations together climb the
+    smallest margin of the poses reached: each step is a linear program of the exact derivatives, and is made only if
+    the frames come back to their poses and nothing touches. The same arguments give the same answer.
 
     A pose that counts as reached has a configuration; one that does not was not found by ``seeds`` searches.
 
@@ -190,6 +192,8 @@ def _refined(
     """Return the best of some bases, moved off the grid, and its configurations; ``stands``: which bases are free."""
     lower, upper = (np.array([axis[end] for axis in axes]) for end in (0, -1))
     steps = np.array([0.5 * float(np.diff(axis).min()) if len(axis) > 1 else 0.0 for axis in axes])
+    spread = upper - lower + 2.0 * steps
+    lower, upper = (np.where(_TURNS & (spread > _WHOLE), sign * np.inf, end) for sign, end in ((-1, lower), (1, upper)))
     base, q = _best_of(task, bases)
     for _ in range(refine if steps.any() else 0):
         if np.isnan(q).any():

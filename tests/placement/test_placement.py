@@ -129,6 +129,16 @@ def test_the_climb_leaves_no_base_nearby_with_a_larger_margin(arm, scene, points
     assert (climbed.best >= [-0.2, 0.0, 0.0, 0.0]).all() and (climbed.best <= [0.0, 0.3, 0.0, 0.0]).all()
 
 
+def test_a_yaw_of_a_whole_turn_has_no_ends(arm, points):
+    """The best rotation is between the last one of the grid and the first."""
+    turn = np.array([[np.cos(-0.75), -np.sin(-0.75), 0.0], [np.sin(-0.75), np.cos(-0.75), 0.0], [0.0, 0.0, 1.0]])
+    given: dict[str, Any] = dict(x=0.0, y=0.0, seeds=8)
+    found = place_base(arm, {"tip": points @ turn.T}, **given, yaw=4)
+    bounded = place_base(arm, {"tip": points @ turn.T}, **given, yaw=[0.0, 1.0, 2.0])
+    assert bounded.best[2] >= 0.0 and not 0.0 <= found.best[2] <= 1.5 * np.pi
+    assert found.best_margin.min() > bounded.best_margin.min() + 0.01
+
+
 def test_poses_too_far_are_counted_and_searched_for_nowhere(arm, scene):
     far = np.array([[0.3, 0.0, 0.4], [5.0, 0.0, 0.4]])
     found = place_base(arm, {"tip": far}, x=[0.0, 0.1, 4.5], y=0.0, yaw=[0.0], scene=scene, refine=1)
