@@ -90,6 +90,7 @@ def test_rows_are_those_of_the_nearest_pairs(arm, scene, limit):
     assert apart.sum() > 80 and (near < 0.0).any() and (near > 0.3).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("post", "h", "atol"), [("capsule", 1e-6, 2e-4), ("cylinder", 1e-4, 0.05)], ids=["exact", "side"]
 )
@@ -263,3 +264,34 @@ def test_wrong_arguments_are_named(arm, scene, limit):
     refuses(TypeError, "srdf goes with a scene", kind, arm, srdf="<robot name='r'/>")
     refuses(TypeError, "limit.replace", limit.moved, "table", position=np.zeros(3))
     refuses(TypeError, "make an osik_jax.Scene", limit.replace, scene=3)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_step_with_active_rows():
+    """Of the velocity, with respect to the table's place and to q, where the hand presses on the table."""
+    arm = osik.Robot.from_mjcf(
+        ARM.replace('"cylinder" pos', '"capsule" pos').format(_palm()), velocity_limits={"*": 3.0}
+    )
+    scene = osik.Scene({"table": CollisionShape.box(TABLE["half_sizes"], TABLE["position"])})
+    limit, scheme = osik.CollisionAvoidanceLimit(arm, scene=scene, minimum_distance=0.02), osik.WeightedQP(damping=1e-3)
+    hand = osik.FrameTask(arm, "hand", rows="position", target=(TABLE["position"], np.eye(3)))
+    tasks = {"hand": hand, "posture": osik.PostureTask(arm, weight=1e-3)}
+    controller, q = (
+        osik.Controller(arm, tasks, scheme=scheme, limits=(limit,), dt=0.01),
+        np.array([0.0, 0.5, 0.4, 0.3, 0.0]),
+    )
+    for _ in range(60):
+        solution = controller.step(q)
+        q = controller.integrate(q, solution.velocity)
+    assert np.asarray(solution.warm_start)[5:].any()
+
+    def velocity(of):
+        moved = limit.replace(scene=scene.moved("table", (of[:3], np.eye(3))))
+        return osik.solve(arm, of[3:], tasks, scheme=scheme, limits=(moved,), dt=0.01).velocity
+
+    at, h = np.concatenate([TABLE["position"], q]), 1e-6
+    around = jax.jit(jax.vmap(velocity))(np.concatenate([at + h * np.eye(8), at - h * np.eye(8)]))
+    slope = (np.asarray(around[:8]) - np.asarray(around[8:])).T / (2.0 * h)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(velocity))(at), slope, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(velocity))(at), slope, atol=1e-6)
+    assert np.abs(slope).max() > 10.0
