@@ -61,7 +61,7 @@ def reference(cells: Cells, ramp: Array, count: int) -> tuple[Float[Array, ""], 
     duration = cells.start[-1]
     spread = jnp.maximum(ramp, 4.0 * duration / count)
     width = (duration + spread) / (count - 4)
-    along = cells.at(width * (jnp.arange(count + 3) - 3.0) - 0.5 * spread)[0]
+    along = cells.at(width * (jnp.arange(count + 3, dtype=width.dtype) - 3.0) - 0.5 * spread)[0]
     smooth = _moving_mean(along, spread / width)
     four = jnp.stack([smooth[i : i + count] for i in range(4)], axis=1)
     return width, (four @ CUBIC.T.astype(width.dtype)) / width ** jnp.arange(4)
@@ -70,8 +70,8 @@ def reference(cells: Cells, ramp: Array, count: int) -> tuple[Float[Array, ""], 
 def _moving_mean(values: Float[Array, " K"], window: Array) -> Float[Array, " K"]:
     """Return the mean over a window around each value; the window's length in values need not be whole."""
     count = len(values)
-    sums = jnp.append(0.0, jnp.cumsum(jnp.pad(values, count, mode="edge")))
-    middle = count + 0.5 + jnp.arange(count)
+    sums = jnp.append(jnp.zeros((), values.dtype), jnp.cumsum(jnp.pad(values, count, mode="edge")))
+    middle = count + 0.5 + jnp.arange(count, dtype=values.dtype)
     ends = jnp.stack([middle - 0.5 * window, middle + 0.5 * window])
     low, high = jnp.interp(ends, jnp.arange(len(sums), dtype=values.dtype), sums)
     return (high - low) / window
@@ -97,7 +97,9 @@ def rows_of(
     first, second = q1 * s1, q2 * s1**2 + q1 * s2
     zero, alone = jnp.zeros_like(q1), 3.0 * q2 * s1 * s2 + q1 * s3
     speed = jnp.stack([(first / limits[0]) ** 2, zero, zero], axis=-1)
-    speed = jnp.concatenate([speed, (s1 / jnp.sqrt(cap)[:, None])[..., None] ** 2 * jnp.eye(3)[:1]], axis=1)
+    speed = jnp.concatenate(
+        [speed, (s1 / jnp.sqrt(cap)[:, None])[..., None] ** 2 * jnp.eye(3, dtype=cap.dtype)[:1]], axis=1
+    )
     pull = jnp.stack([second, 0.5 * first, zero], axis=-1) / limits[1][:, None]
     jerk = [jnp.stack([q3 * s1**3 + alone, 1.5 * second, 0.5 * first], axis=-1) for q3 in thirds]
     jerk = jnp.concatenate(jerk, axis=1) / jnp.tile(limits[2], 2)[:, None]
@@ -148,6 +150,7 @@ def _optimum(width: Array, rows: Rows) -> Float[Array, " K2"]:
     for _ in range(_LAST_STEPS):
         square = _moved(square, fixed_width, fixed_rows, fixed_scale * least, exact=True)
     move = _newton(jax.lax.stop_gradient(square), width, rows, scale * least, exact=True)[0]
+    move = jnp.where(jnp.isfinite(move).all(), move, 0.0)
     return jax.lax.stop_gradient(square) + move - jax.lax.stop_gradient(move)
 
 
@@ -160,9 +163,13 @@ def _slow(width: Array, rows: Rows) -> Float[Array, " K2"]:
 
 
 def _moved(square: Float[Array, " K2"], width: Array, rows: Rows, weight: Array, exact: bool = False) -> Array:
-    """Return the coefficients after one Newton step of the barrier problem, inside all limits."""
+    """Return the coefficients after one Newton step of the barrier problem, inside all limits.
+
+    They stay where the step is not finite: the exact matrix may lose its sign to rounding in single precision.
+    """
     move, taken = _newton(square, width, rows, weight, exact)
-    return square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(taken, 1e-9))
+    known = jnp.isfinite(move).all() & jnp.isfinite(taken)
+    return jnp.where(known, square + move * jnp.minimum(1.0, 0.9 / jnp.maximum(taken, 1e-9)), square)
 
 
 def _newton(
@@ -174,7 +181,7 @@ def _newton(
     derivatives of the gradient alone: where that vanishes, those of the matrix do not count.
     """
     values, stencils = _values(square, width), _stencils(width)
-    b, share = values[:, 0], jnp.tile(width * _SHARES, len(square) - 2)
+    b, share = values[:, 0], jnp.tile(width * jnp.asarray(_SHARES, width.dtype), len(square) - 2)
     margin, slope = _linear_margins(rows, values)
     scaled = slope / margin[..., None]
     down = weight * scaled.sum(axis=1)

@@ -124,7 +124,9 @@ def resampled(pieces: Float[np.ndarray, "k P n"], times: int) -> Float[np.ndarra
 def _spline(points: Float[Array, "N n"], uniform: bool) -> Spline:
     """Return the spline through points, by a parameter that grows evenly, or with the distance of points."""
     count = len(points)
-    return spline_through(points, jnp.arange(count) / (count - 1.0) if uniform else chord_lengths(points))
+    return spline_through(
+        points, jnp.arange(count, dtype=points.dtype) / (count - 1.0) if uniform else chord_lengths(points)
+    )
 
 
 def checked_speed(speed: Any) -> Float[Array, ""] | None:
@@ -259,7 +261,9 @@ def _retimed(
         moving = jnp.isfinite(limits[2])
         ramp = jnp.max(jnp.where(moving, limits[1] / jnp.where(moving, limits[2], 1.0), 0.0))
         width, cubics = reference(progress, jnp.minimum(ramp, progress.start[-1]), count)
-        at = jax.vmap(lambda x: cubic_derivatives(cubics, jnp.full(count, x)), out_axes=2)(width * PLACES)
+        at = jax.vmap(lambda x: cubic_derivatives(cubics, jnp.full(count, x)), out_axes=2)(
+            width * jnp.asarray(PLACES, width.dtype)
+        )
         thirds = jnp.stack([jnp.repeat(path.derivatives(at[0, :, end])[3], len(PLACES), axis=0) for end in (0, -1)])
         at = at.reshape(4, -1)
         states = path.derivatives(at[0])

@@ -20,6 +20,7 @@ JERK = np.array([300.0, 100.0, 500.0])
 LIMITS: dict[str, Any] = {"velocity": VELOCITY, "acceleration": ACCELERATION}
 POINTS = np.cumsum(np.random.default_rng(0).normal(size=(6, 3)) * 0.5, axis=0)
 CELLS = 120
+KINDS = "velocity", "acceleration", "jerk"
 
 
 @partial(jax.jit, static_argnames="smooth")
@@ -201,3 +202,17 @@ def test_a_waypoint_outside_of_its_range_is_named() -> None:
 def test_what_cannot_be_is_refused(points, more, message) -> None:
     with pytest.raises(osik.OsikError, match=message):
         retime(points, **(LIMITS | more))
+
+
+def test_single_precision_is_finite_and_hardly_slower():
+    """128 paths with limits of jerk, of which rounding spoils the exact matrix of some."""
+    paths = np.cumsum(np.random.default_rng(0).normal(0.0, 0.5, (128, 6, 7)), axis=1)
+
+    @partial(jax.jit, static_argnames="kind")
+    def durations(kind):
+        limits = {name: jnp.full(7, most, kind) for name, most in zip(KINDS, (2.0, 5.0, 500.0), strict=True)}
+        return jax.vmap(lambda p: retime(p, **limits).duration)(jnp.asarray(paths, kind))
+
+    single, double = (np.asarray(durations(kind)) for kind in (np.float32, np.float64))
+    assert single.dtype == np.float32 and np.isfinite(single).all()
+    assert (single / double).max() < 1.03 and (single / double).min() > 0.999
