@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..numerics._arguments import check_count
+from ..numerics._dense import full_precision
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ._calibration import Calibration
@@ -97,6 +98,7 @@ def rows_at(
 
 
 @partial(jax.jit, static_argnums=(4, 5, 6, 7))
+@full_precision
 def _calibrated(
     setup: Setup,
     measurements: tuple[Measurement, ...],

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import OsikValueError
 from ..numerics._arguments import check_count
+from ..numerics._dense import full_precision
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._calibration import Calibration
@@ -84,6 +85,7 @@ def _drawn(robot: Robot, count: int, seed: int) -> Float[np.ndarray, "m nq"]:
 
 
 @partial(jax.jit, static_argnums=3)
+@full_precision
 def _sensitivities(
     setup: Setup, measurement: Measurement, q: Float[Array, "m nq"], parameters: tuple[Parameter, ...]
 ) -> Float[Array, "m k p"]:

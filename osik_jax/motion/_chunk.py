@@ -21,6 +21,7 @@ from .._errors import OsikValueError, warn
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
 from ..numerics._arguments import as_floats, check_count, concrete
+from ..numerics._dense import full_precision
 from ..numerics._guarded import positive_root
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
@@ -90,6 +91,7 @@ class Chunk(eqx.Module):
 
 
 @jax.jit
+@full_precision
 def _at(chunk: Chunk, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
     cells = len(chunk.coefficients) - 3
     place = jnp.clip((time - chunk.begin) / chunk.width, 0.0, cells)
@@ -232,6 +234,7 @@ def _rows(cells: int, free: int) -> _Rows:
 
 
 @partial(jax.jit, static_argnames=("cells", "rest"))
+@full_precision
 def _fitted(
     points: Float[Array, "N n"],
     time: Float[Array, " N"],

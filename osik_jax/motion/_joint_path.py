@@ -16,6 +16,7 @@ from scipy.linalg import solveh_banded
 
 from ..inverse import inverse_kinematics
 from ..kinematics import forward_kinematics
+from ..numerics._dense import full_precision
 from ..robot import Robot
 from ._obstacles import Obstacles, line_curves
 from ._pose_path import Poses
@@ -35,6 +36,7 @@ Free = Mapping[str, str]
 
 
 @partial(jax.jit, static_argnames=("names", "axes"))
+@full_precision
 def pose_errors(
     robot: Robot, q: Float[Array, "S n"], goals: Any, *, names: tuple[str, ...], axes: tuple[str | None, ...]
 ) -> tuple[Float[Array, "S m"], Float[Array, "S m n"]]:

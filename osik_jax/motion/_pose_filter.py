@@ -15,6 +15,7 @@ from .._errors import OsikValueError
 from ..control._clutch import pose_numbers
 from ..kinematics._pose_forms import Pose, PoseLike, as_pose
 from ..numerics._arguments import concrete
+from ..numerics._dense import full_precision
 from ..numerics._replace import Replaceable
 from ..tasks._leaves import as_scalar, as_vector
 from ..tasks._rotation import dot, rotation_log
@@ -86,6 +87,7 @@ class PoseFilter(Replaceable):
 
 
 @jax.jit
+@full_precision
 def _update(own: _Own, given: PoseLike, dt: Float[Array, ""]) -> tuple[_Own, Pose, Array]:
     position, rotation = as_pose(given, own.velocity.dtype)
     seen = jnp.isfinite(position).all() & jnp.isfinite(rotation).all()

@@ -15,6 +15,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..inverse._inverse_kinematics import joint_box
 from ..kinematics import forward_kinematics
 from ..numerics._arguments import as_floats, concrete
+from ..numerics._dense import full_precision
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
 from ._cells import Cells
@@ -107,6 +108,7 @@ def retimed_pieces(
 
 
 @partial(jax.jit, static_argnames="times")
+@full_precision
 def _resampled(pieces: Float[Array, "k P n"], *, times: int) -> Float[Array, "k R n"]:
     def one(points: Array) -> Array:
         path = _spline(points, True)
@@ -231,6 +233,7 @@ def _check_limits(limits: Array, robot: Robot | None, least_time: bool) -> None:
 
 
 @partial(jax.jit, static_argnames=("frame", "count", "smooth", "uniform"))
+@full_precision
 def _retimed(
     points: Float[Array, "N n"] | Spline,
     limits: Float[Array, "3 n"],
@@ -311,6 +314,7 @@ def _largest_ratio(
 
 
 @partial(jax.jit, static_argnames="frame")
+@full_precision
 def _frame_speeds(robot: Robot, q: Float[Array, "T n"], v: Float[Array, "T n"], *, frame: str) -> Float[Array, " T"]:
     move = jax.vmap(lambda q, v: jax.jvp(lambda q: _origin(robot, q, frame), (q,), (v,))[1])(q, v)
     return jnp.linalg.norm(move, axis=1)

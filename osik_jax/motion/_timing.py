@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
+from ..numerics._dense import full_precision
 from ._cells import Cells
 from ._motion import Motion, at_rest_outside, sample_times
 from ._spline import Spline
@@ -94,6 +95,7 @@ def by_progress(states: Float[Array, "4 T n"], progress: Float[Array, "4 T"]) ->
 
 
 @jax.jit
+@full_precision
 def _at(path: Spline, progress: Cells, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
     moved = progress.at(time)
     states = by_progress(path.derivatives(moved[0]), moved)

@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
 _ONE_THREAD = 31
 """Largest number of terms that XLA sums in one thread of a GPU."""
+
+
+def full_precision(function: _Function) -> _Function:
+    """Return the function with all its products, and those of its derivatives, in full precision."""
+
+    @wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **options)
+
+    return cast(Any, call)
 
 
 def product(a: Float[Array, "*B m k"], b: Float[Array, "*B k n"]) -> Float[Array, "*B m n"]:

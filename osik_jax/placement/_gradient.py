@@ -16,6 +16,7 @@ from scipy.sparse import block_diag, csr_array, hstack, vstack
 from ..collision import is_free
 from ..inverse._chain_problem import ENOUGH
 from ..inverse._chain_search import ChainSearch, Goal
+from ..numerics._dense import full_precision
 from ._bases import in_bases, scenes_in_bases
 from ._score import Task, joint_margin, manipulability
 
@@ -69,6 +70,7 @@ def _motions(task: Task, base: np.ndarray, x: Float[np.ndarray, "p n"]) -> tuple
 
 
 @jax.jit
+@full_precision
 def _linearised(search: ChainSearch, goal: Goal, base: Any, x: Any) -> tuple[Array, Array]:
     """Return the derivative of the frames' errors by the coordinates (p, m, n), and by the base (p, m, 4)."""
     rows = jax.vmap(search.rows_at)
@@ -171,6 +173,7 @@ class Climber(NamedTuple):
 
 
 @jax.jit
+@full_precision
 def _solved(search: ChainSearch, goal: Goal, base: Any, x: Any) -> tuple[Array, Array]:
     """Return configurations after steps towards the poses, and whether they are there."""
     x, _, errors = search.finishing(exact=True).advance(x, goal_in_base(base, goal), _CORRECTIONS)

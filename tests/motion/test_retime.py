@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from products import HIGHEST, products_of
 from scipy.interpolate import CubicSpline
 
 import osik_jax as osik
@@ -210,9 +211,18 @@ def test_single_precision_is_finite_and_hardly_slower():
 
     @partial(jax.jit, static_argnames="kind")
     def durations(kind):
-        limits = {name: jnp.full(7, most, kind) for name, most in zip(KINDS, (2.0, 5.0, 500.0), strict=True)}
+        limits: dict[str, Any] = {
+            name: jnp.full(7, most, kind) for name, most in zip(KINDS, (2.0, 5.0, 500.0), strict=True)
+        }
         return jax.vmap(lambda p: retime(p, **limits).duration)(jnp.asarray(paths, kind))
 
     single, double = (np.asarray(durations(kind)) for kind in (np.float32, np.float64))
     assert single.dtype == np.float32 and np.isfinite(single).all()
     assert (single / double).max() < 1.03 and (single / double).min() > 0.999
+
+
+def test_products_are_in_full_precision():
+    """A GPU takes TF32 otherwise, and the barrier method doubles the duration."""
+    call = jax.value_and_grad(lambda p: run(p, smooth=True).duration)
+    products = list(products_of(jax.make_jaxpr(call)(POINTS).jaxpr))
+    assert len(products) > 5 and all(precision == (HIGHEST, HIGHEST) for precision in products)

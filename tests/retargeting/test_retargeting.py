@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from motion_files import bent_forward, dancer, sliding, with_first, write_bvh
 from other_processes import finish, start
+from products import HIGHEST, products_of
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from small_robots import nao_soles
@@ -54,7 +55,6 @@ from osik_jax.retargeting._terms import Body, frame_rows
 from osik_jax.robot.loading import example_urdf
 
 FPS = 30.0
-HIGHEST = jax.lax.Precision.HIGHEST
 
 
 @pytest.fixture(scope="module")
@@ -114,19 +114,6 @@ def test_the_gpu_kernel_solves_a_banded_system_as_the_dense_one():
     for lane in range(lanes):
         exact = np.linalg.solve(dense[lane], right[lane].ravel()).reshape(frames, n)
         np.testing.assert_allclose(x[lane], exact, atol=2e-6 * np.abs(exact).max())
-
-
-def products_of(jaxpr):
-    """Precisions of a program's products of matrices; of those with vectors XLA makes sums, which no GPU rounds."""
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            (contracted, _), (batched, _) = equation.params["dimension_numbers"]
-            if contracted and all(v.aval.ndim > len(contracted) + len(batched) for v in equation.invars):
-                yield equation.params["precision"]
-        for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                yield from products_of(inner)
 
 
 @pytest.mark.slow
