@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
+import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import OsikError, OsikTypeError, OsikValueError
