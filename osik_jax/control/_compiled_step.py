@@ -423,7 +423,8 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    if not (q.dtype == jnp.float64 and all(type(limit) in _LIMITS for limit in limits if has_box(limit))):
+    by_limits = all(type(a) in _LIMITS and not a.has_rows(robot) for a in limits if has_box(a))  # of ball joints JAX
+    if not (q.dtype == jnp.float64 and by_limits):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
             places[len(places)] = len(given), 0, robot.tree.nv
