@@ -108,18 +108,24 @@ def targets(own: Setting, goals: np.ndarray) -> dict[str, tuple[np.ndarray, np.n
     return {f: (np.asarray(place), np.asarray(turn)) for f, (place, turn) in zip(own.frames, placed, strict=True)}
 
 
-def main() -> None:
-    """Solve the problems that the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def arguments(description: str | None, out: str) -> argparse.ArgumentParser:
+    """Return the options that say which problems are solved and how; ``out`` is the name of the file of answers."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robot")
-    parser.add_argument("answers", type=Path)
+    parser.add_argument(out, type=Path)
     parser.add_argument("--problems", type=Path)
     parser.add_argument("--sets", nargs="*")
     parser.add_argument("--count", type=int, help="problems of each set; default: all")
     parser.add_argument("--batch", action="store_true", help="all problems in one call")
     parser.add_argument("--clearance", type=float, default=0.0)
-    parser.add_argument("--grow", type=float, default=0.0)
     parser.add_argument("--key", type=int, default=0)
+    return parser
+
+
+def main() -> None:
+    """Solve the problems that the command line names."""
+    parser = arguments(__doc__, "answers")
+    parser.add_argument("--grow", type=float, default=0.0)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     osik.runtime.configure_cpu()

@@ -12,7 +12,6 @@ start or goal is out of range have their range widened to it.
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from pathlib import Path
@@ -23,21 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
-from benchmarks.collision_free import Problem, Setting, read, setting
+from benchmarks.collision_free import Problem, Setting, arguments, read, setting
 from osik_jax.motion import Way, connect
 
 
 def main() -> None:
     """Connect the starts and goals that the command line names."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("robot")
-    parser.add_argument("ways", type=Path)
-    parser.add_argument("--problems", type=Path)
-    parser.add_argument("--sets", nargs="*")
-    parser.add_argument("--count", type=int, help="problems of each set; default: all")
-    parser.add_argument("--batch", action="store_true", help="all problems in one call")
-    parser.add_argument("--clearance", type=float, default=0.0)
-    parser.add_argument("--key", type=int, default=0)
+    parser = arguments(__doc__, "ways")
     parser.add_argument("--dense", type=float, default=1e-3)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
