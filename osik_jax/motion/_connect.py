@@ -32,7 +32,7 @@ _LONGEST = 256
 _STEP = 0.1
 """A tree grows by this share of the distance between the corners of the ranges at a time, at most."""
 _OUTSIDE = 1e-6
-"""What a start or a goal may be outside of a range, for rounding [rad or m]."""
+"""Tolerance of the ranges for a start and a goal, because of rounding [rad or m]."""
 _FOUND, _BAD_START, _BAD_GOAL, _NOT_FOUND = range(4)
 _REASONS = {
     _BAD_START: "the start does not keep the clearance",
@@ -63,7 +63,7 @@ class Way(NamedTuple):
 
     @property
     def found(self) -> bool:
-        """Whether there is a way."""
+        """True if a way was found."""
         return not self.problem
 
     def retime(

@@ -1,4 +1,4 @@
-"""What a path of the joints keeps clear of, proven by the core (``core/way_around.hpp``)."""
+"""Obstacles of joint paths, and proofs that curves keep clear of them (``core/way_around.hpp``)."""
 
 from __future__ import annotations
 
