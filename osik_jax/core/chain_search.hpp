@@ -42,6 +42,9 @@ template <class Call> struct ChainSearch {
     tips = space.take(3 * frames), e = space.take(m), gram = space.take(m * m);
     J = space.take(n * m), x = space.take(n), home = space.take(n);
   }
+  static constexpr OSIK_HOST int space_of(int n, int frames, int joints) {
+    return 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1);
+  }
   void read(In given) {
     Reader<In> at{given};
     constant = at.take(12 * joints), first = at.take(12 * joints), second = at.take(12 * joints);

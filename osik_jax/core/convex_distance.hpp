@@ -24,9 +24,10 @@ template <class Real> struct Convex {
   int kind, count;       // a hull's number of vertices, a multiple of 4 (the last one is repeated)
   V size, position;
   Mat3<Real> rotation;   // from the shape's axes
-  const Real* vertices;  // [3, count] in the shape's axes
+  const Real* vertices;  // [3, count] in the shape's axes, or as `apart` and `axes` say
   // neighbours of vertex k of a large hull: next[first_next[k]] and on, up to next[first_next[k + 1]]; or null
   const int *first_next = nullptr, *next = nullptr;
+  int apart = 1, axes = 0;  // how far apart vertices are, and their x, y and z (0: count)
   static constexpr int SPREAD = 32;  // so many of the first vertices of such a hull lie in all directions
 
   OSIK_FN Real radius() const { return kind == SPHERE || kind == CAPSULE || kind == HULL ? size.x : Real(0); }
@@ -43,7 +44,11 @@ template <class Real> struct Convex {
     const Real across = sqrt(d.x * d.x + d.y * d.y), share = across > Real(1e-30) ? size.x / across : Real(0);
     return {share * d.x, share * d.y, toward(size.y, d.z)};
   }
-  OSIK_FN V vertex(int k) const { return {vertices[k], vertices[count + k], vertices[2 * count + k]}; }
+  OSIK_FN V vertex(int k) const {
+    const Real* x = vertices + k * apart;
+    const int next_axis = axes ? axes : count;
+    return {x[0], x[next_axis], x[2 * next_axis]};
+  }
   OSIK_FN V support(V d) const {
     int near = -1;
     return support(d, near);

@@ -5,7 +5,9 @@
 #include <algorithm>
 #include <vector>
 
+#include "collision.hpp"
 #include "freedom.hpp"
+#include "xla.hpp"
 
 namespace osik {
 
@@ -86,7 +88,7 @@ class NearRows {
   // The nearest pairs that are not farther than `detection`, exact and sorted.
   void find_nearest(double detection, size_t most) {
     candidates.clear(), near.clear();
-    collision.each_moving_pair([&](int number, Collision<double>::Pair p) {
+    collision.each_moving_pair([&](int number, Pair p) {
       if (collision.is_out_of_reach(p, detection)) return;
       const double bound = collision.lower_bound(p);
       if (bound < detection) candidates.push_back({bound, number});
@@ -128,19 +130,18 @@ class NearRows {
 
 // Arguments: the fields of Kinematics, the robot's integers and numbers, a scene, numbers of the limit [5]. Results: those
 // of NearRows::find; then, if they are asked for, those of put_geometry [most, 29] and [most].
-inline void find_near_rows(const xla::Call& call) {
-  const ShapedRobot<double> robot(call.in<int>(5), call.in<double>(6));
+inline void find_near_rows(const xla::Batch& call) {
+  const ShapedRobot<double> robot(call.integers(5), call.in(6, 0));
   NearRows rows(robot);
   const int lanes = call.result_size(0, 0), most = call.result_size(0, 1);
   for (int lane = 0; lane < lanes; ++lane) {
     if (lane == 0 || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane));
-    auto in = [&](int k) { return xla::lane_of(call, k, lane); };
-    auto out = [&](int k) { return call.out<double>(k) + xla::numbers_of_lane(call.result(k)) * lane; };
-    int* pair = call.out<int>(3) + 4 * most * lane;
+    auto in = [&](int k) { return call.in(k, lane); };
+    auto out = [&](int k) { return call.out(k, lane); };
     rows.find({in(0), in(1), in(2), in(3), in(4)}, *reinterpret_cast<const AvoidanceNumbers*>(in(9)), most, out(0), out(1),
-              out(2), pair);
-    if (call.frame->results.size <= 4) continue;
-    int* carried = call.out<int>(5) + most * lane;
+              out(2), call.labels(3, lane));
+    if (call.call.frame->results.size <= 4) continue;
+    int* carried = call.labels(5, lane);
     std::fill_n(out(4), 29 * most, 0.0), std::fill_n(carried, most, 0);
     for (int k = 0; k < rows.count(); ++k) rows.put_geometry(k, out(4) + 29 * k, carried[k]);
   }

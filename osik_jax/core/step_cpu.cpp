@@ -19,12 +19,12 @@ void take_steps(const xla::Call& call) {
   std::vector<size_t> sizes(given), strides(given);
   bool shared_clean = true;
   for (int k = 0; k < given; ++k) {
-    arrays[k] = call.in<double>(FIRST + k), sizes[k] = xla::numbers_of_lane(call.argument(FIRST + k));
+    arrays[k] = call.in<double>(FIRST + k), sizes[k] = xla::Call::numbers_of_lane(call.argument(FIRST + k));
     strides[k] = call.size(FIRST + k, 0) > 1 ? sizes[k] : 0;
     if (!strides[k]) shared_clean = shared_clean && !has_nan(arrays[k], sizes[k]);
   }
   auto guess = [&](int k, int lane) -> const int* {
-    const size_t labels = xla::numbers_of_lane(call.argument(k));
+    const size_t labels = xla::Call::numbers_of_lane(call.argument(k));
     return labels ? call.in<int>(k) + (call.size(k, 0) > 1 ? labels * lane : 0) : nullptr;
   };
   auto begin_at = [&](int lane) {

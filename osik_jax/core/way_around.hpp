@@ -7,7 +7,9 @@
 #pragma once
 #include <cstdint>
 
+#include "collision.hpp"
 #include "freedom.hpp"
+#include "threads.hpp"
 
 namespace osik {
 
@@ -57,21 +59,21 @@ class WayAround {
   // Argument 0: configurations [lanes, nq]; 1: more of them [lanes, k, nq]; 2, 3: robot; 4: number of entries that move,
   // states to try, key, the entries; 5: their ranges, and the longest step by the distance of the corners; 6, 7: scene;
   // 8: clearance.
-  WayAround(const xla::Call& call, const ShapedRobot<double>& robot)
-      : robot(robot), collision(robot), n(call.in<int>(4)[0]), most(call.in<int>(4)[1]), entry(call.in<int>(4) + 3),
-        low(call.in<double>(5)), high(low + n), q(call.size(0, 1)), travel(robot.joints), middle(n), spread(n), curve(4 * n),
+  WayAround(const xla::Batch& call, const ShapedRobot<double>& robot)
+      : robot(robot), collision(robot), n(call.integers(4)[0]), most(call.integers(4)[1]), entry(call.integers(4) + 3),
+        low(call.in(5, 0)), high(low + n), q(call.size(0, 1)), travel(robot.joints), middle(n), spread(n), curve(4 * n),
         points(5 * n) {}
 
   // From a configuration to one of more. Results: vertices [lanes, longest, n], radii of corners [lanes, longest], and
   // [lanes, 6] status, goal, vertices, states that were tried, and the pair that touches.
-  void connect(const xla::Call& call, int lane) {
+  void connect(const xla::Batch& call, int lane) {
     const int longest = call.result_size(0, 1);
-    double* vertices = call.out<double>(0) + size_t(longest) * n * lane;
-    double* radii = call.out<double>(1) + size_t(longest) * lane;
-    int* labels = call.out<int>(2) + 6 * lane;
+    double* vertices = call.out(0, lane);
+    double* radii = call.out(1, lane);
+    int* labels = call.labels(2, lane);
     std::fill(vertices, vertices + longest * n, 0.0), std::fill(radii, radii + longest, 0.0);
     begin(call, lane);
-    Collision<double>::Nearest touching;
+    Nearest<double> touching;
     const Status status = plan(call.size(1, 1), touching);
     limit = tried + most;
     List way;
@@ -86,21 +88,21 @@ class WayAround {
     for (int k = 1; k + 1 < labels[2]; ++k) radii[k] = corner(vertices + n * (k - 1));
   }
   // Whether a cubic Bezier curve with these four control points is free. Result: [lanes] flags.
-  void prove(const xla::Call& call, int lane) {
+  void prove(const xla::Batch& call, int lane) {
     begin(call, lane), margin = FINEST;
     for (int e = 0; e < 4; ++e)
       for (int k = 0; k < n; ++k) curve[e * n + k] = (e ? goals + (e - 1) * q.size() : start)[entry[k]];
-    call.out<int>(0)[lane] = collision.nearer(clearance, false).i < 0 && is_free_curve();
+    *call.labels(0, lane) = collision.nearer(clearance, false).i < 0 && is_free_curve();
   }
 
  private:
   // Take a lane's configurations and scene.
-  void begin(const xla::Call& call, int lane) {
+  void begin(const xla::Batch& call, int lane) {
     const int own = call.size(6, 0) > 1 ? lane : 0;
-    start = xla::lane_of(call, 0, lane), goals = xla::lane_of(call, 1, lane);
+    start = call.in(0, lane), goals = call.in(1, lane);
     q.assign(start, start + q.size());
     if (own != row) collision.set(scene_of(call, 6, robot.shapes, lane)), row = own;
-    clearance = *xla::lane_of(call, 8, lane), tried = 0, limit = most, random_state = uint64_t(call.in<int>(4)[2]) + 1;
+    clearance = *call.in(8, lane), tried = 0, limit = most, random_state = uint64_t(call.integers(4)[2]) + 1;
     measure(call.size(1, 1)), collision.place(start);
   }
   int chosen = 0, ends[2] = {0, 0};  // the goal; the nodes at which the trees meet
@@ -209,8 +211,7 @@ class WayAround {
   // the sum of the distances between the joints from this one to the shape, and the shape's radius.
   void add_reach(int shape, int other, List& reach) const {
     int body = collision.carrier_of(shape);
-    V at = collision.own_center(shape);
-    double length = collision.own_radius(shape);
+    auto [at, length] = collision.own_ball(shape);
     for (; body > 0; body = robot.parents[body]) {
       int joint = robot.joints - 1;
       for (; joint >= 0 && robot.owners[joint] >= body; --joint) {
@@ -230,7 +231,7 @@ class WayAround {
 
   // ---- Search
 
-  Status plan(int count, Collision<double>::Nearest& touching) {
+  Status plan(int count, Nearest<double>& touching) {
     for (Tree& tree : trees) tree.nodes.clear(), tree.parents.clear();
     goal_of_root.clear(), margin = MARGIN;
     if (!add_root(trees[0], start, touching)) return BAD_START;
@@ -258,7 +259,7 @@ class WayAround {
 
   const double* node(int tree, int k) const { return trees[tree].nodes.data() + size_t(n) * k; }
   // Make a configuration a root, if it is free; the margin is such that it keeps two of them.
-  bool add_root(Tree& tree, const double* from, Collision<double>::Nearest& touching) {
+  bool add_root(Tree& tree, const double* from, Nearest<double>& touching) {
     List x(n);
     for (int k = 0; k < n; ++k) x[k] = from[entry[k]];
     place(x.data());
@@ -390,8 +391,8 @@ class WayAround {
   }
 };
 
-template <void (WayAround::*method)(const xla::Call&, int)> void find_ways(const xla::Call& call) {
-  const ShapedRobot<double> robot(call.in<int>(2), call.in<double>(3));
+template <void (WayAround::*method)(const xla::Batch&, int)> void find_ways(const xla::Batch& call) {
+  const ShapedRobot<double> robot(call.integers(2), call.in(3, 0));
   in_threads(call.result_size(0, 0), 2,
              [&] { return [&, way = WayAround(call, robot)](int lane) mutable { (way.*method)(call, lane); }; });
 }

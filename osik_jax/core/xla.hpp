@@ -10,6 +10,7 @@
 #include <stdexcept>
 #include <string_view>
 #include <type_traits>
+#include <vector>
 
 namespace osik::xla {
 
@@ -156,18 +157,38 @@ struct Call {
   int result_size(int k, int axis) const { return length(result(k), axis); }
   template <class T> const T* in(int k) const { return data<T>(argument(k)); }
   template <class T> T* out(int k) const { return data<T>(result(k)); }
+
+  // How many numbers one lane of a buffer has. Its leading axis is that of the lanes, or has length 1 where all share it.
+  static size_t numbers_of_lane(const Buffer& buffer) {
+    size_t count = 1;
+    for (int axis = 1; axis < buffer.rank; ++axis) count *= buffer.dimensions[axis];
+    return count;
+  }
+  template <class T> const T* of_lane(int k, int lane) const {
+    return in<T>(k) + (size(k, 0) > 1 ? numbers_of_lane(argument(k)) * lane : 0);
+  }
+  template <class T> T* out(int k, int lane) const { return out<T>(k) + numbers_of_lane(result(k)) * lane; }
 };
 
-// How many numbers one lane of a buffer has. Its leading axis is that of the lanes, or has length 1 where all share it.
-inline size_t numbers_of_lane(const Buffer& buffer) {
-  size_t count = 1;
-  for (int axis = 1; axis < buffer.rank; ++axis) count *= buffer.dimensions[axis];
-  return count;
-}
-inline const double* lane_of(const Call& call, int k, int lane) {
-  const Buffer& buffer = call.argument(k);
-  return call.in<double>(k) + (call.size(k, 0) > 1 ? numbers_of_lane(buffer) * lane : 0);
-}
+// A call as methods take it that are written for a CPU and a GPU: kinematic_calls.hpp says what its words mean.
+struct Batch {
+  using Real = double;
+  using In = const double*;
+  using Out = double*;
+  using Space = std::vector<double>;
+  Call call;
+  Space space() const { return Space(number(call.frame->attributes, "space")); }
+  int size(int k, int axis) const { return call.size(k, axis); }
+  int result_size(int k, int axis) const { return call.result_size(k, axis); }
+  const int* integers(int k, int lane = 0) const { return call.of_lane<int>(k, lane); }
+  In in(int k, int lane) const { return call.of_lane<double>(k, lane); }
+  In numbers(int k, int lane) const { return in(k, lane); }
+  Out out(int k, int lane) const { return call.out<double>(k, lane); }
+  int* labels(int k, int lane) const { return call.out<int>(k, lane); }
+  template <class F> void each_lane(F f) const {
+    for (int lane = 0; lane < result_size(0, 0); ++lane) f(lane);
+  }
+};
 
 // An error that XLA raises in Python with this message.
 inline void* error(CallFrame* frame, const char* message) {
@@ -185,5 +206,6 @@ template <void (*solve)(const Call&)> void* handle(CallFrame* frame) {
   }
   return nullptr;
 }
+template <void (*solve)(const Batch&)> void of_batch(const Call& call) { solve(Batch{call}); }
 
 }  // namespace osik::xla
