@@ -19,6 +19,7 @@ from ..robot import Robot
 from ._core import (
     CoreRobot,
     CoreScene,
+    Gaps,
     are_free,
     check_length,
     check_scene,
@@ -113,7 +114,7 @@ def _in_lanes(call: Any, own: CoreRobot, q: Array, scene: CoreScene, *more: Arra
 
 def _prepared(robot: Robot, q: Any, scene: Scene, srdf: Given, what: str) -> tuple[RobotShapes, Array, tuple[int, ...]]:
     """Return the robot's shapes, the configurations as (lanes, nq), and their leading axes."""
-    require_core(what)
+    require_core(what, on_gpu=True)
     check_scene(scene)
     q = jnp.asarray(q, robot.q0.dtype)
     if q.ndim == 0 or q.shape[-1] != robot.nq:
@@ -128,23 +129,34 @@ def _prepared(robot: Robot, q: Any, scene: Scene, srdf: Given, what: str) -> tup
 
 def distances(robot: Robot, shapes: RobotShapes, q: Float[Array, "lanes nq"], scene: Scene) -> tuple[Array, Array]:
     """Return the distance of the nearest pair at each configuration, with its derivative, and the pair's numbers."""
-    return _distances(robot, core_robot(robot, shapes), jnp.asarray(shapes.bodies), q, core_scene(scene, shapes), scene)
+    gaps = _gaps(core_robot(robot, shapes), jax.lax.stop_gradient((q, core_scene(scene, shapes))))
+    return differentiable(robot, shapes, q, scene, gaps), gaps.pair
 
 
 @jax.jit
-def _distances(
-    robot: Robot, own: CoreRobot, bodies: Int[Array, " k"], q: Float[Array, "lanes nq"], arrays: CoreScene, scene: Scene
-) -> tuple[Array, Array]:
-    gaps = _in_lanes(gaps_at, *jax.lax.stop_gradient((own, q, arrays)))
+def _gaps(own: CoreRobot, given: tuple[Array, CoreScene]) -> Gaps:
+    return _in_lanes(gaps_at, own, *given)
+
+
+def differentiable(
+    robot: Robot, shapes: RobotShapes, q: Float[Array, "lanes nq"], scene: Scene, gaps: Gaps
+) -> Float[Array, " lanes"]:
+    """Return the distances of nearest pairs at each configuration with their derivatives."""
+    return _differentiable(robot, jnp.asarray(shapes.bodies), q, scene, gaps)
+
+
+@jax.jit
+def _differentiable(
+    robot: Robot, bodies: Int[Array, " k"], q: Float[Array, "lanes nq"], scene: Scene, gaps: Gaps
+) -> Float[Array, " lanes"]:
     rows: Any = scene.table.position, scene.table.rotation, scene.body
     if scene.is_stack and len(scene.body) == 1:
         rows = tuple(a[0] for a in rows)
     each = 0 if rows[2].ndim == 2 else None
     lane = partial(_moved, robot, bodies)
     moved = jax.vmap(lane, (0, 0, 0, 0, each, each, each))(q, gaps.points, gaps.normal, gaps.pair, *rows)
-    known = jnp.isfinite(gaps.distance)
-    slope = jnp.where(known, moved - jax.lax.stop_gradient(moved), 0.0)
-    return gaps.distance + slope, gaps.pair
+    slope = jnp.where(jnp.isfinite(gaps.distance), moved - jax.lax.stop_gradient(moved), 0.0)
+    return gaps.distance + slope
 
 
 def _moved(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +14,9 @@ import scipy
 from jaxtyping import Array, Bool, Float, Int
 
 from .._errors import OsikError, OsikTypeError, OsikValueError
-from ..core import _library
-from ..execution._platform import cpu_is_default
+from ..core import _cuda, _library
+from ..execution._backends import core_is_here
+from ..execution._platform import cuda_is_default
 from ..kinematics._kernels import dof_columns, tree_integers
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
@@ -25,6 +28,8 @@ from ._table import RobotShapes, ShapeKind, ShapeTable
 
 _SPREAD = 32
 """Vertices of a hull in all directions, from which the core begins to look for the farthest one."""
+_SPACES = {"are_free": "clearances"}
+"""Methods that take the workspace of another."""
 _PACK = 4
 """Hulls have a multiple of so many vertices in the core: the last one is repeated."""
 
@@ -41,25 +46,59 @@ class CoreScene(NamedTuple):
     integers: Int[Array, "scenes n"] | np.ndarray
     numbers: Float[Array, "scenes m"] | np.ndarray
 
+    def rows(self, shapes: int) -> int:
+        """Return the number of rows, beside a robot with so many shapes."""
+        others, length = 4 + shapes, self.integers.shape[-1] - 1
+        return (math.isqrt(others**2 + 4 * length) - others) // 2
 
-class CoreRobot(NamedTuple):
+
+class CoreRobot(eqx.Module):
     """A robot and its shapes for the core.
 
     Attributes:
         integers: (n,)
         numbers: (m,)
+        sizes: numbers of bodies, dofs and shapes (static).
     """
 
-    integers: Int[Array, " n"] | np.ndarray
-    numbers: Float[Array, " m"] | np.ndarray
+    integers: Int[Array, "*one n"] | np.ndarray
+    numbers: Float[Array, "*one m"] | np.ndarray
+    sizes: tuple[int, int, int] = eqx.field(static=True)
 
 
-def require_core(what: str) -> None:
-    """Raise an error where the compiled core is missing, or JAX's default device is not a CPU."""
-    if not cpu_is_default():
-        raise OsikError(f"{what} runs on a CPU: call it under jax.default_device(jax.devices('cpu')[0])")
-    if not _library.installed():
+def require_core(what: str, *, on_gpu: bool = False) -> None:
+    """Raise an error where the compiled core is missing, or does not run on JAX's default device.
+
+    Args:
+        what: needs it.
+        on_gpu: whether it runs on a GPU too.
+    """
+    if core_is_here() and (on_gpu or not cuda_is_default()):
+        return
+    if _library.core().library is None:
         raise OsikError(f"{what} needs the compiled core: {_library.core().reason}")
+    if on_gpu and cuda_is_default():
+        raise OsikError(f"{what} needs NVRTC, which comes with jax[cuda12] or jax[cuda13], and a GPU of 2020 or newer")
+    raise OsikError(f"{what} runs on a CPU: call it under jax.default_device(jax.devices('cpu')[0])")
+
+
+def call_here(
+    method: str, shapes: _library.Shapes, *given: Any, sizes: tuple[int, ...], members: int = 1
+) -> list[Array]:
+    """Call a method of the core on JAX's default device: ``_library.call``, or ``_cuda.call_lanes`` with ``members``.
+
+    Args:
+        method: its name.
+        shapes: of the results.
+        given: arrays.
+        sizes: what ``core/_cuda.py: space_of_lane`` takes.
+        members: threads of a lane on a GPU.
+    """
+    if not cuda_is_default():
+        return _library.call(method, shapes, *given)
+    return _cuda.call_lanes(
+        method, shapes, *given, space=_cuda.space_of_lane(_SPACES.get(method, method), *sizes), members=members
+    )
 
 
 @remembered
@@ -110,7 +149,8 @@ def core_robot(
         column_factors,
     ]
     with jax.ensure_compile_time_eval():  # on the device once, also if a user's program is traced
-        return CoreRobot(jnp.asarray(_flat(integers, np.int32)), jnp.asarray(_flat(numbers, np.float64)))
+        arrays = jnp.asarray(_flat(integers, np.int32)), jnp.asarray(_flat(numbers, np.float64))
+        return CoreRobot(*arrays, (sizes[0], sizes[2], sizes[4]))
 
 
 def _flat(parts: Sequence[Any], kind: Any) -> np.ndarray:
@@ -236,7 +276,12 @@ def gaps_at(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> 
     """Return the nearest pair at each configuration."""
     lanes = max(map(len, (q, *scene)))
     shapes = [((lanes, 10), float), ((lanes, 2), int)]
-    numbers, pair = _library.call("clearances", shapes, q, robot.integers, robot.numbers, *scene)
+    numbers, pair = _call_at("clearances", shapes, robot, q, scene)
+    return read_gaps(numbers, pair)
+
+
+def read_gaps(numbers: Float[Array, "lanes 10"], pair: Int[Array, "lanes 2"]) -> Gaps:
+    """Return gaps from distance, points and normal of each."""
     return Gaps(numbers[:, 0], numbers[:, 1:7].reshape(-1, 2, 3), numbers[:, 7:], pair)
 
 
@@ -244,9 +289,16 @@ def are_free(
     robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene, clearance: Float[Array, " 1"]
 ) -> Bool[Array, " lanes"]:
     """Return whether all pairs keep a distance at each configuration."""
-    given = q, robot.integers, robot.numbers, *scene, clearance
     lanes = max(map(len, (q, *scene, clearance)))
-    return _library.call("are_free", [((lanes,), int)], *given)[0] > 0
+    return _call_at("are_free", [((lanes, 1), int)], robot, q, scene, clearance)[0][:, 0] > 0
+
+
+def _call_at(
+    method: str, shapes: _library.Shapes, robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene, *more: Any
+) -> list[Array]:
+    sizes = *robot.sizes, scene.rows(robot.sizes[2])
+    own = (a.reshape(1, -1) for a in (robot.integers, robot.numbers))
+    return call_here(method, shapes, q, *own, *scene, *more, sizes=sizes)
 
 
 def gaps_between(first: ShapeTable, second: ShapeTable) -> Gaps:
@@ -261,7 +313,7 @@ def gaps_between(first: ShapeTable, second: ShapeTable) -> Gaps:
     numbers = np.stack([np.concatenate([t.size, t.position, np.reshape(t.rotation, (-1, 9))], 1) for t in tables], 1)
     out = _library.call("shape_gaps", [((len(integers), 10), float)], *(integers, numbers, np.concatenate(vertices)))[0]
     pair = jnp.arange(len(integers))[:, None].repeat(2, 1)
-    return Gaps(out[:, 0], out[:, 1:7].reshape(-1, 2, 3), out[:, 7:], pair)
+    return read_gaps(out, pair)
 
 
 class Ways(NamedTuple):

@@ -175,7 +175,7 @@ def _by_core(
     limit: Array,
 ) -> NearRows:
     """Return the rows of all lanes; arrays have a leading axis, of the lanes or of length 1."""
-    given = *kinematics, *kept.core, integers, numbers, limit
+    given = *kinematics, kept.core.integers, kept.core.numbers, integers, numbers, limit
     lanes = max(len(a) for a in (*kinematics, integers, numbers, limit))
     shapes: Any = [((lanes, most, kept.tree.nv), float), ((lanes, most), float), ((lanes, most), float)]
     shapes += [((lanes, most, 4), int)]

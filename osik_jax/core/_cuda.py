@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import math
 import os
 import re
 import sys
@@ -26,6 +27,8 @@ _SHARED_BYTES = 97  # CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN
 DEFAULT_SHARED_BYTES = 48 * 1024
 """Shared memory [bytes] that every CUDA device offers a block by default."""
 _MOST_SPACES = 1 << 14
+_MOST_KEPT = 1024
+"""Numbers of an argument that all lanes share and a block keeps in its shared memory."""
 _MOST_NUMBERS = 8
 """Length of results that a thread writes side by side: of longer ones the threads of a warp write neighbours."""
 _LOCAL_INCLUDE = re.compile(r'^#include "(.*)"\n', re.MULTILINE)
@@ -141,15 +144,17 @@ def call(
 
 
 def call_lanes(
-    method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, space: int = 0
+    method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: Any, space: int = 0, members: int = 1
 ) -> list[Array]:
-    """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane: a robot of the batch.
+    """Call a method of ``core/kinematic_calls.hpp`` and the like on a GPU. A lane is a robot or a target of the batch.
 
     Args:
         method: name of its CPU handler without the prefix "osik_".
-        outputs: shape and type of each result, as for ``_library.call``; all are floats.
-        inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers.
-        space: numbers of workspace of a lane.
+        outputs: shape and type of each result, as for ``_library.call``.
+        inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers that all
+            lanes share, or with such an axis.
+        space: numbers of workspace of a thread.
+        members: threads of each lane: 1, 2, 4, ... 32; of a method with groups they are the last of its ``options``.
 
     Returns:
         The results, in the precision of the inputs.
@@ -158,12 +163,14 @@ def call_lanes(
     real = next(a.dtype for a in arrays if _is_real(a))
     arrays = [a.astype(real if _is_real(a) else jnp.int32) for a in arrays]
     lanes = outputs[0][0][0]
-    given = tuple((2 if len(a) > 1 else 1, *a.shape[1:]) if _is_real(a) else a.shape for a in arrays)
+    given = tuple((min(len(a), 2), *a.shape[1:]) if _is_real(a) or a.ndim > 1 else a.shape for a in arrays)
     integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))
     results = tuple((min(lanes, 2), *shape[1:]) for shape, _ in outputs)
-    source = _lanes_source(method, real == jnp.float32, given, integers, results, space)
-    shapes, last = [(shape, real) for shape, _ in outputs], [*_lanes_last(given), *_lanes_last(results, _MOST_NUMBERS)]
-    return call(source, shapes, *arrays, problems=lanes, shared=0, per_block=64, warps=2, lanes_last=last)
+    labels = tuple(k for k, (_, kind) in enumerate(outputs) if _kind(kind) == jnp.int32)
+    source = _lanes_source(method, real == jnp.float32, given, integers, results, labels, space)
+    shapes = [(shape, jnp.int32 if k in labels else real) for k, (shape, _) in enumerate(outputs)]
+    last = [*_lanes_last(given), *_lanes_last(results, _MOST_NUMBERS)]
+    return call(source, shapes, *arrays, problems=lanes, shared=0, per_block=64 // members, warps=2, lanes_last=last)
 
 
 _METHODS = {
@@ -174,7 +181,13 @@ _METHODS = {
     "pose_rows": "find_pose_rows",
     "frame_rows": "find_frame_rows",
     "chain_steps": "advance_chain",
+    "chain_find": "find_chain",
+    "free_find": "find_free",
+    "clearances": "find_clearances",
+    "are_free": "find_free_ones",
 }
+_GROUPED, _OPTIONS = ("chain_find", "free_find"), 4
+"""Methods whose lanes have several threads, and their argument of options."""
 
 
 @cache
@@ -184,16 +197,18 @@ def _lanes_source(
     given: tuple[tuple[int, ...], ...],
     integers: tuple[int, ...],
     results: tuple[tuple[int, ...], ...],
+    labels: tuple[int, ...] = (),
     space: int = 0,
 ) -> str:
-    """Return CUDA text that runs a method for one lane a thread.
+    """Return CUDA text that runs a method for each lane.
 
     Args:
         method: as in ``call_lanes``.
         single: whether floats are of single precision.
-        given: shape of each argument; the leading axis of floats is 1 if all lanes share it.
+        given: shape of each argument; the leading axis is 1 if all lanes share it, 2 if each has its own.
         integers: which arguments are integers.
         results: shape of each result; the leading axis is 1 if there is one lane.
+        labels: which results are integers.
         space: as in ``call_lanes``.
     """
 
@@ -205,20 +220,33 @@ def _lanes_source(
     def names(letter: str, count: int) -> str:
         return ", ".join(f"{letter}{k}" for k in range(count))
 
+    kept = [
+        k for k, shape in enumerate(given) if k not in integers and shape[0] == 1 and math.prod(shape) <= _MOST_KEPT
+    ]
+    copies = [
+        f"__shared__ Real s{k}[{math.prod(given[k])}];\n"
+        f"for (int i = threadIdx.x; i < {math.prod(given[k])}; i += blockDim.x) s{k}[i] = a{k}[i];\n"
+        for k in kept
+    ]
+
     parameters = [f"const {'int' if k in integers else 'Real'}* a{k}" for k in range(len(given))]
-    parameters += [f"Real* r{k}" for k in range(len(results))]
+    parameters += [f"{'int' if k in labels else 'Real'}* r{k}" for k in range(len(results))]
     return (
         text_of("lanes_cuda.hpp")
         + f"using namespace osik;\nusing Real = {'float' if single else 'double'};\nstruct Sizes {{\n"
-        + f"static constexpr int SPACE = {space};\n"
+        + f"static constexpr int SPACE = {max(space, 1)};\n"
         + table("argument", given)
         + table("result", results)
         + f"static constexpr unsigned LANES_LAST = {_mask(_lanes_last(given))};\n"
         + f"static constexpr unsigned RESULTS_LANES_LAST = {_mask(_lanes_last(results, _MOST_NUMBERS))};\n"
         + f'}};\nextern "C" __global__ void osik_kernel({", ".join(parameters)}, int problems) {{\n'
+        + "".join(copies)
+        + "__syncthreads();\n" * bool(copies)
         + f"const void* arguments[] = {{{names('a', len(given))}}};\n"
         + f"void* results[] = {{{names('r', len(results))}}};\n"
-        + f"{_METHODS[method]}(ThreadCall<Real, Sizes>{{arguments, results, problems}});\n}}\n"
+        + f"const Real* kept[] = {{{', '.join(f's{k}' if k in kept else 'nullptr' for k in range(len(given)))}}};\n"
+        + f"const int members = {f'a{_OPTIONS}[{given[_OPTIONS][0] - 1}]' if method in _GROUPED else 1};\n"
+        + f"{_METHODS[method]}(ThreadCall<Real, Sizes>{{arguments, results, kept, problems, members}});\n}}\n"
     )
 
 
@@ -239,6 +267,10 @@ def _is_real(a: Any) -> bool:
     return jnp.issubdtype(a.dtype, jnp.floating)
 
 
+def _kind(kind: Any) -> Any:
+    return jnp.float32 if jnp.issubdtype(jnp.dtype(kind), jnp.floating) else jnp.int32
+
+
 def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
     """Return the axes of an array from the slowest in memory to the fastest."""
     return (*range(1, axes), 0) if lanes_last else tuple(range(axes))
@@ -248,6 +280,12 @@ def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:
 def space_of(method: str, *sizes: int) -> int:
     """Return the shared memory that a problem of these sizes takes [bytes], by the core's ``osik_{method}_bytes``."""
     return getattr(_library.core().library, f"osik_{method}_bytes")(*sizes)
+
+
+@cache
+def space_of_lane(method: str, *sizes: int) -> int:
+    """Return how many numbers of workspace a thread takes, by the core's ``osik_{method}_space``."""
+    return getattr(_library.core().library, f"osik_{method}_space")(*sizes)
 
 
 @cache

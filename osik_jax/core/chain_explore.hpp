@@ -9,12 +9,13 @@
 
 namespace osik {
 
-template <class Call> class PackFinder : public ChainFinder<Call> {
+template <class Call, bool IN_SCENE> class PackFinder : public ChainFinder<Call, IN_SCENE> {
   template <class R> struct Kind {
     using Real = R;
     using In = const double*;
+    using Numbers = const double*;
   };
-  using Base = ChainFinder<Call>;
+  using Base = ChainFinder<Call, IN_SCENE>;
   using typename Base::Errors, typename Base::In;
   using Pack = Lanes<double>;
   using List = std::vector<double>;
@@ -40,7 +41,7 @@ template <class Call> class PackFinder : public ChainFinder<Call> {
   PackFinder(const Call& call, double* space)
       : Base(call, space), gram(n * n), pack_space(Base::Search::space_of(n, frames, call.integers(3)[1])), pack_here(n),
         pack(call.integers(3) + 1, n, frames, pack_space.data()) {
-    pack.read(call.in(2, 0));
+    pack.read(call.numbers(2, 0));
   }
 
   void solve(const Call& call, int target) {
@@ -49,15 +50,15 @@ template <class Call> class PackFinder : public ChainFinder<Call> {
     const int most = this->begin_target(call, target), all = most ? seeds : 0;
     Best best = is_near || is_every ? explored(goal, all, is_near, false, outcomes) : plain(goal, most);
     if (is_near) compare_with_plain(goal, most, best);
-    if (freedom && is_every && !(best.score <= 1)) best = plain(goal, most);
-    if (freedom && !(best.score <= 1)) freedom->take_least_wrong(best.x.data(), best.seed);
+    if (IN_SCENE && is_every && !(best.score <= 1)) best = plain(goal, most);
+    if (IN_SCENE && !(best.score <= 1)) freedom->take_least_wrong(best.x.data(), best.seed);
     std::copy(best.x.begin(), best.x.end(), here);
     this->answer(call, target, best.seed, best.steps);
   }
 
  private:
   // Searches until one has a solution.
-  Best plain(In goal, int most) { return freedom ? explored(goal, most, false, true, nullptr) : found(goal, most); }
+  Best plain(In goal, int most) { return IN_SCENE ? explored(goal, most, false, true, nullptr) : found(goal, most); }
   // One search after another.
   Best found(In goal, int most) {
     Best best{List(search.start, search.start + n), NEVER, 0, 0, 0};
@@ -88,10 +89,11 @@ template <class Call> class PackFinder : public ChainFinder<Call> {
       begin(lanes[k].seed, near, [&](int j, double to) { pack.x[j].v[k] = to; });
       pack.pull.v[k] = near, pack.enough.v[k] = search.enough;
     };
-    for (int k = 1; outcomes && freedom && k <= seeds; ++k) outcomes[(n + 2) * k - 2] = NEVER, outcomes[(n + 2) * k - 1] = 0;
+    for (int k = 1; outcomes && IN_SCENE && k <= seeds; ++k)
+      outcomes[(n + 2) * k - 2] = NEVER, outcomes[(n + 2) * k - 1] = 0;
     for (int j = 0; j < n; ++j) pack.x[j] = search.start[j];
     for (int k = 0; k < Pack::COUNT; ++k) start(k);
-    auto is_over = [&] { return (brief && best.score <= 1) || (freedom && freedom->is_blocked); };
+    auto is_over = [&] { return (brief && best.score <= 1) || (IN_SCENE && freedom->is_blocked); };
     while (running && !is_over()) {
       const auto errors = pack.advance(check, goal, pack_here.data());
       for (int k = 0; k < Pack::COUNT; ++k) {
@@ -138,7 +140,7 @@ template <class Call> class PackFinder : public ChainFinder<Call> {
   void keep(In goal, int seed, double score, Best& best, double* outcomes) {
     List x(n);
     unwind(x.data());
-    score = score == score && (score > 1 || !freedom || this->is_free_end(goal, seed, x.data())) ? score : NEVER;
+    score = score == score && (score > 1 || !IN_SCENE || this->is_free_end(goal, seed, x.data())) ? score : NEVER;
     double distance = is_near ? 0 : seed;
     for (int j = 0; j < n && is_near; ++j) distance += (x[j] - search.start[j]) * (x[j] - search.start[j]);
     if (outcomes) {
@@ -174,22 +176,23 @@ template <class Call> class PackFinder : public ChainFinder<Call> {
 };
 
 template <class Call> void find_chain(const Call& call) {
-  std::vector<double> space(PackFinder<Call>::space_of(call));
-  PackFinder<Call> finder(call, space.data());
+  using Finder = PackFinder<Call, false>;
+  std::vector<double> space(Finder::space_of(call));
+  Finder finder(call, space.data());
   for (int target = 0; target < call.size(0, 0); ++target) finder.solve(call, target);
 }
 
 // The same in scenes, by all processor cores where there are many targets.
 template <class Call> void find_free(const Call& call) {
   constexpr int LEAST = 8;  // targets of a thread
-  using Finder = PackFinder<Call>;
+  using Finder = PackFinder<Call, true>;
   const auto robot = Finder::robot_of(call);
   struct Worker {
     std::vector<double> space, kept;
     Finder finder;
     Freedom<Call> freedom;
     Worker(const Call& call, const ShapedRobot<double>& robot)
-        : space(Finder::space_of(call)), kept(Freedom<Call>::space_of(call.integers(4)[0])), finder(call, space.data()),
+        : space(Finder::space_of(call)), kept(Freedom<Call>::space_of(call.size(5, 1))), finder(call, space.data()),
           freedom(finder.freedom_of(robot, kept.data())) {
       finder.take(&freedom);
     }

@@ -7,7 +7,8 @@
 
 namespace osik {
 
-template <class Call> class ChainFinder {
+// IN_SCENE: whether it has a scene; else every solution is free.
+template <class Call, bool IN_SCENE> class ChainFinder {
  protected:
   using Real = typename Call::Real;
   using In = typename Call::In;
@@ -19,24 +20,23 @@ template <class Call> class ChainFinder {
   int n, frames, check, trial, last, seeds, nq, nv, longest;
   bool is_warm, is_near, is_every, is_single;
   const int *shift, *increment, *turns, *entry, *dof;  // [n]
-  In low, high, home;                                  // [n], [n], [nq]
+  const Real *low, *high, *home;                                 // [n], [n], [nq]
   Real progress, settled, isolated, stopped, still;
   Real *here, *before, *q;  // [n] end of a search, and of the steps before; [nq] of an answer
   Search search;
-  Freedom<Call>* freedom = nullptr;  // null: every solution is free
+  Freedom<Call>* freedom = nullptr;  // of a search in a scene
 
   ChainFinder(const Call& call, Real* space)
-      : n(call.integers(4)[0]), frames(call.size(0, 1)), here(space), before(space + n), q(space + 2 * n),
-        search(call.integers(3) + 1, n, frames, space + 2 * n + call.integers(4)[6]) {
-    Reader<const int*> options{call.integers(4) + 1};
+      : n(call.size(5, 1)), frames(call.size(0, 1)), here(space), before(space + n), q(space + 2 * n),
+        search(call.integers(3) + 1, n, frames, space + 2 * n + call.integers(4)[5]) {
+    Reader<const int*> options{call.integers(4)}, lists{call.integers(5)};
     longest = *options.take(1), check = *options.take(1), trial = *options.take(1), last = *options.take(1),
     seeds = *options.take(1), nq = *options.take(1), nv = *options.take(1);
     is_warm = *options.take(1), is_near = *options.take(1), is_every = *options.take(1), is_single = *options.take(1);
-    shift = options.take(n), increment = options.take(n), turns = options.take(n), entry = options.take(n),
-    dof = options.take(n);
-    search.read(call.in(2, 0));
+    shift = lists.take(n), increment = lists.take(n), turns = lists.take(n), entry = lists.take(n), dof = lists.take(n);
+    search.read(call.numbers(2, 0));
     search.near = false, search.pull = 0;
-    Reader<In> more{search.numbers + 6};
+    Reader<const Real*> more{search.numbers + 6};
     low = more.take(n), high = more.take(n), home = more.take(nq);
     progress = more.take(1)[0], settled = more.take(1)[0], isolated = more.take(1)[0], stopped = more.take(1)[0],
     still = more.take(1)[0];
@@ -47,10 +47,10 @@ template <class Call> class ChainFinder {
     return 2 * n + nq + Search::space_of(n, frames, joints);
   }
   static int space_of(const Call& call) {
-    return space_of(call.integers(4)[0], call.size(0, 1), call.integers(3)[1], call.integers(4)[6]);
+    return space_of(call.size(5, 1), call.size(0, 1), call.integers(3)[1], call.integers(4)[5]);
   }
-  // The robot in a scene that a search reads; argument 5 and on.
-  static ShapedRobot<Real> robot_of(const Call& call) { return {call.integers(5), call.numbers(6, 0)}; }
+  // The robot in a scene that a search reads; argument 6 and on.
+  static ShapedRobot<Real> robot_of(const Call& call) { return {call.integers(6), call.numbers(7, 0)}; }
   Freedom<Call> freedom_of(const ShapedRobot<Real>& robot, Real* space) const { return {robot, n, entry, q, space}; }
   void take(Freedom<Call>* given) { freedom = given; }
 
@@ -59,7 +59,7 @@ template <class Call> class ChainFinder {
   // Begin with a target: the number of its searches.
   int begin_target(const Call& call, int target) {
     for (int k = 0; k < nq; ++k) q[k] = home[k];
-    return freedom && !freedom->begin(call, target) ? 0 : call.integers(1, target)[0];
+    return IN_SCENE && !freedom->begin(call, target) ? 0 : call.integers(1, target)[0];
   }
   // The start of a search.
   template <class F> void begin(int seed, bool near, F put) const {
@@ -80,7 +80,7 @@ template <class Call> class ChainFinder {
     return freedom->accepts(x, seed, search.tips, score, tolerances);
   }
   // `here` with whole turns added, as near to the start as the limits allow.
-  void unwind(Real* x) const {
+  OSIK_CALL void unwind(Real* x) const {
     for (int j = 0; j < n; ++j) {
       const Real lower = search.lower[j], upper = search.upper[j];
       const Real fewest = ceil((lower - here[j]) / TURN), most = floor((upper - here[j]) / TURN);
@@ -89,12 +89,12 @@ template <class Call> class ChainFinder {
       x[j] = number == 0 ? here[j] : within(here[j] + TURN * number, lower, upper);
     }
   }
-  Errors compare(In goal) {
+  OSIK_CALL Errors compare(In goal) {
     search.place();
     return search.compare(goal);
   }
   // `here` after one more step, where it is a solution and the step lowers its error.
-  void polish(In goal) {
+  OSIK_CALL void polish(In goal) {
     const Real enough = search.enough;
     search.enough = 0;
     for (int j = 0; j < n; ++j) search.x[j] = here[j];
@@ -106,7 +106,7 @@ template <class Call> class ChainFinder {
   // Write the answer `here`: the configuration q, its errors, residuals, and the limits that stop joints.
   void answer(const Call& call, int target, int seed, int steps) {
     const In goal = call.in(0, target);
-    if (!freedom) polish(goal);
+    if (!IN_SCENE) polish(goal);
     unwind(search.x);
     for (int k = 0; k < nq; ++k) q[k] = home[k];
     for (int j = 0; j < n; ++j) q[entry[j]] = search.x[j] = is_single ? Real(float(search.x[j])) : search.x[j];
@@ -128,7 +128,7 @@ template <class Call> class ChainFinder {
       labels[3 + dof[j]] = (search.x[j] >= search.upper[j] && gradient < 0) -
                            (search.x[j] <= search.lower[j] && gradient > 0);
     }
-    if (freedom) freedom->judge(call, target, is_every ? 4 : 3, labels);
+    if (IN_SCENE) freedom->judge(call, target, is_every ? 4 : 3, labels);
   }
 };
 }  // namespace osik

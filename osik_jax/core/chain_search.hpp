@@ -16,6 +16,7 @@ template <class Real> OSIK_FN Real most(Real a, Real b) { return select((a != a)
 template <class Call> struct ChainSearch {
   using Real = typename Call::Real;
   using In = typename Call::In;
+  using Numbers = typename Call::Numbers;  // a pointer
   using V = Vec3<Real>;
   using M = Mat3<Real>;
   struct Errors {
@@ -25,10 +26,10 @@ template <class Call> struct ChainSearch {
   bool near;                                       // whether what the frames leave free goes towards `start` in any
   const int *parent, *hinge, *coordinate, *end;    // [joints]: parent or `joints` for the world, ...; [frames] last joint
   const int *carries, *row;                        // [frames, joints] flags; [m] number among those that count or -1
-  In constant, first, second, offset, axis, anchor, tip, factor;  // [joints, 12] thrice, [joints], [joints, 3] twice,
-                                                                  // [frames, 12], [joints]
-  In lower, upper, start, numbers;                 // [n] thrice; length, tolerances, enough, share and least of damping
-  Real pull, enough;                               // 1 where it goes there, else 0; score at which a search ends, else
+  Numbers constant, first, second, offset, axis, anchor, tip, factor;  // [joints, 12] thrice, [joints], [joints, 3] twice,
+  // [frames, 12], [joints]
+  Numbers lower, upper, start, numbers;  // [n] thrice; length, tolerances, enough, share and least of damping
+  Real pull, enough;  // 1 where it goes there, else 0; score at which a search ends, else
   Real *pose, *turned, *point, *e, *gram;  // [joints, 12]; [joints, 3] axes and points on them; [rows], [rows, rows]
   Real *tips, *J, *x, *home;  // [frames, 3] positions; [n, rows]; [n] coordinates and way to the start
 
@@ -45,8 +46,8 @@ template <class Call> struct ChainSearch {
   static constexpr OSIK_HOST int space_of(int n, int frames, int joints) {
     return 18 * joints + 3 * frames + 2 * n + 6 * frames * (6 * frames + n + 1);
   }
-  void read(In given) {
-    Reader<In> at{given};
+  void read(Numbers given) {
+    Reader<Numbers> at{given};
     constant = at.take(12 * joints), first = at.take(12 * joints), second = at.take(12 * joints);
     offset = at.take(joints), axis = at.take(3 * joints), anchor = at.take(3 * joints), tip = at.take(12 * frames);
     factor = at.take(joints), lower = at.take(n), upper = at.take(n), start = at.take(n), numbers = at.at,
@@ -60,6 +61,8 @@ template <class Call> struct ChainSearch {
   V place_of_joint(int joint) const { return joint < joints ? place_of(pose + 12 * joint) : V{0, 0, 0}; }
 
   void place() {
+    M turn = M::identity();  // of the joint before
+    V at{0, 0, 0};
     for (int j = 0; j < joints; ++j) {
       const Real angle = (coordinate[j] < 0 ? Real(0) : x[coordinate[j]] * factor[j]) + offset[j];
       Real s, c;
@@ -68,8 +71,9 @@ template <class Call> struct ChainSearch {
       Real local[12];
       OSIK_UNROLL
       for (int i = 0; i < 12; ++i) local[i] = constant[12 * j + i] + f * first[12 * j + i] + g * second[12 * j + i];
-      const M before = turn_of_joint(parent[j]), turn = before * turn_of(local + 0);
-      const V at = before * place_of(local + 0) + place_of_joint(parent[j]);
+      const bool is_next = parent[j] == j - 1;
+      const M before = is_next ? turn : turn_of_joint(parent[j]);
+      at = before * place_of(local + 0) + (is_next ? at : place_of_joint(parent[j])), turn = before * turn_of(local + 0);
       Real* to = pose + 12 * j;
       turn.a.put(to), turn.b.put(to + 4), turn.c.put(to + 8);
       to[3] = at.x, to[7] = at.y, to[11] = at.z;
@@ -202,7 +206,7 @@ template <class Call> void advance_chain(const Call& call) {
   auto space = call.space();
   ChainSearch<Call> search(integers + 1, n, frames, space.data());
   call.each_lane([&](int lane) {
-    search.read(call.in(2, lane));
+    search.read(call.numbers(2, lane));
     auto x = call.in(0, lane);
     auto here = call.out(0, lane), there = call.out(1, lane), errors = call.out(2, lane);
     for (int j = 0; j < n; ++j) search.x[j] = x[j];

@@ -4,10 +4,6 @@
 
 namespace osik {
 
-template <class Real, class Out> void put(const Gap<Real>& gap, Out to) {
-  to[0] = gap.distance, gap.on_a.put(to + 1), gap.on_b.put(to + 4), gap.normal.put(to + 7);
-}
-
 // f(collision, lane) with the shapes placed at each configuration: arguments q [lanes, nq], the robot's integers and numbers,
 // a scene.
 template <class Call, class F> void each_placed(const Call& call, F f) {

@@ -66,7 +66,9 @@ template <class Real> struct Convex {
   }
   // Of the first vertices.
   OSIK_FN int farthest(V d, int number_of_first) const {
-#ifdef __CUDACC__
+#ifndef __CUDACC__
+    if (apart == 1) return farthest_of_neighbours(d, number_of_first);
+#endif
     int best = 0;
     Real most = inner(d, vertex(0));
     for (int k = 1; k < number_of_first; ++k) {
@@ -74,7 +76,9 @@ template <class Real> struct Convex {
       if (along > most) most = along, best = k;
     }
     return best;
-#else
+  }
+#ifndef __CUDACC__
+  int farthest_of_neighbours(V d, int number_of_first) const {
     typedef Real Pack __attribute__((vector_size(4 * sizeof(Real))));
     Pack most{}, at{}, number{0, 1, 2, 3};
     most += -std::numeric_limits<Real>::infinity();
@@ -89,8 +93,8 @@ template <class Real> struct Convex {
     int best = 0;
     for (int k = 1; k < 4; ++k) best = most[k] > most[best] ? k : best;
     return int(at[best]);
-#endif
   }
+#endif
   // A lower bound on the distance from a point of the world; exact outside of all kinds but hulls.
   OSIK_FN Real beyond(V point, V center, Real bound) const {
     const V out = point - position;
@@ -194,7 +198,7 @@ template <class Real> class Difference : Simplex<Real> {
 
   // Find the point of the difference that is nearest to the origin. With `least` > 0, stop as soon as it is known that
   // its distance is at least that, or, if one only `decides`, that it is less.
-  void approach(Real least, bool decides) {
+  OSIK_CALL void approach(Real least, bool decides) {
     v = Real(-1) * offset, count = 0, overlaps = is_known = is_far = false;
     size = length(v);
     if (!(size > TOLERANCE)) v = {1, 0, 0}, size = 1;
@@ -323,7 +327,7 @@ template <class Real> class Difference : Simplex<Real> {
     return {{i, j, k}, normal, size > 0 ? inner(normal, points[i].w) : Real(1e30)};
   }
   // The depth of cores that overlap, its direction, and the point of the first core there.
-  Real deepen(V& normal, V& on_a) {
+  OSIK_CALL Real deepen(V& normal, V& on_a) {
     if (!complete(normal)) {
       for (int k = 0; k < count; ++k) on_a = on_a + (Real(1) / count) * simplex[k].a;
       return 0;

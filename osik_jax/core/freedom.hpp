@@ -39,9 +39,9 @@ template <class Call> class Freedom {
 
   // Take a target's scene at the configuration q; false if shapes touch that no joint of the search parts.
   bool begin(const Call& call, int target) {
-    const int own = has_many_scenes(call, 7) ? target : 0;
-    if (own != row) collision.set(scene_of(call, 7, robot.shapes, target)), row = own;
-    clearance = call.in(9, 0)[0], is_blocked = false, rejected = 0;
+    const int own = has_many_scenes(call, 8) ? target : 0;
+    if (own != row) collision.set(scene_of(call, 8, robot.shapes, target)), row = own;
+    clearance = call.in(10, 0)[0], is_blocked = false, rejected = 0;
     collision.place(q);
     fixed = collision.nearer(clearance, false);
     return fixed.i < 0;
@@ -68,7 +68,7 @@ template <class Call> class Freedom {
     }
     return best;
   }
-  // Write clearance, pair and reason of the answer q from result `first` on, and whether it is a free solution.
+  // Write gap, pair and reason of the answer q from result `first` on, and whether it is a free solution.
   template <class Labels> void judge(const Call& call, int target, int first, Labels converged) {
     collision.place(q);
     Nearest<Real> nearest = collision.nearest();
@@ -76,7 +76,7 @@ template <class Call> class Freedom {
     if (missed == HELD_SHAPES) nearest = fixed;
     if (missed == AROUND_TARGET) nearest = around;
     if (missed == HELD_SHAPES || missed == AROUND_TARGET) nearest.gap = collision.gap_of(nearest.i, nearest.j);
-    call.out(first, target)[0] = nearest.gap.distance;
+    put(nearest.gap, call.out(first, target));
     auto to = call.labels(first + 1, target);
     to[0] = nearest.i, to[1] = nearest.j;
     converged[0] = converged[0] && nearest.gap.distance >= clearance;

@@ -1,6 +1,7 @@
 // XLA's calls of kinematics and of rows of tasks on a CPU, in double precision.
 #include "chain_explore.hpp"
 #include "collision_calls.hpp"
+#include "lane_collision.hpp"
 #include "near_rows.hpp"
 #include "way_around.hpp"
 #include "xla.hpp"
@@ -16,6 +17,18 @@ template <void (*method)(const Robots&)> void* handle(xla::CallFrame* frame) { r
 }  // namespace
 
 extern "C" {
+// Numbers of workspace of a GPU's thread.
+int osik_clearances_space(int bodies, int dofs, int shapes, int rows) {
+  return LaneCollision<double>::space_of(bodies, dofs, shapes, rows);
+}
+int osik_chain_find_space(int n, int frames, int joints, int nq) {
+  return n + ChainFinder<Robots, true>::space_of(n, frames, joints, nq);
+}
+int osik_free_find_space(int n, int frames, int joints, int nq, int bodies, int dofs, int shapes, int rows) {
+  return osik_chain_find_space(n, frames, joints, nq) + Freedom<Robots>::space_of(n) +
+         osik_clearances_space(bodies, dofs, shapes, rows);
+}
+
 void* osik_free_find(xla::CallFrame* frame) { return handle<find_free<Robots>>(frame); }
 void* osik_are_free(xla::CallFrame* frame) { return handle<find_free_ones<Robots>>(frame); }
 void* osik_clearances(xla::CallFrame* frame) { return handle<find_clearances<Robots>>(frame); }

@@ -11,7 +11,7 @@ template <class R> class LaneCollision {
   using M = Mat3<Real>;
 
   const ShapedRobot<Real>& robot;
-  SceneRows<Real> scene{};
+  SceneRows<Real> scene;
   Real *positions, *turns, *unused;    // of bodies, [bodies, 3] and [bodies, 9]; [dofs, 9]
   Ball<Real>*ball, *row_ball;  // [shapes + rows]; [rows] in the carrying body
 
@@ -34,7 +34,7 @@ template <class R> class LaneCollision {
   int group(int shape) const { return body(shape) < 0 ? 0 : robot.group[body(shape)]; }
 
   // Place the shapes at a configuration [nq].
-  void place(const Real* q) {
+  OSIK_CALL void place(const Real* q) {
     place_bodies(robot.tree(), Configuration<const Real*>{q, robot.factor, robot.offset, robot.source},
                  Placed<Real*>{positions, turns, unused, unused + 3 * robot.dofs, unused + 6 * robot.dofs});
     for (int k = 0; k < robot.shapes + scene.rows; ++k) {
@@ -45,7 +45,7 @@ template <class R> class LaneCollision {
     }
   }
   // The first pair nearer than `least`, among those whose distance a search changes or the fixed ones; or none.
-  Nearest<Real> nearer(Real least, bool is_moving) const {
+  OSIK_CALL Nearest<Real> nearer(Real least, bool is_moving) const {
     Nearest<Real> found;
     any_pair([&](int i, int j) {
       if ((group(i) != group(j)) != is_moving || keeps(i, j, least)) return false;
@@ -55,20 +55,20 @@ template <class R> class LaneCollision {
     return found;
   }
   // The nearest pair; one whose distance is NaN, if there is one.
-  Nearest<Real> nearest() const {
+  OSIK_CALL Nearest<Real> nearest() const {
     Nearest<Real> best;
     any_pair([&](int i, int j) {
       if (best.i >= 0 && ball[i].is_out_of_reach(ball[j], best.gap.distance > 0 ? best.gap.distance : Real(0))) return false;
       if (lower_bound({i, j}) >= best.gap.distance) return false;
-      const Gap<Real> gap = gap_of(i, j);
+      const Gap<Real> gap = gap_between(shape(i), shape(j), best.gap.distance);
       if (!(gap.distance >= best.gap.distance)) best = {i, j, gap};
       return gap.distance != gap.distance;
     });
     return best;
   }
-  Real lower_bound(Pair p) const { return osik::lower_bound(shape(p.i), ball[p.i], shape(p.j), ball[p.j]); }
+  OSIK_CALL Real lower_bound(Pair p) const { return osik::lower_bound(shape(p.i), ball[p.i], shape(p.j), ball[p.j]); }
   template <class F> bool any_pair(F f) const { return any_pair_apart(robot, scene, f); }
-  Gap<Real> gap_of(int i, int j) const { return gap_between(shape(i), shape(j)); }
+  OSIK_CALL Gap<Real> gap_of(int i, int j) const { return gap_between(shape(i), shape(j)); }
   // Distance from a point to the farthest point of a shape, or more.
   Real reach(int shape, V from) const {
     const V way = ball[shape].center - from;
@@ -79,7 +79,7 @@ template <class R> class LaneCollision {
   int body(int shape) const { return shape < robot.shapes ? robot.body[shape] : scene.body[shape - robot.shapes]; }
   M turn(int body) const { return M::of(turns + 9 * body); }
   V position(int body) const { return V::of(positions + 3 * body); }
-  Convex<Real> shape(int k) const {
+  OSIK_CALL Convex<Real> shape(int k) const {
     Convex<Real> to = k < robot.shapes ? shape_of(robot, k) : shape_of_row(scene, k - robot.shapes);
     const int carrier = body(k);
     if (carrier < 0) return to;
@@ -88,7 +88,7 @@ template <class R> class LaneCollision {
     return to;
   }
   // Whether a pair is at least `least` >= 0 apart.
-  bool keeps(int i, int j, Real least) const {
+  OSIK_CALL bool keeps(int i, int j, Real least) const {
     if (ball[i].is_out_of_reach(ball[j], least)) return true;
     const Convex<Real> a = shape(i), b = shape(j);
     return osik::lower_bound(a, ball[i], b, ball[j]) >= least || is_apart(a, b, least);

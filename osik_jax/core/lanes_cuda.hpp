@@ -1,10 +1,13 @@
-// A call of kinematic_calls.hpp or chain_search.hpp on a GPU. A lane is one robot of the batch, and has one thread.
+// A call of kinematic_calls.hpp, collision_calls.hpp or chain_group.hpp on a GPU. A lane is one robot or target of the batch,
+// and has one thread, or the few threads of a group, which are neighbours in a warp.
 //
 // The lanes are the fastest axis of matrices and of long results, so that the threads of a warp read and write neighbours. In
 // all others the numbers of a lane are neighbours, as XLA has them. The text that includes this file defines Real, the sizes, and SPACE
 // (core/_cuda.py: call_lanes).
 #pragma once
-#include "chain_search.hpp"
+#include "chain_group.hpp"
+#include "collision_calls.hpp"
+#include "lane_collision.hpp"
 
 namespace osik {
 
@@ -34,20 +37,31 @@ template <class R, class Sizes> struct ThreadCall {
   using Real = R;
   using In = Strided<const R>;
   using Out = Strided<R>;
+  using Numbers = const R*;
+  using Collision = LaneCollision<R>;
   struct Space {
     R numbers[Sizes::SPACE];
     R* data() { return numbers; }
   };
   const void* const* arguments;
   void* const* results;
-  int lanes;
+  const R* const* kept;  // copies of arguments in shared memory, or null
+  int lanes, members;  // of the batch; threads of each lane
   Space space() const {
     Space own;  // whoever uses it writes first
     return own;
   }
   int size(int k, int axis) const { return Sizes::argument(k, axis); }
   int result_size(int k, int axis) const { return Sizes::result(k, axis); }
-  const int* integers(int k) const { return static_cast<const int*>(arguments[k]); }
+  const int* integers(int k, int lane = 0) const {
+    return static_cast<const int*>(arguments[k]) + (Sizes::argument(k, 0) == 1 ? 0 : size_t(lane) * Sizes::argument(k, 1));
+  }
+  // of an argument with one axis beside the lanes, whose numbers are neighbours
+  Numbers numbers(int k, int lane) const { return kept[k] ? kept[k] : in(k, lane).at; }
+  Strided<int> labels(int k, int lane) const {
+    return of_lane(Strided<int>{static_cast<int*>(results[k])}, lane, Sizes::RESULTS_LANES_LAST >> k & 1,
+                   Sizes::result(k, 1));
+  }
   In in(int k, int lane) const {
     const In first{static_cast<const R*>(arguments[k])};
     return Sizes::argument(k, 0) == 1 ? first : of_lane(first, lane, Sizes::LANES_LAST >> k & 1, Sizes::argument(k, 1));
@@ -61,8 +75,20 @@ template <class R, class Sizes> struct ThreadCall {
     return lanes_last ? At{first.at + lane, lanes} : At{first.at + size_t(lane) * (count ? count : 1), 1};
   }
   template <class F> void each_lane(F f) const {
-    const int lane = blockIdx.x * blockDim.x + threadIdx.x;
-    if (lane < lanes) f(lane);
+    if (lane() < lanes) f(lane());
+  }
+  template <class F> void each_group(F f) const { f(lane() < lanes ? lane() : lanes - 1, lane() < lanes); }
+  int lane() const { return (blockIdx.x * blockDim.x + threadIdx.x) / members; }
+  int member() const { return threadIdx.x % members; }
+  // The threads of this one's group.
+  unsigned group() const { return (members == 32 ? ~0u : (1u << members) - 1) << threadIdx.x % 32 / members * members; }
+  template <class T> T of_member(int k, T number) const { return __shfl_sync(group(), number, k, members); }
+  int least_of_members(int number) const { return __reduce_min_sync(group(), number); }
+  static bool any(bool flag) { return __any_sync(~0u, flag); }
+  static bool is_time(bool waits, bool goes_on) {
+    constexpr int ENOUGH = 16;
+    const unsigned waiting = __ballot_sync(~0u, waits), going_on = __ballot_sync(~0u, goes_on);
+    return waiting && (!going_on || __popc(waiting) >= ENOUGH);
   }
 };
 }  // namespace osik

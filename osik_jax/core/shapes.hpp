@@ -44,6 +44,7 @@ template <class Real> struct SceneRows {
   const int *kind, *first, *count, *body;  // [rows] each
   const int *contacts, *among;  // [rows, shapes of the robot], [rows, rows] flags
   const Real *size, *place, *turn, *points;  // [rows, 3] twice, [rows, 9], [vertices, 3]
+  SceneRows() = default;
   SceneRows(const int* integers, const Real* numbers, int shapes) {
     Reader<const int*> i{integers};
     rows = *i.take(1), kind = i.take(rows), first = i.take(rows), count = i.take(rows), body = i.take(rows);
@@ -61,6 +62,11 @@ template <class Real> struct Nearest {
   int i = -1, j = -1;
   Gap<Real> gap{Real(INFINITE), {}, {}, {}};
 };
+
+// Write distance, points and normal [10].
+template <class Real, class Out> void put(const Gap<Real>& gap, Out to) {
+  to[0] = gap.distance, gap.on_a.put(to + 1), gap.on_b.put(to + 4), gap.normal.put(to + 7);
+}
 
 // A sphere around a shape.
 template <class Real> struct Ball {
@@ -137,6 +143,7 @@ template <class Real, class F> bool any_pair_apart(const ShapedRobot<Real>& robo
     if (have_distance(robot.kind[i], robot.kind[j]) && f(i, j)) return true;
   }
   for (int r = 0; r < scene.rows; ++r) {
+    if (scene.kind[r] == ABSENT) continue;
     for (int k = 0; k < robot.shapes; ++k)
       if (robot.world[k] && !scene.contacts[r * robot.shapes + k] && have_distance(robot.kind[k], scene.kind[r]) &&
           f(k, robot.shapes + r))

@@ -175,6 +175,7 @@ struct Batch {
   using Real = double;
   using In = const double*;
   using Out = double*;
+  using Numbers = const double*;
   using Space = std::vector<double>;
   Call call;
   Space space() const { return Space(number(call.frame->attributes, "space")); }
@@ -182,7 +183,7 @@ struct Batch {
   int result_size(int k, int axis) const { return call.result_size(k, axis); }
   const int* integers(int k, int lane = 0) const { return call.of_lane<int>(k, lane); }
   In in(int k, int lane) const { return call.of_lane<double>(k, lane); }
-  In numbers(int k, int lane) const { return in(k, lane); }
+  Numbers numbers(int k, int lane) const { return in(k, lane); }
   Out out(int k, int lane) const { return call.out<double>(k, lane); }
   int* labels(int k, int lane) const { return call.out<int>(k, lane); }
   template <class F> void each_lane(F f) const {

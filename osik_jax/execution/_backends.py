@@ -16,7 +16,7 @@ problems that it cannot solve. A scheme's backend is that of its whole step.
     of a step with one of these schemes       kinematics, Jacobians of frames, centre of mass, rows of pose tasks
     "core"    CPUs and CUDA: any robot, any precision
 
-    of inverse kinematics                     steps of searches for poses of frames that hinges and slides carry
+    of inverse kinematics                     searches for poses of frames that hinges and slides carry, in scenes too
     "core"    CPUs and CUDA: any robot, any precision
 
     of retargeting                            iterations of a plan                a plan's banded systems
@@ -37,8 +37,8 @@ from typing import Any, Literal, get_args
 import jax
 
 from .._errors import OsikValueError
-from ..core import _library
-from ._platform import cuda_is_default, is_symbolic
+from ..core import _cuda, _library
+from ._platform import cuda_is_default, default_platform, is_symbolic
 from ._rules import KERNEL_IN_EXPORT, not_exported
 
 Backend = Literal["auto", "jax", "core"]
@@ -46,6 +46,11 @@ BACKENDS: tuple[str, ...] = get_args(Backend)
 
 _PLATFORM = {"core": "cpu", "core-cuda": "cuda"}
 CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"}
+
+
+def core_is_here() -> bool:
+    """Return whether the compiled core runs on JAX's default device."""
+    return _cuda.installed() if cuda_is_default() else default_platform() == "cpu" and _library.installed()
 
 
 def check_backend(backend: Any) -> Backend:

@@ -9,13 +9,18 @@ import jax
 import numpy as np
 
 
+def default_platform() -> str:
+    """Return the platform of JAX's default device, which ``jax.default_device`` may have chosen."""
+    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
+    return getattr(device, "platform", device)
+
+
 def cuda_is_default() -> bool:
     """Return whether JAX's default device is a GPU.
 
     Under ``jax.default_device`` of a CPU it is not, and no kernel is compiled for a GPU.
     """
-    device = getattr(jax.config, "jax_default_device", None) or jax.local_devices()[0]
-    return getattr(device, "platform", device) in ("gpu", "cuda")
+    return default_platform() in ("gpu", "cuda")
 
 
 def cpu_is_default() -> bool:

@@ -12,13 +12,14 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Int
 
-from .._errors import OsikValueError
-from ..collision._clearance import distances, shape_names
+from .._errors import OsikError, OsikValueError
+from ..collision._clearance import differentiable, distances, shape_names
 from ..collision._core import CoreRobot, CoreScene, check_length, check_scene, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
 from ..execution._blocks import first_axes_as_one
+from ..execution._platform import cuda_is_default
 from ..limits import CollisionAvoidanceLimit, Limit
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
@@ -31,12 +32,10 @@ from ._fixed import Explored, Searches, or_far, with_placeholders
 from ._run import split
 from ._solution import InverseKinematicsSolution, with_fields
 from ._task_search import CLEAR
-from ._whole import Around, Whole, by_core, named, whole
+from ._whole import EVERY_SOLUTION, Around, Whole, by_core, named, whole
 
 _SURE = 1e-6
 """Distance beyond the clearance, against rounding [m]."""
-EVERY_SOLUTION = 3
-"""``InverseKinematicsSolution.obstruction`` where something is in the way of the best configuration."""
 SEEDS = 256
 """Searches for a target, to begin with: free solutions can be one in a hundred."""
 
@@ -69,7 +68,7 @@ def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any
         OsikError: there is no core for this device.
         TypeError, ValueError: no scene; a clearance that is negative.
     """
-    require_core("inverse_kinematics with a scene")
+    require_core("inverse_kinematics with a scene", on_gpu=True)
     check_scene(scene)
     shapes, own = _known(robot, srdf, route=route)
     return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
@@ -104,6 +103,9 @@ def find_free(
     single: bool,
 ) -> Explored:
     """Return free configurations; arguments as of ``whole``. Without numbers, ``settings`` and so on may be traced."""
+    if (how.near or how.every) and cuda_is_default():
+        where = "call it under jax.default_device(jax.devices('cpu')[0])"
+        raise OsikError(f"nearest and all run on a CPU where there is a scene: {where}")
     route, scenes = obstacles.route, len(obstacles.around.scene.integers)
     if len(goals.position) == 1 and scenes > 1:
         goals = jax.tree.map(lambda a: a.repeat(scenes, 0), goals)
@@ -121,15 +123,19 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
-    names = _pair_fields(np.asarray(results.pair), obstacles.shapes, obstacles.scene)
+    names = _pair_fields(np.asarray(results.gaps.pair), obstacles.shapes, obstacles.scene)
     return with_fields(results.answer, **names, obstruction=results.reason)
 
 
 def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
     """Return the fields of an answer that name its nearest pairs."""
-    named = [shape_names(shapes.names, scene.names, pair, k) for k, pair in enumerate(pairs.reshape(-1, 2))]
+    flat, own_names = pairs.reshape(-1, 2), bool(scene.names) and isinstance(scene.names[0], tuple)
+    of_scene = np.arange(len(flat)) * (own_names & (flat.max(-1, initial=-1) >= len(shapes.names)))
+    codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))
+    _, first, place = np.unique(codes, return_index=True, return_inverse=True)
+    named = [shape_names(shapes.names, scene.names, flat[k], of_scene[k]) for k in first]
     kinds = {pair: k for k, pair in enumerate(dict.fromkeys(named))}
-    number = np.array([kinds[pair] for pair in named], np.int32).reshape(pairs.shape[:-1])
+    number = np.array([kinds[pair] for pair in named], np.int32)[place].reshape(pairs.shape[:-1])
     return dict(nearest_pair=number, pairs=tuple(kinds))
 
 
@@ -194,7 +200,7 @@ def _traced(
     results = _in_one_call(how, dofs, joints)(fixed, there, counts, jnp.int32(steps), around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
     own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
-    gap = distances(robot, obstacles.shapes, own.q, obstacles.scene)[0]
+    gap = differentiable(robot, obstacles.shapes, own.q, obstacles.scene, found.gaps)
     is_free = own.converged & (gap >= around.clearance[0])
     return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)
 

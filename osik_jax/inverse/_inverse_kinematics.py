@@ -181,7 +181,7 @@ def inverse_kinematics(
         if all:
             found = dataclasses.replace(found, **_as_arrays(_all_of(*given, results, route)))
         return found if many or not (all or is_traced(found)) else jax.tree.map(lambda a: a[0], found)
-    most, by_core = once * (1 + restarts), not traced and whole_is_possible(route)
+    most, by_core = once * (1 + restarts), not traced and whole_is_possible(route, every=nearest or all)
     # inside jit, operations on numbers would be traced too
     with nullcontext() if traced else jax.ensure_compile_time_eval():
         if by_core and not problem.many:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..execution._blocks import in_blocks
+from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ._chain_problem import ENOUGH, Settings
 from ._closest import Closest, closest
@@ -49,14 +50,16 @@ def searched(
     """
     lanes = lanes_for(len(jax.tree.leaves(goals)[0]), route.pace.lanes)
     run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
-    hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route)
+    hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route, every=False)
+
+    def by_the_core(goals: Any, most: np.ndarray) -> InverseKinematicsSolution:
+        how = Searches(0, warm, near=False, every=False)
+        return whole(robot, route, goals, settings, most, hopeless, steps, how, single=False).answer
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
         def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
             if by_core:
-                how, number = Searches(0, warm, near=False, every=False), np.where(left, most, 0)
-                results = whole(robot, route, goals, settings, number, hopeless, steps, how, single=False)
-                return jax.tree.map(np.asarray, results.answer)
+                return jax.tree.map(np.asarray, by_the_core(goals, np.where(left, most, 0)))
             given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
             return unpacked(jax.device_get(run(given)))
 
@@ -77,8 +80,14 @@ def searched(
         own = only(left, approach, goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
-    wanted = np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted
-    return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
+    def in_all(wanted: np.ndarray) -> InverseKinematicsSolution:
+        return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
+
+    if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
+        found = by_the_core(goals, np.full(len(goals.position), seeds))
+        missed = ~np.asarray(found.converged)
+        return _with(jax.device_get(found), missed, in_all(missed)) if missed.any() else found
+    return in_all(np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted)
 
 
 def found_at_once(
@@ -164,7 +173,7 @@ def searched_on(
     """
     near = near and route.starts_anew
     reachable, met = np.asarray(found.beyond_reach) <= 0.0, np.asarray(found.converged)
-    left = reachable & ~(met & (not near or whole_is_possible(route)))
+    left = reachable & ~(met & (not near or whole_is_possible(route, every=True)))
     if not left.any():
         return found
     new = searched(robot, goals, settings, seeds, steps, route=route, warm=warm, go_on=False, wanted=left)

@@ -1,4 +1,4 @@
-"""Whole searches for poses outside of programs, by one call of the core (``core/chain_find.hpp``) on a CPU.
+"""Whole searches for poses outside of programs, by one call of the core (``core/chain_find.hpp``).
 
 What does not change from call to call is found by the identity of the robot and of the limits of its joints.
 """
@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..collision._core import CoreRobot, CoreScene
-from ..core import _library
-from ..execution._platform import cpu_is_default
+from ..collision._core import CoreRobot, CoreScene, Gaps, call_here, read_gaps
+from ..execution._backends import core_is_here
+from ..execution._lanes import first_set
+from ..execution._platform import cuda_is_default
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
@@ -29,6 +30,12 @@ from ._pool import PROGRESS, TRIAL, Pace
 from ._seeds import increments, shift_of
 from ._solution import InverseKinematicsSolution
 
+_MOST_THREADS = 1 << 17
+"""Threads that keep a GPU busy."""
+_FIRST, _MEMBERS = 16, 32
+"""Searches of each target by one thread, where there are many; then threads for each that is left."""
+EVERY_SOLUTION = 3
+"""``InverseKinematicsSolution.obstruction`` where something is in the way of the best configuration."""
 _STILL = 1e-9
 """A search is at its end if no coordinate moves by more in a step [rad or m]."""
 
@@ -40,14 +47,14 @@ class Whole(NamedTuple):
         answer: the answers, as of ``ChainRoute.answer``.
         score: of the answers. (targets,)
         ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
-        pair: with a scene, numbers of the nearest pair's shapes. (targets, 2)
+        gaps: with a scene, of the nearest pairs.
         reason: with a scene, why there is no free solution, as in ``core/freedom.hpp``. (targets,)
     """
 
     answer: InverseKinematicsSolution
     score: Float[Array, "*targets"]
     ends: Float[Array, "*targets seeds n_and_2"] | None
-    pair: Int[Array, "*targets 2"] | None = None
+    gaps: Gaps | None = None
     reason: Int[Array, "*targets"] | None = None
 
 
@@ -73,9 +80,13 @@ class _Known(NamedTuple):
     programs: dict[tuple[ChainRoute, Searches, bool], Callable[..., Whole]]
 
 
-def whole_is_possible(route: Any) -> bool:
-    """Return whether ``whole`` runs here, for concrete arguments."""
-    return isinstance(route, ChainRoute) and route.by_core and cpu_is_default() and _library.installed()
+def whole_is_possible(route: Any, *, every: bool) -> bool:
+    """Return whether ``whole`` runs here, for concrete arguments.
+
+    ``every``: all searches for a target, and not as many as it needs, which a GPU does not do by one call.
+    """
+    possible = isinstance(route, ChainRoute) and route.by_core and core_is_here()
+    return possible and not (every and cuda_is_default())
 
 
 def whole(
@@ -177,7 +188,7 @@ def by_core(
     These are configurations (targets, nq). Then position and orientation error, score, and
     residuals (targets, 3 + 6 frames). Then whether it has converged, the number of the search, steps, and at_limit
     (targets, 3 + nv). With ``every``, also end points, score and whether isolated (targets, seeds, n + 2). With
-    ``around``, also clearance (targets, 1), and the nearest pair and the reason (targets, 3).
+    ``around``, also the gap of the nearest pair (targets, 10), and the pair and the reason (targets, 3).
     """
     kind, nv = search.first.dtype, len(joints)
     targets, frames, n, nq = len(most), len(search.rows), len(search.first), len(search.home)
@@ -186,19 +197,55 @@ def by_core(
     numbers = [*numbers_of(search, (DAMPING, LEAST_DAMPING)), search.low, search.high, search.home, tuned]
     flags = [how.warm, how.near, how.every, kind == jnp.float32]
     bits = [jax.lax.bitcast_convert_type(search.shift, jnp.int32), increments(n).view(np.int32)]
-    options = [[n, steps, Pace().check, TRIAL, LAST, how.seeds, nq, nv, *flags], *bits, search.turns]
-    options += [search.chain.layout.dofs, dofs]
+    options = jnp.stack([jnp.int32(a) for a in (steps, Pace().check, TRIAL, LAST, how.seeds, nq, nv, *flags)])
+    lists = jnp.stack([jnp.asarray(a, jnp.int32) for a in (*bits, search.turns, search.chain.layout.dofs, dofs)])
     shapes: list[Any] = [((targets, nq), float), ((targets, 3 + 6 * frames), float), ((targets, 3 + nv), int)]
     shapes += [((targets, how.seeds, n + 2), float)] * how.every
-    method, more = "chain_find", ()
+    method, sizes = "chain_find", (n, frames, len(search.chain.layout.joints), nq)
     if around is not None:
-        shapes += [((targets, 1), float), ((targets, 3), int)]
-        method, more = "free_find", (*around.robot, *around.scene, around.clearance)
-    return _library.call(
-        *(method, shapes, goals, most, jnp.concatenate([jnp.ravel(a) for a in numbers])),
-        *(integers_of(search, 0), jnp.concatenate([jnp.array(a, jnp.int32) for a in options])),
-        *more,
-    )
+        shapes += [((targets, 10), float), ((targets, 3), int)]
+        method, sizes = "free_find", (*sizes, *around.robot.sizes, around.scene.rows(around.robot.sizes[2]))
+    shared = jnp.concatenate([jnp.ravel(a) for a in numbers])[None], integers_of(search, 0)
+
+    def call(members: int, goals: Array, most: Array, *scene: Array) -> list[Array]:
+        outputs = [((len(most), *shape[1:]), kind) for shape, kind in shapes]
+        more: tuple[Any, ...] = ()
+        if around is not None:
+            more = around.robot.integers, around.robot.numbers[None], *scene, around.clearance
+        given = goals, most[:, None], *shared, jnp.append(options, members), lists, *more
+        return call_here(method, outputs, *given, sizes=sizes, members=members)
+
+    lanes = goals, most, *(() if around is None else around.scene)
+    return in_stages(call, *lanes) if cuda_is_default() else call(1, *lanes)
+
+
+def in_stages(call: Callable[..., list[Array]], goals: Array, most: Array, *scene: Array) -> list[Array]:
+    """Return what ``call(members, goals, most, *scene)`` finds for many targets on a GPU.
+
+    A few searches for each target come first, by one thread. What they leave, which needs many searches, is done by
+    several threads each, so that no thread works on when all others are done.
+    """
+    if _MEMBERS * len(most) <= _MOST_THREADS:
+        return call(_MEMBERS, goals, most, *scene)
+    found = call(1, goals, jnp.minimum(most, _FIRST), *scene)
+    targets, labels = len(most), found[2]
+    hopeless = found[-1][:, 2:] if scene else jnp.zeros((targets, 1), jnp.int32)  # see ``core/freedom.hpp``
+    size = _MOST_THREADS // _MEMBERS
+
+    def some(array: Array, at: Array) -> Array:
+        return array[at] if len(array) > 1 else array
+
+    def body(state: tuple[list[Array], Array]) -> tuple[list[Array], Array]:
+        found, left = state
+        place = first_set(left, size)
+        at = jnp.minimum(place, targets - 1)
+        new = call(_MEMBERS, goals[at], jnp.where(place < targets, most[at], 0), *(some(a, at) for a in scene))
+        new[2] = new[2].at[:, 2].add(found[2][at, 2])
+        found = [a.at[place].set(b, mode="drop") for a, b in zip(found, new, strict=True)]
+        return found, left.at[place].set(False, mode="drop")
+
+    left = (labels[:, 0] <= 0) & (most > _FIRST) & ((hopeless[:, 0] == 0) | (hopeless[:, 0] == EVERY_SOLUTION))
+    return jax.lax.while_loop(lambda state: state[1].any(), body, (found, left))[0]
 
 
 def named(
@@ -213,7 +260,7 @@ def named(
 ) -> Whole:
     """Return the results of ``by_core`` by their names."""
     ends, around = (more[0] if every else None), more[every:]
-    clearance, pair, reason = (around[0][:, 0], around[1][:, :2], around[1][:, 2]) if around else (None, None, None)
+    gaps, reason = (read_gaps(around[0], around[1][:, :2]), around[1][:, 2]) if around else (None, None)
     residual = sizes[:, 3:].reshape(-1, len(frames), 6)
     answer = InverseKinematicsSolution(
         q=q,
@@ -225,7 +272,7 @@ def named(
         residual={name: residual[:, at] for at, name in enumerate(frames)},
         at_limit=labels[:, 3:],
         beyond_reach=beyond,
-        clearance=clearance,
+        clearance=None if gaps is None else gaps.distance,
         joints=joints,
     )
-    return Whole(answer, sizes[:, 2], ends, pair, reason)
+    return Whole(answer, sizes[:, 2], ends, gaps, reason)

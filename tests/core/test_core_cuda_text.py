@@ -24,6 +24,15 @@ CHAIN = (2, 7), (2, 1, 12), (1, 347), (38,)
 """Steps of a search for the pose of a frame that seven joints carry."""
 ROWS = (2, 6), (2, 6, 7), (2, 6), (2,), (2, 6), (2, 7), (2, 6)
 """Rows of a pose task or of one on the centre of mass, for seven dofs."""
+FIND = ((2, 1, 12), (2, 1), (1, 500), (60,), (12,), (2, 7)), (1, 3, 4, 5)
+SCENE = (300,), (1, 900), (2, 121), (2, 100)
+"""A robot with shapes, and scenes of their own for all lanes."""
+FREE = (
+    ((2, 1, 12), (2, 1), (1, 500), (60,), (12,), (2, 7), *SCENE, (1,)),
+    (1, 3, 4, 5, 6, 8),
+    ((2, 9), (2, 9), (2, 12), (2, 10), (2, 3)),
+)
+PLACES = ((2, 9), (1, 300), *SCENE[1:]), (1, 3)
 
 
 def test_headers_become_one_text_whose_loops_stay_loops():
@@ -50,10 +59,13 @@ TEXTS = {
     "frames": lambda: _cuda._lanes_source(
         "moving_frames", False, (*PLACED, (1, 50), (9,)), (6,), ((2, 1, 3), (2, 1, 6, 7))
     ),
-    "centre of mass": lambda: _cuda._lanes_source("center_rows", True, CENTER, (6,), ROWS, 33),
+    "centre of mass": lambda: _cuda._lanes_source("center_rows", True, CENTER, (6,), ROWS, (), 33),
     "rows of a frame": lambda: _cuda._lanes_source("frame_rows", True, (*PLACED, (1, 19), (2, 25), (16,)), (7,), ROWS),
     "rows of a pose": lambda: _cuda._lanes_source("pose_rows", True, POSE, (4,), ROWS),
-    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((2, 7), (2, 7), (2, 4)), 227),
+    "chain": lambda: _cuda._lanes_source("chain_steps", True, CHAIN, (3,), ((2, 7), (2, 7), (2, 4)), (), 227),
+    "searches": lambda: _cuda._lanes_source("chain_find", True, *FIND, ((2, 9), (2, 9), (2, 12)), (2,), 400),
+    "searches in scenes": lambda: _cuda._lanes_source("free_find", False, *FREE, (2, 4), 900),
+    "clearances": lambda: _cuda._lanes_source("clearances", True, *PLACES, ((2, 10), (2, 2)), (1,), 400),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 
