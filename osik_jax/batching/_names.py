@@ -48,11 +48,8 @@ def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
 def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, batched: bool = False) -> T:
     """Return the tree with other numbers in its named leaves.
 
-    Args:
-        tree: any pytree.
-        names: of its leaves.
-        values: by name (``find_leaves``): one array for each of the leaves found, or a pytree with one array for each.
-        batched: whether each value has one more axis in front.
+    A value is one array for each of the leaves found (``find_leaves``), or a pytree with one array for each. If
+    ``batched``, each has one more axis in front.
 
     Raises:
         KeyError: no such name.

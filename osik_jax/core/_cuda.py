@@ -116,18 +116,9 @@ def call(
 ) -> list[Array]:
     """Launch a compiled kernel named ``osik_kernel`` through XLA.
 
-    Args:
-        source: CUDA text.
-        outputs: shape and dtype of each result.
-        inputs: arrays with the dtypes and memory layout that the kernel expects.
-        problems: number of problems in the batch.
-        shared: bytes of shared memory that one problem takes.
-        per_block: how many problems a block solves.
-        warps: how many warps of 32 threads a block has.
-        lanes_last: for the inputs and then the results, whether the leading axis is the fastest in memory. Default: no.
-
-    Returns:
-        The results.
+    Inputs have the dtypes and memory layout that the kernel expects, results the given shapes and dtypes. One problem
+    takes ``shared`` bytes of shared memory, a block solves ``per_block`` problems and has ``warps`` warps.
+    ``lanes_last`` says, for the inputs and then the results, whether the leading axis is the fastest in memory.
     """
     _register()
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in outputs]
@@ -145,14 +136,9 @@ def call_lanes(
 ) -> list[Array]:
     """Call a method of ``core/kinematic_calls.hpp`` on a GPU, with one thread for each lane: a robot of the batch.
 
-    Args:
-        method: name of its CPU handler without the prefix "osik_".
-        outputs: shape and type of each result, as for ``_library.call``; all are floats.
-        inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers.
-        space: numbers of workspace of a lane.
-
-    Returns:
-        The results, in the precision of the inputs.
+    ``method`` is its CPU handler without the prefix "osik_". Inputs are floats of one precision with a leading axis of
+    lanes, or of length 1, and flat arrays of integers; results are floats of that precision. ``space`` is the workspace
+    of a lane in numbers.
     """
     arrays = [jnp.asarray(a) for a in inputs]
     real = next(a.dtype for a in arrays if _is_real(a))
@@ -188,13 +174,7 @@ def _lanes_source(
 ) -> str:
     """Return CUDA text that runs a method for one lane a thread.
 
-    Args:
-        method: as in ``call_lanes``.
-        single: whether floats are of single precision.
-        given: shape of each argument; the leading axis of floats is 1 if all lanes share it.
-        integers: which arguments are integers.
-        results: shape of each result; the leading axis is 1 if there is one lane.
-        space: as in ``call_lanes``.
+    The leading axis of floats that all lanes share is 1, and so is that of the results if there is one lane.
     """
 
     def table(name: str, shapes: Sequence[tuple[int, ...]]) -> str:

@@ -20,10 +20,7 @@ _INK, _BAD, _GRID = "#2b2f36", "#d7263d", "#e3e7ec"
 def comparison(title: str, figures: Mapping[str, Sequence[Figure]], dt: float) -> Page:
     """Return a page with a plot for each figure that has values over time, with a line at its requirement.
 
-    Args:
-        title: over all plots.
-        figures: by the names of the schemes.
-        dt: time between two values [s].
+    Values are ``dt`` [s] apart.
     """
     rows = [row for row in zip(*figures.values(), strict=True) if np.ndim(row[0].values) and row[0].worst is not None]
     columns = min(3, len(rows))

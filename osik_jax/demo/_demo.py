@@ -58,20 +58,10 @@ def run_demo(
 ) -> tuple[Table, Sequence[Run]]:
     """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
 
-    Args:
-        motion: what to do.
-        folder: to write to; made if need be.
-        schemes: ``"weighted"``, ``"null-space"``, ``"hierarchical"``.
-        dt: control period [s].
-        physics: whether the loop is closed with MuJoCo; ``motion`` is then one of NAO.
-        animation: whether to write ``motion.gif`` (and ``motion.mp4`` where the program ffmpeg is installed) of the
-            last scheme.
-        picture: whether to write ``picture.png``: three instants side by side.
-        renderer: for the film, as in ``viewer.animate``.
-        announce: called with the current stage and the finished share, 0 to 1.
-
-    Returns:
-        The table of all figures, and the runs.
+    Return the table of all figures, and the runs. With ``physics`` the loop is closed with MuJoCo; the motion is then
+    one of NAO. The film is that of the last scheme, ``motion.gif``, and ``motion.mp4`` where the program ffmpeg is
+    installed. ``picture`` adds ``picture.png``, three instants side by side. ``announce`` is called with the current
+    stage and the finished share, 0 to 1.
 
     Raises:
         KeyError: no such scheme.

@@ -28,23 +28,14 @@ _ROOM = -1e-9
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """Number of a motion, or values over time of which the worst counts.
+    """Number of a motion, or values over time of which the worst counts."""
 
-    Attributes:
-        label: in the table and over its plot, with its unit.
-        values: a number, or one value a configuration. () or (T,)
-        least: smallest value that is wanted.
-        most: largest value that is wanted.
-        floor: its plot has a logarithmic axis that ends here; ``None``: a linear axis.
-        span: a linear axis shows this much at least.
-    """
-
-    label: str
-    values: Float[np.ndarray, "*T"] | float | int
-    least: float | None = None
-    most: float | None = None
-    floor: float | None = None
-    span: float = 1e-3
+    label: str  # in the table and over its plot, with its unit
+    values: Float[np.ndarray, "*T"] | float | int  # a number, or one value a configuration
+    least: float | None = None  # smallest value that is wanted
+    most: float | None = None  # largest value that is wanted
+    floor: float | None = None  # its plot has a logarithmic axis that ends here; ``None``: a linear axis
+    span: float = 1e-3  # a linear axis shows this much at least
 
     @property
     def worst(self) -> float | int | None:

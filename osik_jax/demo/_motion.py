@@ -23,34 +23,21 @@ Rows = Literal["pose", "position"]
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Frame that follows a path.
+    """Frame that follows a path."""
 
-    Attributes:
-        frame: name of the frame.
-        path: reference of its pose.
-        rows: tracked part of the pose: ``"pose"`` or ``"position"``.
-    """
-
-    frame: str
-    path: Path
-    rows: Rows = "pose"
+    frame: str  # name of the frame
+    path: Path  # reference of its pose
+    rows: Rows = "pose"  # tracked part of the pose: ``"pose"`` or ``"position"``
 
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """Frame that stands on the ground for a time.
+    """Frame that stands on the ground for a time."""
 
-    Attributes:
-        frame: name of the frame.
-        corners: its contact corners in the frame [m]; empty: not part of the support polygon. (k, 3)
-        lifted: start and end of the time in the air [s]; ``None``: never.
-        flat: whether its orientation must stay too; a point foot may rotate.
-    """
-
-    frame: str
-    corners: np.ndarray
-    lifted: tuple[float, float] | None = None
-    flat: bool = True
+    frame: str  # name of the frame
+    corners: np.ndarray  # its contact corners in the frame [m]; empty: not part of the support polygon. (k, 3)
+    lifted: tuple[float, float] | None = None  # start and end of the time in the air [s]; ``None``: never
+    flat: bool = True  # whether its orientation must stay too; a point foot may rotate
 
     def on_ground(self, t: np.ndarray) -> np.ndarray:
         """Return whether the frame stands at each time [s]. (T,)."""

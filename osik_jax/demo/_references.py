@@ -20,17 +20,11 @@ def minimum_jerk(t: ArrayLike | Array, start: float, duration: float) -> tuple[A
 
 @dataclasses.dataclass(frozen=True)
 class Stroke:
-    """Minimum-jerk move by ``amount`` between two times.
+    """Minimum-jerk move by ``amount`` between two times."""
 
-    Attributes:
-        start: when it starts [s].
-        end: when it ends [s].
-        amount: how far, one number for each coordinate.
-    """
-
-    start: float
-    end: float
-    amount: tuple[float, ...]
+    start: float  # when it starts [s]
+    end: float  # when it ends [s]
+    amount: tuple[float, ...]  # how far, one number for each coordinate
 
 
 def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
@@ -45,17 +39,11 @@ def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """Reference of a frame over time: its position moves by strokes, its rotation stays.
+    """Reference of a frame over time: its position moves by strokes, its rotation stays."""
 
-    Attributes:
-        position: at the start [m]. (3,)
-        rotation: frame axes to world axes. (3, 3)
-        strokes: moves of the position [m].
-    """
-
-    position: np.ndarray
-    rotation: np.ndarray
-    strokes: tuple[Stroke, ...] = ()
+    position: np.ndarray  # at the start [m]. (3,)
+    rotation: np.ndarray  # frame axes to world axes. (3, 3)
+    strokes: tuple[Stroke, ...] = ()  # moves of the position [m]
 
     def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
         """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""

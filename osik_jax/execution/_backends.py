@@ -67,10 +67,7 @@ def check_backend(backend: Any) -> Backend:
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     """Return whether a solver includes the candidates of a kernel in its program.
 
-    Args:
-        backend: the requested backend.
-        kernel: "core" for CPUs, "core-cuda" for GPUs.
-        fits: whether the solver has such a kernel for problems of this kind, precision and shape.
+    ``fits`` says whether the solver has such a kernel for problems of this kind, precision and shape.
 
     Raises:
         ValueError: this kernel was requested and does not fit.

@@ -42,14 +42,9 @@ def as_pose(
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
-    from a rotation become NaN, which a solve answers with its status.
-
-    Args:
-        value: the pose.
-        dtype: of the result.
-        rest: position and rotation where the value has only the other part; None: the value has to have that part.
-        numbers: module of the result's arrays, ``jax.numpy`` or ``numpy``; of traced values always ``jax.numpy``.
-        what: name of the owner of the pose, for messages.
+    from a rotation become NaN, which a solve answers with its status. ``rest`` has position and rotation for a value
+    with only the other part; None: the value has to have that part. ``numbers`` is the module of the result's arrays,
+    for traced values always ``jax.numpy``; ``what`` names the owner of the pose in messages.
 
     Raises:
         TypeError: no numbers.

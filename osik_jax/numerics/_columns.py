@@ -15,9 +15,7 @@ from .._errors import OsikValueError
 def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> dict[str, Float[np.ndarray, " n"]]:
     """Return the numbers of a CSV file by the names of its columns; lines that begin with # are left out.
 
-    Args:
-        path: the file. Its head names the columns.
-        unnamed: names of the columns, from the first one, of a file that begins with numbers.
+    The head names the columns; ``unnamed`` does so for a file that begins with numbers.
 
     Raises:
         FileNotFoundError: no such file.

@@ -24,11 +24,8 @@ def around(frame: Frame, positions: int) -> Grid:
     """Return a grid with equal spacing along x, y and z over the bounding box of a frame's workspace.
 
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
-    frame never moves, as a planar arm's, is a single coordinate.
-
-    Args:
-        frame: the frame.
-        positions: their number at most; it is nearly reached.
+    frame never moves, as a planar arm's, is a single coordinate. There are at most ``positions``; that number is nearly
+    reached.
 
     Raises:
         ValueError: ``positions`` is no positive number.

@@ -240,11 +240,8 @@ def _moves(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.nda
 def _axis_up(feet_to_head: Float[np.ndarray, "3"], way: float) -> Up | None:
     """Return the up axis of the rest pose, or None if nobody stands in it.
 
-    The person stands if the head is above the feet by at least 0.6 of the path length between them.
-
-    Args:
-        feet_to_head: in the rest pose. (3,)
-        way: path length along the joints from foot to head.
+    The person stands if the head is above the feet by at least 0.6 of the path length between them. ``way`` is the path
+    length along the joints from foot to head.
     """
     above = np.concatenate([feet_to_head, -feet_to_head])
     return UPS[int(np.argmax(above))] if above.max() > _UPRIGHT * way else None

@@ -24,12 +24,7 @@ _RATE = 15.0
 
 
 def film(result: Retargeted, path: str | os.PathLike[str]) -> Path:
-    """Write a GIF: the person on the left, the robot on the right, scaled to the person's height.
-
-    Args:
-        result: the retargeted motion.
-        path: of the ``.gif``.
-    """
+    """Write a GIF: the person on the left, the robot on the right, scaled to the person's height."""
     stride = max(1, round(result.motion.fps / _RATE))
     views = {"person": _person_sticks(result)[::stride], "robot": _robot_sticks(result)[::stride]}
     canvas, tracks = Canvas(_SIZE), []

@@ -152,11 +152,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> bool:
 def _bend(robot: Robot, kinematics: Kinematics, limb: Chain, first: int) -> int | None:
     """Return the index of the knee or elbow (the bending joint farthest from both ends of a limb), or None.
 
-    Args:
-        robot: the robot.
-        kinematics: at home.
-        limb: the limb, from its first joint to its end.
-        first: index of the joint at which the limb begins.
+    ``first`` is the index of the joint at which the limb begins.
     """
     first = min(first, len(limb.anchors) - 1)
     beginning, end = limb.anchors[first], limb.anchors[-1]
@@ -220,15 +216,8 @@ def find_end(
 ) -> tuple[Place, np.ndarray]:
     """Return the end of the last link of an arm or finger as a place and in the world [m].
 
-    It is a named frame, else the link's far end.
-
-    Args:
-        robot: the robot.
-        kinematics: at home.
-        arm: the arm or finger.
-        last: index of its last joint.
-        patterns: names of frames at the end, the preferred ones first.
-        least_share: least distance of such a frame from the last joint, as a share of the upper arm.
+    It is a named frame (``patterns``, the preferred ones first), else the far end of the link. Such a frame is at least
+    ``least_share`` of the upper arm from the last joint.
     """
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
     upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
@@ -254,13 +243,8 @@ def find_end(
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:
     """Return the end of a body along the line from its joint to its middle [m].
 
-    It is that of its meshes; without them, that of its other shapes or masses, whichever is farther.
-
-    Args:
-        robot: the robot.
-        body: index of the body; bodies fixed to it are included.
-        anchor: position of its joint in the world [m]. (3,)
-        most: largest length accepted without meshes [m].
+    It is that of its meshes; without them, that of its other shapes or masses, whichever is farther. Bodies fixed to it
+    count. ``anchor`` is its joint in the world; without meshes a length of ``most`` [m] is accepted.
     """
     model = robot.mj_model
     data = home_poses(robot)

@@ -62,16 +62,8 @@ def find_roles(
     Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after. A
     prefix common to all used names (``mixamorig:``, ``Character1_``, ``Bip01``) is ignored, and so is a word for joint
     at the end. A name without such a word goes first (CMU has ``LHipJoint`` in the pelvis, and ``LeftHip``), and a
-    joint at one point with another limb joint goes last.
-
-    Args:
-        joint_names: joint names of the clip.
-        mapping: role (``ROLES``) to joint name of the clip; None: inferred from the names.
-        needed: roles that have to be found.
-        positions: positions of the joints; None: names alone count.
-
-    Returns:
-        role to joint name of the clip.
+    joint at one point with another limb joint goes last. ``mapping`` gives joints for roles, ``needed`` are those that
+    have to be found. Without positions names alone count.
 
     Raises:
         KeyError: the mapping has a role or a joint that does not exist.

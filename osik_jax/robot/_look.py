@@ -49,13 +49,9 @@ class Look:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class UnreadLook:
-    """Visual shapes whose files are not read yet.
+    """Visual shapes whose files are not read yet."""
 
-    Attributes:
-        reader: function that reads them.
-    """
-
-    reader: Callable[[], Look]
+    reader: Callable[[], Look]  # function that reads them
 
     @cached_property
     def read(self) -> Look:

@@ -47,10 +47,7 @@ def decode_parts(content: Mapping[str, Any], robot: Robot) -> tuple[dict[str, Ta
 def encode(part: Any, robot: Robot, where: str) -> Data:
     """Return a task, limit, scheme or gain as plain data.
 
-    Args:
-        part: an object of a public class.
-        robot: the robot that it was made for.
-        where: name of the object, for messages.
+    ``where`` is its name in messages.
 
     Raises:
         ValueError: a class that is not public in osik_jax, or an object that its constructor does not make again.

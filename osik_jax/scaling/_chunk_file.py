@@ -78,12 +78,7 @@ def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
 def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arrays: Mapping[str, np.ndarray]) -> None:
     """Write the results of some lanes.
 
-    Args:
-        folder: where to.
-        part: which lanes they are.
-        job: identifier of the job.
-        blocks: ranges of lanes that the rows of the arrays are.
-        arrays: by name, with the lanes in front.
+    ``blocks`` are the ranges of lanes that the rows of the arrays are; arrays have the lanes in front.
 
     Raises:
         OSError: the file cannot be written.

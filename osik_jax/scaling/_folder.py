@@ -19,17 +19,9 @@ from ._saved import read_manifest, write_manifest
 def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: int) -> dict[int, list[Part]]:
     """Assign a folder to a job, and check that every finished chunk is complete and of this job.
 
-    Damaged files are removed, with a warning, so that they are made anew.
-
-    Args:
-        folder: that exists, and that no other job writes to.
-        manifest: of the job.
-        process: index of this process.
-        processes: how many the job has.
-
-    Returns:
-        The chunks of which this process needs to write nothing, each with parts that it has checked: its own part is
-        there, or all parts of another number of processes.
+    Damaged files are removed, with a warning, so that they are made anew. Return the chunks of which this process needs
+    to write nothing, each with parts that it has checked: its own part is there, or all parts of another number of
+    processes. No other job writes to the folder.
 
     Raises:
         ValueError: there is another job in the folder.
@@ -79,15 +71,7 @@ def _report(damaged: DamagedFile) -> None:
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Raise where results do not fit into a folder.
-
-    Args:
-        folder: where they go.
-        needed: bytes.
-
-    Raises:
-        OSError: the disk has less than that left.
-    """
+    """Raise OSError where results of ``needed`` bytes do not fit into a folder."""
     disk = shutil.disk_usage(folder)
     if disk.total and disk.free < needed:  # some network file systems say 0 of 0
         message = (

@@ -20,14 +20,8 @@ def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
     """Make the folder, and lock it against other jobs inside the block.
 
     The operating system holds the lock for the process and drops it when the process ends, however it ends. So the lock
-    file, which stays in the folder, stops nobody.
-
-    Args:
-        folder: where the results go.
-        process: index of this process in its job.
-
-    Yields:
-        Whether the others are kept out; some file systems know no locks.
+    file, which stays in the folder, stops nobody. The block is given whether the others are kept out; some file systems
+    know no locks.
 
     Raises:
         BlockingIOError: another process has the folder; the message names it.

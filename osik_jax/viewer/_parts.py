@@ -42,21 +42,13 @@ _HIDDEN_GROUP = 3
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One shape of a robot.
+    """One shape of a robot."""
 
-    Attributes:
-        index: of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``.
-        kind: MuJoCo's geom type.
-        size: MuJoCo's geom sizes [m]. (3,)
-        color: red, green, blue, alpha. (4,)
-        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
-    """
-
-    index: int
-    kind: mujoco.mjtGeom
-    size: np.ndarray
-    color: np.ndarray
-    mesh: tuple[np.ndarray, np.ndarray] | None = None
+    index: int  # of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``
+    kind: mujoco.mjtGeom  # MuJoCo's geom type
+    size: np.ndarray  # MuJoCo's geom sizes [m]. (3,)
+    color: np.ndarray  # red, green, blue, alpha. (4,)
+    mesh: tuple[np.ndarray, np.ndarray] | None = None  # vertices (k, 3) [m] and triangles (m, 3) of a mesh
 
     @functools.cached_property
     def corners(self) -> Float[np.ndarray, "8 3"]:
@@ -93,21 +85,14 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class RobotParts:
-    """Shapes of a robot for pictures.
+    """Shapes of a robot for pictures."""
 
-    Attributes:
-        model: the MuJoCo model.
-        style: ``"look"``, ``"geoms"`` or ``"sticks"``.
-        parts: the shapes.
-        bodies: MuJoCo's index of the body that carries each part. (parts,)
-        anchors: position [m] and rotation of each part in its body; of sticks, which change with the configuration, the
-            bodies without children, and of each the farthest named point in its frame [m].
-    """
-
-    model: mujoco.MjModel
-    style: Literal["look", "geoms", "sticks"]
-    parts: tuple[Part, ...]
-    bodies: Int[np.ndarray, " parts"]
+    model: mujoco.MjModel  # the MuJoCo model
+    style: Literal["look", "geoms", "sticks"]  # ``"look"``, ``"geoms"`` or ``"sticks"``
+    parts: tuple[Part, ...]  # the shapes
+    bodies: Int[np.ndarray, " parts"]  # MuJoCo's index of the body that carries each part
+    # position [m] and rotation of each part in its body; of sticks, which change with the configuration, the bodies
+    # without children, and of each the farthest named point in its frame [m]
     anchors: tuple[np.ndarray, np.ndarray]
 
     def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:

@@ -43,11 +43,10 @@ class RayCaster:
         self._background, self._ground = self._empty_floor()
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """Return a picture of the stage; ``under`` is painted on the floor with shadows, behind the robots.
+        """Return a picture of the stage, posed by ``Stage.pose``.
 
-        Args:
-            data: from ``Stage.pose``.
-            under: red, green, blue and alpha from 0 to 1, alpha not multiplied in.
+        ``under`` is painted on the floor with shadows, behind the robots: red, green, blue and alpha from 0 to 1, alpha
+        not multiplied in.
         """
         picture = self._background * self._shadow(data)[..., None]
         if under is not None:
@@ -179,11 +178,8 @@ def light(
 ) -> Float[np.ndarray, "n 3"]:
     """Return the colours of points under a bright sky and one lamp.
 
-    Args:
-        colors: surface colours without shading. (n, 3)
-        normals: unit vectors, towards the camera. (n, 3)
-        rays: unit vectors from the camera. (n, 3)
-        lit: share of the lamp that each point sees, 0 (in shadow) to 1. (n,)
+    Normals point towards the camera, rays away from it, both of unit length. ``lit`` is the share of the lamp that each
+    point sees, 0 (in shadow) to 1.
     """
     lamp = lit * np.clip(normals @ TO_LAMP, 0.0, 1.0)
     half = TO_LAMP - rays

@@ -93,13 +93,8 @@ def frame_camera(
 ) -> Camera:
     """Return the nearest camera that sees all points [m] within a window of its picture.
 
-    Args:
-        points: what has to be seen [m]. (n, 3)
-        size: width and height of the picture [pixels].
-        azimuth: as in ``Camera``.
-        elevation: as in ``Camera``.
-        window: left, right, top and bottom as parts of the picture.
-        lens: how far the camera is, in heights of what it sees at its centre; farther means less perspective.
+    The window is left, right, top and bottom as parts of the picture. ``lens`` is how far the camera is, in heights of
+    what it sees at its centre; farther means less perspective.
     """
     left, right, top, bottom = window
     axes = Camera((0.0, 0.0, 0.0), 1.0, azimuth, elevation, 1.0).axes

@@ -22,19 +22,12 @@ class Refused(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class JointNames:
-    """Joints of a robot under their ROS names.
+    """Joints of a robot under their ROS names."""
 
-    Attributes:
-        names: ROS names of the independent joints, in the order of v. (n,)
-        index: entry of q of each joint. (n,)
-        dofs: entry of v of each joint. (n,)
-        ignored: ROS names that are known and not used: joints that follow others, and locked ones.
-    """
-
-    names: tuple[str, ...]
-    index: np.ndarray
-    dofs: np.ndarray
-    ignored: frozenset[str]
+    names: tuple[str, ...]  # ROS names of the independent joints, in the order of v. (n,)
+    index: np.ndarray  # entry of q of each joint. (n,)
+    dofs: np.ndarray  # entry of v of each joint. (n,)
+    ignored: frozenset[str]  # ROS names that are known and not used: joints that follow others, and locked ones
 
     def read(self, message: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
         """Return indices in ``names``, positions [rad or m], and the names that no joint has.

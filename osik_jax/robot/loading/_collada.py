@@ -18,19 +18,12 @@ _Color = tuple[float, float, float, float]
 
 
 class Triangles(NamedTuple):
-    """Part of a mesh that has one colour.
+    """Part of a mesh that has one colour."""
 
-    Attributes:
-        vertices: [m]. (k, 3)
-        faces: counter-clockwise seen from outside. (m, 3)
-        color: red, green, blue, alpha; ``None`` where the file has none.
-        y_up: whether the file says that its y axis points up; its numbers are left as they are.
-    """
-
-    vertices: Float[np.ndarray, "k 3"]
-    faces: Int[np.ndarray, "m 3"]
-    color: _Color | None
-    y_up: bool = False
+    vertices: Float[np.ndarray, "k 3"]  # [m]
+    faces: Int[np.ndarray, "m 3"]  # counter-clockwise seen from outside
+    color: _Color | None  # red, green, blue, alpha; ``None`` where the file has none
+    y_up: bool = False  # whether the file says that its y axis points up; its numbers are left as they are
 
 
 def read_collada(path: Path) -> list[Triangles]:

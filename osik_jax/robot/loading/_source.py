@@ -22,17 +22,11 @@ def is_mjcf(path: str | os.PathLike[str]) -> bool:
 
 
 class Source(NamedTuple):
-    """XML before it is parsed.
+    """XML before it is parsed."""
 
-    Attributes:
-        label: what error messages call it: the file's path, or "the XML text".
-        content: the XML.
-        path: of the file, None where the text itself was given.
-    """
-
-    label: str
-    content: str | bytes
-    path: Path | None
+    label: str  # what error messages call it: the file's path, or "the XML text"
+    content: str | bytes  # the XML
+    path: Path | None  # of the file, None where the text itself was given
 
 
 def read_source(given: str | os.PathLike[str], kind: str) -> Source:

@@ -79,15 +79,11 @@ def _aimed(task: Any, target: Any) -> Task:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Compiled control step.
+    """Compiled control step."""
 
-    Attributes:
-        run: from the controller's numbers, the state and a push (nv,) to the next state, status and task errors.
-        cold: the warm start of a first step.
-    """
-
+    # from the controller's numbers, the state and a push (nv,) to the next state, status and task errors
     run: Callable[[list[Array], State, Array], tuple[State, Array, dict[str, Array]]]
-    cold: Any
+    cold: Any  # the warm start of a first step
 
 
 def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
