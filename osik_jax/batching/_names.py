@@ -33,9 +33,6 @@ def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
     """Return the indices of the leaf called ``wanted``, or of all leaves under it.
 
     A ``*`` stands for any part of a name up to the next dot: ``*.weight``, ``*_foot.gain``, ``limits[*].velocity``.
-
-    Raises:
-        KeyError: no such leaf; the message lists the names.
     """
     own = "[^.]*".join(re.escape(part) for part in str(wanted).split("*"))
     pattern = re.compile(rf"{own}(?:[.\[].*)?")
@@ -50,10 +47,6 @@ def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, b
 
     A value is one array for each of the leaves found (``find_leaves``), or a pytree with one array for each. If
     ``batched``, each has one more axis in front.
-
-    Raises:
-        KeyError: no such name.
-        ValueError: a wrong shape, or a leaf that is given twice.
     """
     leaves, structure = jax.tree.flatten(tree)
     given: dict[int, str] = {}

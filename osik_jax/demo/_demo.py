@@ -25,11 +25,7 @@ _PICTURES = 12_000_000
 
 
 def writable_folder(path: Path, motion: Motion, *, schemes: int, dt: float) -> Path:
-    """Create the folder and check that the files can be written to it, the motion counted without compression.
-
-    Raises:
-        OSError: it cannot be made, nothing can be written to it, or too little room is left on its disk.
-    """
+    """Create the folder and check that the files can be written to it, the motion counted without compression."""
     path.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryFile(dir=path) as file:

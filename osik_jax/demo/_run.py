@@ -33,11 +33,7 @@ class Run:
 
 
 def make_scheme(name: str) -> WeightedQP | NullSpace | HierarchicalQP:
-    """Return a scheme with its default settings.
-
-    Raises:
-        KeyError: no such scheme; the message lists those that exist.
-    """
+    """Return a scheme with its default settings."""
     if name not in _SCHEMES:
         raise unknown_name("scheme", name, tuple(_SCHEMES))
     return _SCHEMES[name]()

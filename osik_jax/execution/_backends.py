@@ -49,12 +49,7 @@ CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"
 
 
 def check_backend(backend: Any) -> Backend:
-    """Return a checked backend.
-
-    Raises:
-        ValueError: no such backend.
-        ModuleNotFoundError: its kernels are not installed; the message says how to install them.
-    """
+    """Return a checked backend."""
     if backend in ("numba", "warp"):
         raise OsikValueError(f"backend={backend!r} is gone: the compiled core has its kernels; take 'auto' or 'core'")
     if backend not in BACKENDS:
@@ -68,10 +63,6 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     """Return whether a solver includes the candidates of a kernel in its program.
 
     ``fits`` says whether the solver has such a kernel for problems of this kind, precision and shape.
-
-    Raises:
-        ValueError: this kernel was requested and does not fit.
-        ModuleNotFoundError: it was requested and is not installed.
     """
     if kernel == "core-cuda":
         return backend in ("auto", "core") and fits and cuda_is_default()
@@ -89,9 +80,6 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     """Call a kernel's function on the kernel's platform, and the search on other platforms.
 
     The functions are not differentiated. One program may be lowered for several platforms.
-
-    Raises:
-        ValueError: a symbolic batch of ``jax.export``, or a kernel in a program that is exported.
     """
     if not kernels:
         return search(*args)

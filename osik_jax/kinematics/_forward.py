@@ -249,11 +249,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
 def moving_center(
     robot: Robot, kinematics: Kinematics, subtree: str | None = None
 ) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
-    """Return ``center_of_mass`` and ``com_jacobian``.
-
-    Raises:
-        KeyError, ValueError: as in ``center_of_mass``.
-    """
+    """Return ``center_of_mass`` and ``com_jacobian``."""
     alone = _with_masses(robot, subtree)
     if kinematics.backend == "jax":
         return _center_and_jacobian(alone, kinematics)
@@ -314,11 +310,7 @@ def _moments(mass: Numbers, center: Numbers, position: Numbers, rotation: Number
 
 
 def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbody"]:
-    """Return the mass of each body [kg], 0 outside the subtree, or outside the robot.
-
-    Raises:
-        KeyError, ValueError: as in ``center_of_mass``.
-    """
+    """Return the mass of each body [kg], 0 outside the subtree, or outside the robot."""
     mass, tree = robot.body_mass, robot.tree
     if subtree is None:
         own = tree.is_own

@@ -16,10 +16,6 @@ def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> d
     """Return the numbers of a CSV file by the names of its columns; lines that begin with # are left out.
 
     The head names the columns; ``unnamed`` does so for a file that begins with numbers.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no head, equal names, no numbers, or lines of different lengths.
     """
     with open(path, newline="", encoding="utf-8") as file:
         head, *lines = [row for row in csv.reader(file) if row and not row[0].startswith("#")] or [[]]

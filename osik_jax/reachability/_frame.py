@@ -67,12 +67,7 @@ class Frame(eqx.Module):
 
 
 def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int) -> Frame:
-    """Return a robot's frame, checked.
-
-    Raises:
-        KeyError: no such frame; the message lists those that exist.
-        ValueError: no joint carries it, or one that moves freely.
-    """
+    """Return a robot's frame, checked."""
     robot.tree.frame(name)
     if not is_plain(robot.tree, (name,)):
         raise OsikValueError(

@@ -62,12 +62,7 @@ def _along(middle: float, side: float, spacing: float) -> Float[np.ndarray, " n"
 
 
 def checked_grid(grid: object) -> Grid:
-    """Return a checked grid of a user.
-
-    Raises:
-        TypeError: no three sequences of numbers.
-        ValueError: coordinates that are not finite, not increasing, or none.
-    """
+    """Return a checked grid of a user."""
     expected = "it is (x, y, z): the coordinates along each axis, increasing [m]"
     if not isinstance(grid, tuple | list) or len(grid) != 3:
         raise OsikTypeError(f"grid is {grid!r}; {expected}")

@@ -58,11 +58,7 @@ def base_body(robot: Robot) -> int:
 
 
 def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: int = 3) -> list[Chain]:
-    """Return the limbs that end in some bodies, those with ``least`` joints.
-
-    Raises:
-        ValueError: a limb has fewer joints.
-    """
+    """Return the limbs that end in some bodies, those with ``least`` joints."""
     chains = []
     for end in ends:
         others = [other for other in ends if other != end]
@@ -77,11 +73,7 @@ def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: in
 
 
 def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, pointed: bool = False) -> Limb:
-    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it.
-
-    Raises:
-        ValueError: no joint between the ends of the leg bends it.
-    """
+    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it."""
     knee = _bend(robot, kinematics, leg, 0)
     ankle = None if knee is None else _after(leg.anchors, knee)
     if knee is not None and ankle is not None and not pointed:
@@ -101,9 +93,6 @@ def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Limb:
     is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link
     is the wrist. Where none bends it so either, the arm ends at the elbow: at its last joint, or at the end of its last
     link if that is far from there.
-
-    Raises:
-        ValueError: the arm has no length.
     """
     hand = _hand(robot, arm)
     own = Chain(arm.bodies[: hand + 1], arm.anchors[: hand + 1])

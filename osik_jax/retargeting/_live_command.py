@@ -51,9 +51,6 @@ def stream(make: Make, lines: Iterable[str], out: TextIO) -> int:
     z up, null for a joint that is not seen, optionally ``"contact": [...]``; ``null`` is a lost frame. The first output
     line has ``joint_names`` and ``latency`` [s]; each other line is ``{"frame": 0, "qpos": [...], "contact": [...],
     "status": "followed"}`` in MuJoCo's order. Return how many frames were written.
-
-    Raises:
-        ValueError: a line is broken; the message says which, and what is wrong.
     """
     rows = _rows(lines)
     head = next(rows, (1, None))[1]

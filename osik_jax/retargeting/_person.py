@@ -105,9 +105,6 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
     """Measure a person and the floor from a clip.
 
     An ``OsikWarning`` is given if z does not seem to point up. ``standing`` are the points that say when feet stand.
-
-    Raises:
-        ValueError: the legs are shorter than 0.1 m or longer than 3 m, so the clip is not in metres.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS

@@ -64,10 +64,6 @@ def find_roles(
     at the end. A name without such a word goes first (CMU has ``LHipJoint`` in the pelvis, and ``LeftHip``), and a
     joint at one point with another limb joint goes last. ``mapping`` gives joints for roles, ``needed`` are those that
     have to be found. Without positions names alone count.
-
-    Raises:
-        KeyError: the mapping has a role or a joint that does not exist.
-        ValueError: joints that retargeting needs are not found, or two are at one point; the message says which.
     """
     places = {} if positions is None else _places(joint_names, positions)
     roles = _by_name(joint_names, needed, places) if mapping is None else _checked(joint_names, mapping, needed)

@@ -64,9 +64,6 @@ def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
     Without them they are those of a person of 1.7 m, because ``betas`` needs the model's own data. Rotation vectors are
     ``poses`` (F, 3 k) of k joints, 22 at least, or ``root_orient`` (F, 3) and ``pose_body`` (F, 63); ``trans`` (F, 3)
     is in metres; the rate is ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``.
-
-    Raises:
-        ValueError: the rate is missing, or arrays do not agree.
     """
     count = len(_TREE)
     poses = arrays["poses"] if "poses" in arrays else np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)

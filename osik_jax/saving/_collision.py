@@ -68,11 +68,7 @@ def _shapes_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, dict
 
 
 def _shape(data: Mapping[str, Any]) -> CollisionShape:
-    """Return the shape of data, equal to the last bit.
-
-    Raises:
-        ValueError: a kind that is not known.
-    """
+    """Return the shape of data, equal to the last bit."""
     kind = _KINDS.get(data["shape"])
     if kind is None:
         raise OsikValueError(f"{data['shape']!r} is no shape: there are {', '.join(_KINDS)}")

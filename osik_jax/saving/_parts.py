@@ -48,9 +48,6 @@ def encode(part: Any, robot: Robot, where: str) -> Data:
     """Return a task, limit, scheme or gain as plain data.
 
     ``where`` is its name in messages.
-
-    Raises:
-        ValueError: a class that is not public in osik_jax, or an object that its constructor does not make again.
     """
     if isinstance(part, NoLimits):
         return {"kind": _NO_LIMITS}
@@ -85,11 +82,7 @@ def makes(data: Data, robot: Robot, part: Any) -> bool:
 
 
 def decode(data: Any, robot: Robot, where: str) -> Any:
-    """Return the object of data from ``encode``, made by its constructor for this robot.
-
-    Raises:
-        ValueError: no such data, a class that this version does not have, or arguments that it does not take.
-    """
+    """Return the object of data from ``encode``, made by its constructor for this robot."""
     kind = data.get("kind") if isinstance(data, Mapping) else None
     if kind == _NO_LIMITS:
         return no_limits

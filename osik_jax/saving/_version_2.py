@@ -15,11 +15,7 @@ _DERIVED = {"made_for", "gain", "row_count", "dt"}
 
 
 def converted(data: Any) -> Any:
-    """Return data as ``decode`` takes it.
-
-    Raises:
-        ValueError: an object whose fields do not tell its constructor's arguments.
-    """
+    """Return data as ``decode`` takes it."""
     if isinstance(data, list):
         return [converted(one) for one in data]
     if not isinstance(data, Mapping):

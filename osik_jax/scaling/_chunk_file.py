@@ -129,12 +129,7 @@ def unwritable(folder: Path, what: str, error: OSError) -> OSError:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a file for reading inside the block; yield its arrays.
-
-    Raises:
-        DamagedFile: one of them cannot be read.
-        OSError: the file is not there, or may not be read.
-    """
+    """Open a file for reading inside the block; yield its arrays."""
     try:
         with open_npz(path) as file:
             yield file
@@ -147,12 +142,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def check_chunk(path: Path, part: Part, job: str) -> None:
-    """Read a file once, against its checksums.
-
-    Raises:
-        DamagedFile: a byte that matters has changed, or the file is of another chunk.
-        OtherJob: the file is whole, and of another job.
-    """
+    """Read a file once, against its checksums."""
     with opened(path) as file:
         broken = file.zip.testzip()
         if broken is not None:

@@ -22,9 +22,6 @@ def claim(folder: Path, manifest: Mapping[str, Any], process: int, processes: in
     Damaged files are removed, with a warning, so that they are made anew. Return the chunks of which this process needs
     to write nothing, each with parts that it has checked: its own part is there, or all parts of another number of
     processes. No other job writes to the folder.
-
-    Raises:
-        ValueError: there is another job in the folder.
     """
     old = _old_manifest(folder)
     changed = [line for line in differences(old or manifest, manifest) if not line.startswith("job was")]

@@ -22,10 +22,6 @@ def only_job(folder: Path, process: int = 0) -> Iterator[bool]:
     The operating system holds the lock for the process and drops it when the process ends, however it ends. So the lock
     file, which stays in the folder, stops nobody. The block is given whether the others are kept out; some file systems
     know no locks.
-
-    Raises:
-        BlockingIOError: another process has the folder; the message names it.
-        OSError: the folder cannot be made or written to.
     """
     from filelock import FileLock, Timeout  # a tenth of a second, which jobs in memory need not wait for
 

@@ -74,9 +74,6 @@ def per_level(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
     """Return the dampings of ``count`` levels of n variables as one object with a leading axis of levels.
 
     ``damping`` is a number or a ``Damping`` for all levels, or a sequence with one for each.
-
-    Raises:
-        ValueError: a sequence of another length.
     """
     single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
     given = [damping] * count if single else list(damping)

@@ -302,22 +302,14 @@ def _row_weight(value: Any, name: str, dtype: Any) -> Float[Array, "3"]:
 
 
 def option(name: str, value: str, available: tuple[str, ...]) -> str:
-    """Return a value that is one of the available options.
-
-    Raises:
-        ValueError: it is not; the message lists the options.
-    """
+    """Return a value that is one of the available options."""
     if value not in available:
         raise OsikValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")
     return value
 
 
 def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
-    """Return six booleans from the name of a set of rows, or from six booleans.
-
-    Raises:
-        ValueError: no such name, not six, or none of them is true.
-    """
+    """Return six booleans from the name of a set of rows, or from six booleans."""
     if isinstance(rows, str):
         if rows not in ROWS:
             raise OsikValueError(unknown_name("row set", rows, tuple(ROWS)).args[0])

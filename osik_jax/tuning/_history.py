@@ -85,10 +85,6 @@ def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: A
     """Return a state that ``save_state`` wrote.
 
     ``space`` is that of the saved state; ``optimizer`` is the first state of the optimiser, for its structure.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is of other parameters, or another optimiser.
     """
     with open_npz(path) as file:
         arrays = dict(file)

@@ -120,9 +120,6 @@ def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
         robot: the robot.
         style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the
             visual shapes of its URDF, else the geoms if most moving bodies have a visible one, else sticks.
-
-    Raises:
-        ValueError: ``style="geoms"`` of a model that has no visible geom.
     """
     model, unread = robot.mj_model, robot.holder.look
     if unread is not None and style == "auto":
@@ -237,11 +234,7 @@ def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "link
 
 
 def fixed_parts(robot: Robot, shapes: Iterable[CollisionShape]) -> RobotParts:
-    """Return shapes of the world as parts that the world's body carries.
-
-    Raises:
-        ValueError: a shape on a frame of the robot, a half-space or a convex hull.
-    """
+    """Return shapes of the world as parts that the world's body carries."""
     shapes = tuple(shapes)
     for shape in shapes:
         if shape.frame is not None or shape.kind not in _KINDS:

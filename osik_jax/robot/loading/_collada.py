@@ -30,9 +30,6 @@ def read_collada(path: Path) -> list[Triangles]:
     """Return the triangles and polygons of the scene in metres, in the file's axes; ``up_axis`` is ignored.
 
     Skins, splines and lines are left out; of a texture, the mean colour is taken.
-
-    Raises:
-        ValueError: the file is not COLLADA, or holds nothing to draw.
     """
     try:
         root = _without_namespaces(ElementTree.parse(path).getroot())

@@ -23,11 +23,6 @@ def described(name: str, options: LoadOptions) -> RobotModel:
     """Return names and numbers of a robot that ``robot_descriptions`` knows.
 
     A URDF looks for its meshes in its own packages instead of ``options.package_dirs``.
-
-    Raises:
-        ImportError: the package is not installed.
-        KeyError: it knows no such robot; the message lists those with names like this one.
-        ValueError: the robot comes as xacro, or as no file that can be read here.
     """
     known = _known(name)
     if name not in known:

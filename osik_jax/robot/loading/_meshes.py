@@ -20,11 +20,7 @@ SUFFIXES = (".dae", ".stl", ".obj", ".msh")
 
 
 def read_mesh(path: Path) -> list[Triangles]:
-    """Return the triangles of a mesh file, in the file's axes.
-
-    Raises:
-        ValueError: the file is of another kind, broken, or empty.
-    """
+    """Return the triangles of a mesh file, in the file's axes."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")

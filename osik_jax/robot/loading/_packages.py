@@ -35,9 +35,6 @@ class Packages:
 
         Plain paths are relative to the folder of ``beside``, the file that names them. Any folder above it that is
         called ``NAME`` is taken for the package, last of all.
-
-        Raises:
-            FileNotFoundError: there is no such file; the message lists where it was looked for.
         """
         text = str(address)
         spellings = dict.fromkeys([text, unquote(text), unquote(text).replace("\\", "/")])

@@ -30,13 +30,7 @@ class Source(NamedTuple):
 
 
 def read_source(given: str | os.PathLike[str], kind: str) -> Source:
-    """Read a file, or take the text itself (anything that starts with ``<``).
-
-    Raises:
-        FileNotFoundError: no such file; the message lists the files of the same suffix that lie there.
-        TypeError: neither a path nor text.
-        ValueError: an empty text.
-    """
+    """Read a file, or take the text itself (anything that starts with ``<``)."""
     if not isinstance(given, str | os.PathLike):
         raise OsikTypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
     if not str(given).strip():
@@ -53,9 +47,6 @@ def parse_xml(source: Source) -> ElementTree.Element:
     """Return the root element of XML that may break three rules, as robot files often do.
 
     Comments may hold ``--``, an ``&`` may stand alone, and prefixes of names (``drake:``) may be undeclared.
-
-    Raises:
-        ValueError: the XML is broken; the message gives line and column.
     """
     try:
         return ElementTree.fromstring(_edited(source.content, _well_formed))

@@ -141,11 +141,7 @@ def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float)
 def own_limit(
     robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
 ) -> CollisionAvoidanceLimit:
-    """Return the limit of self-collision, without pairs that are too near at q, such as links two joints apart.
-
-    Raises:
-        ValueError: no two links can meet.
-    """
+    """Return the limit of self-collision, without pairs that are too near at q, such as links two joints apart."""
     found = members(robot, covers)[len(robot.tree.geom_names) :]
     model, data = _as_model(robot, covers, q)
     kept = [

@@ -66,11 +66,7 @@ def _made(data: Mapping[str, Any]) -> str:
 
 
 def _shape(name: str, data: Mapping[str, Any]) -> str:
-    """Return the expression that makes a shape, with its numbers rounded.
-
-    Raises:
-        ValueError: a convex hull.
-    """
+    """Return the expression that makes a shape, with its numbers rounded."""
     position, turn, size = (np.asarray(data[k]) for k in ("position", "rotation", "size"))
     kind, frame = data["shape"], f"frame={data['frame']!r}"
     if kind == "hull":

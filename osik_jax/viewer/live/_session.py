@@ -154,11 +154,7 @@ def load_session(path: str | os.PathLike[str]) -> Session:
 
 
 def session_from_json(text: str, where: str = "this") -> Session:
-    """Return the session of a ``Session.to_json`` text; ``where`` names its source in messages.
-
-    Raises:
-        ValueError: as in ``load_session``.
-    """
+    """Return the session of a ``Session.to_json`` text; ``where`` names its source in messages."""
     try:
         content = json.loads(text)
         known = isinstance(content, dict) and content.get("format") == _FORMAT

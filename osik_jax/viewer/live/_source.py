@@ -22,11 +22,7 @@ class RobotSource:
     floating_base: bool | None = None
 
     def load(self) -> Robot:
-        """Return the robot.
-
-        Raises:
-            FileNotFoundError, ImportError, KeyError, ValueError: as in ``read_robot``.
-        """
+        """Return the robot."""
         return read_robot(self.robot, floating_base=self.floating_base)
 
     def python(self) -> str:

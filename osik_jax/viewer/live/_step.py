@@ -112,11 +112,7 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
 
 
 def stacked(controllers: Sequence[Controller]) -> Controller:
-    """Return one controller for a batch; each number has a leading axis.
-
-    Raises:
-        ValueError: they differ in more than numbers.
-    """
+    """Return one controller for a batch; each number has a leading axis."""
     first = controllers[0]
     if any(one.structure() != first.structure() for one in controllers):
         raise OsikValueError(
