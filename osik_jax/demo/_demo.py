@@ -12,7 +12,6 @@ import numpy as np
 from rich.table import Table
 
 from ..viewer import animate, hero_picture
-from ..viewer._opengl import RendererName
 from ._comparison import comparison
 from ._figures import figures, table
 from ._motion import Motion
@@ -49,7 +48,6 @@ def run_demo(
     physics: bool = False,
     animation: bool = True,
     picture: bool = False,
-    renderer: RendererName = "auto",
     announce: Callable[[str, float], None] = lambda stage, done: None,
 ) -> tuple[Table, Sequence[Run]]:
     """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
@@ -61,7 +59,6 @@ def run_demo(
 
     Raises:
         KeyError: no such scheme.
-        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
     """
     folder.mkdir(parents=True, exist_ok=True)
     run, doing = run_scheme, "compiling and running"
@@ -80,7 +77,7 @@ def run_demo(
     if animation:
         names = ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]
         for name in names:
-            _film(folder / name, motion, runs[-1], dt, renderer, lambda x: announce("filming", start + 0.35 * x))
+            _film(folder / name, motion, runs[-1], dt, lambda x: announce("filming", start + 0.35 * x))
     if picture:
         announce("drawing the picture", 0.97)
         _draw_picture(folder / "picture.png", motion, runs[-1])
@@ -105,9 +102,7 @@ def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _film(
-    path: Path, motion: Motion, run: Run, dt: float, renderer: RendererName, progress: Callable[[float], None]
-) -> None:
+def _film(path: Path, motion: Motion, run: Run, dt: float, progress: Callable[[float], None]) -> None:
     """Write a film of a scheme's motion, with a curve of the largest component of up to two goals [mm]."""
     seen, values, wanted = run.seen, {}, {}
     for label in list(motion.goals)[:2]:
@@ -119,7 +114,6 @@ def _film(
         motion.robot,
         run.q,
         dt=dt,
-        renderer=renderer,
         support=seen.support or None,
         trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
         curves=values,

@@ -31,7 +31,7 @@ FEET = ("l_sole", "r_sole")
 def short(tmp_path_factory):
     """A demonstration of half a second: its folder, table, motion and run."""
     folder, motion = tmp_path_factory.mktemp("demo"), _nao.double_support(0.5)
-    shown, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    shown, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT)
     return folder, shown, motion, run
 
 
