@@ -50,8 +50,6 @@ CPU_KERNELS = {name for name, platform in _PLATFORM.items() if platform == "cpu"
 
 def check_backend(backend: Any) -> Backend:
     """Return a checked backend."""
-    if backend in ("numba", "warp"):
-        raise OsikValueError(f"backend={backend!r} is gone: the compiled core has its kernels; take 'auto' or 'core'")
     if backend not in BACKENDS:
         raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
     if backend == "core" and not _library.installed():
