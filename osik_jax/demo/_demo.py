@@ -12,8 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from ..viewer import animate, hero_picture
-from ._comparison import comparison
-from ._figures import figures, table
+from ._figures import comparison, figures, table
 from ._motion import Motion
 from ._physics import PhysicsRun, run_physics
 from ._run import TITLES, Run, run_scheme

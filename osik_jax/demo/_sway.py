@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from ..kinematics import forward_kinematics, frame_jacobian, integrate
 from ..robot import Robot
 from ..robot._tree import SLIDE
-from ._motion import Goal, Rows
-from ._references import Path, Stroke, follow
+from ._motion import Goal, Path, Rows, Stroke, follow
 
 SWAY = 0.05
 """Distance of the frame's motion [m] for a robot sized between ``_SMALL`` and ``_LARGE``; the same share of the size

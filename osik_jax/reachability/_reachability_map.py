@@ -22,9 +22,8 @@ from ..robot import Robot
 from ..scaling import run_in_chunks
 from ..scaling._progress import Progress
 from ._frame import Frame, read_frame
-from ._grid import Grid, around, checked_grid
+from ._grid import Grid, around, checked_grid, spread_rotations
 from ._map import ReachabilityMap
-from ._rotations import spread_rotations
 
 _POSES = 16_384
 """Poses in a chunk: some seconds of work, and enough to fill the cores."""

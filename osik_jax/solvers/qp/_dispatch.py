@@ -35,7 +35,7 @@ from ...numerics._constants import (
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
 from . import _core, _cuda
-from ._candidate import Candidate
+from ._core import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
 from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, multiplier_roundoff, unpack

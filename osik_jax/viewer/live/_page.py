@@ -20,14 +20,12 @@ from ...tasks import ComTask, SupportPolygon, Task
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._desk import Desk
-from ._gizmos import Gizmos, Pose, gizmo_target
+from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
 from ._marks import BalanceMarks
-from ._obstacle_nodes import ObstacleNodes
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
 from ._server import FRAME, WORDS, Driving
-from ._session import Session
-from ._source import RobotSource
+from ._session import RobotSource, Session
 from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
