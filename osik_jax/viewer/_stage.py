@@ -19,21 +19,13 @@ TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """Pinhole camera that looks at a point.
+    """Pinhole camera that looks at a point."""
 
-    Attributes:
-        center: what it looks at [m]. (3,)
-        distance: from there to the lens [m].
-        azimuth: of the lens about the vertical, 0 from +x [deg].
-        elevation: of the lens above the horizon [deg].
-        height: of what it sees at the centre, top to bottom of the picture [m].
-    """
-
-    center: tuple[float, float, float]
-    distance: float
-    azimuth: float
-    elevation: float
-    height: float
+    center: tuple[float, float, float]  # what it looks at [m]. (3,)
+    distance: float  # from there to the lens [m]
+    azimuth: float  # of the lens about the vertical, 0 from +x [deg]
+    elevation: float  # of the lens above the horizon [deg]
+    height: float  # of what it sees at the centre, top to bottom of the picture [m]
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:

@@ -37,21 +37,13 @@ _ROWS = 12
 
 
 class Obstacle(NamedTuple):
-    """Draggable shape of the world.
+    """Draggable shape of the world."""
 
-    Attributes:
-        name: in its limit.
-        kind: ball or box.
-        position: of its middle [m]. (3,)
-        rotation: from its axes to the world's. (3, 3)
-        size: of a ball, the radius first; of a box, half its edges [m]. (3,)
-    """
-
-    name: str
-    kind: str
-    position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    size: Float[np.ndarray, "3"]
+    name: str  # in its limit
+    kind: str  # ball or box
+    position: Float[np.ndarray, "3"]  # of its middle [m]
+    rotation: Float[np.ndarray, "3 3"]  # from its axes to the world's
+    size: Float[np.ndarray, "3"]  # of a ball, the radius first; of a box, half its edges [m]
 
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:

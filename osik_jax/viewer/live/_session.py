@@ -190,15 +190,10 @@ def _loose(limit: Limit) -> Limit | None:
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """Robot given by name or file.
+    """Robot given by name or file."""
 
-    Attributes:
-        robot: a name that ``load_robot`` takes, or the path of a URDF or MJCF file.
-        floating_base: as in ``Robot.from_urdf``; None: as the file says.
-    """
-
-    robot: str
-    floating_base: bool | None = None
+    robot: str  # a name that ``load_robot`` takes, or the path of a URDF or MJCF file
+    floating_base: bool | None = None  # as in ``Robot.from_urdf``; None: as the file says
 
     def load(self) -> Robot:
         """Return the robot."""
