@@ -17,8 +17,7 @@ from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
 from ..viewer._crouch import crouched
 from ..viewer._outline import robot_outline
 from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
-from ._start import dexterous_start
-from ._sway import SWAY, sway, sway_of
+from ._sway import SWAY, dexterous_start, sway, sway_of
 
 
 def file_motion(
