@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from .._progress import Progress
 from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
@@ -20,7 +21,6 @@ from ..limits import Limits
 from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..scaling import run_in_chunks
-from ..scaling._progress import Progress
 from ._frame import Frame, read_frame
 from ._grid import Grid, around, checked_grid, spread_rotations
 from ._map import ReachabilityMap

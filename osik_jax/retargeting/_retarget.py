@@ -13,11 +13,11 @@ import jax
 import numpy as np
 
 from .._errors import OsikValueError, warn
+from .._progress import reported
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..numerics._arguments import check_count
 from ..robot import Robot
-from ..scaling._progress import reported
 from ._body import measured
 from ._guess import describe_profile
 from ._lanes import (
