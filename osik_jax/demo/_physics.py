@@ -39,9 +39,6 @@ def run_physics(motion: Motion, scheme: str, *, dt: float) -> PhysicsRun:
     """Run the kinematic motion as a plan, then the same tasks in closed loop with MuJoCo.
 
     NAO stands on its plastic soles, which extend 10 to 20 mm beyond its force sensors.
-
-    Raises:
-        KeyError: no such scheme.
     """
     plan = run_scheme(motion, scheme, dt=dt)
     # the timestep is the largest divisor of dt up to 1 ms; 1e-9 keeps an exact divisor from being rounded up

@@ -26,11 +26,7 @@ def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
-    """Return a finite number that is not negative; ``dtype=None``: an array's float dtype, else JAX's default.
-
-    Raises:
-        ValueError: the value is negative, not finite, or not a scalar.
-    """
+    """Return a finite number that is not negative; ``dtype=None``: an array's float dtype, else JAX's default."""
     if dtype is None:
         own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
         dtype = value.dtype if own else float

@@ -32,9 +32,6 @@ def around(frame: Frame, positions: int) -> Grid:
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
     frame never moves, as a planar arm's, is a single coordinate. There are at most ``positions``; that number is nearly
     reached.
-
-    Raises:
-        ValueError: ``positions`` is no positive number.
     """
     check_count("positions", positions)
     places = np.asarray(frame.sampled_positions(_SAMPLES))

@@ -49,11 +49,7 @@ document.querySelectorAll('#osik .now').forEach(e=>e.style.left=100*now+'%')},50
 
 
 def write_report(result: Retargeted, figures: Mapping[str, Any], motion: Path, out: Path) -> None:
-    """Write one HTML file that shows a retargeted motion, saved to ``motion.npz`` before, without server or network.
-
-    Raises:
-        ImportError: viser is not installed (the extra ``viewer``).
-    """
+    """Write one HTML file that shows a retargeted motion, saved to ``motion.npz`` before, without server or network."""
     from ..viewer.live._export import write_page
     from ..viewer.live._playback import read_motion
 

@@ -153,12 +153,7 @@ def check_chunk(path: Path, part: Part, job: str) -> None:
 def read_chunk(
     path: Path, part: Part, job: str, names: Sequence[str] | None = None
 ) -> tuple[list[Block], dict[str, np.ndarray]]:
-    """Return the lanes that a file has, and some of its arrays by name, or all.
-
-    Raises:
-        DamagedFile: something of it cannot be read, or it is of another chunk.
-        OtherJob: it is of another job.
-    """
+    """Return the lanes that a file has, and some of its arrays by name, or all."""
     with opened(path) as file:
         _check_marks(file, path, part, job)
         wanted = result_names(file) if names is None else names

@@ -55,10 +55,6 @@ def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "
     """Return one weight per row of some dofs.
 
     It is given as a scalar, in the order of these rows, in the order of v, or by joint names.
-
-    Raises:
-        KeyError: a name that is none of the joints'.
-        ValueError: any other shape, or a weight that is negative or not finite.
     """
     dtype = robot.q0.dtype
     if isinstance(value, Mapping) or (np.shape(value) == (robot.nv,) and len(dofs) != robot.nv):

@@ -47,12 +47,7 @@ def joined(parts: Sequence[Triangles]) -> tuple[Float[np.ndarray, "k 3"], Int[np
 
 
 def unread_points(mesh: UnreadMesh) -> Float[np.ndarray, "k 3"]:
-    """Return the vertices of a collision mesh [m], in the axes of its shape.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read.
-    """
+    """Return the vertices of a collision mesh [m], in the axes of its shape."""
     beside = None if mesh.beside is None else Path(mesh.beside)
     path = Packages(mesh.folders).path(mesh.file, beside=beside)
     return joined(read_mesh(path))[0] * np.array(mesh.scale)

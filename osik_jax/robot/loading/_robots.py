@@ -25,10 +25,6 @@ def robot_trees(
     is none, the only one with a joint that is not free. All that moves is one robot where none of this applies.
     ``root`` names bodies or sites whose trees are the robot; None: the model's custom text ``robot_roots``, or the
     rule.
-
-    Raises:
-        KeyError: no such body or site.
-        ValueError: nothing moves in the tree that ``root`` names.
     """
     moving = np.setdiff1d(np.arange(model.njnt), list(locked)).astype(int)
     trees = _trees(model, moving)

@@ -28,10 +28,6 @@ def meshes_of(
     Shapes with the same file and scale have the same arguments. If ``checked``, each mesh is tried alone: a flat one is
     thickened, one that MuJoCo cannot read is left out, and the notes say so. Without, all are returned as they are,
     which is quicker.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a file of a kind that cannot be read.
     """
     known: dict[tuple[Path, tuple[float, ...]], tuple[dict[str, Any] | None, str]] = {}
     found, notes = [], []

@@ -89,11 +89,7 @@ class Desk:
             self._put(name, self.task(name).replace(**numbers))
 
     def rank(self, name: str, priority: int) -> None:
-        """Set the priority of a task.
-
-        Raises:
-            ValueError: a task of a class of somebody's own.
-        """
+        """Set the priority of a task."""
         with self._lock:
             task, robot = self.task(name), self._session.robot
             if task.priority != priority:
@@ -167,11 +163,7 @@ class Desk:
         self.move_obstacle(name, position=PARKED)
 
     def avoid_itself(self) -> None:
-        """Add the limit that avoids self-collision.
-
-        Raises:
-            ValueError: no two links of it are apart.
-        """
+        """Add the limit that avoids self-collision."""
         with self._lock:
             session = self._session
             self._put_limit(own_limit(session.robot, self._covers, session.q))

@@ -116,11 +116,7 @@ def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."
 
 
 def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float) -> CollisionAvoidanceLimit:
-    """Return the limit between links and obstacles, with all obstacles out of use; ``size`` is the robot's [m].
-
-    Raises:
-        ValueError: no link moves.
-    """
+    """Return the limit between links and obstacles, with all obstacles out of use; ``size`` is the robot's [m]."""
     edge = 0.06 * size
     slots = {f"ball {number + 1}": CollisionShape.sphere(edge, PARKED) for number in range(SLOTS["ball"])}
     slots |= {f"box {number + 1}": CollisionShape.box((edge, edge, edge), PARKED) for number in range(SLOTS["box"])}

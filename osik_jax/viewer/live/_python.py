@@ -18,11 +18,7 @@ _COLLISIONS = "CollisionAvoidanceLimit"
 
 
 def python(part: Any, robot: Robot, where: str = "it") -> str:
-    """Return the expression that makes an object, without arguments that have their defaults.
-
-    Raises:
-        ValueError: an object that a file cannot hold (``encode``), or a convex hull, whose points are not kept.
-    """
+    """Return the expression that makes an object, without arguments that have their defaults."""
     data = encode(part, robot, where)
     short = _shortened(data) if data["kind"] == _COLLISIONS else data
     data = short if makes(short, robot, part) else data
