@@ -28,9 +28,9 @@ from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
-from osik_jax.viewer.live._default import find_hands
+from osik_jax.viewer.live._open import find_hands
 from osik_jax.viewer.live._page import LiveView
-from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._session import RobotSource
 from osik_jax.viewer.live._surfaces import part_triangles
 from osik_jax.viewer.live._timing import Stopwatch
 

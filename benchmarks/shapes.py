@@ -28,7 +28,7 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Profile, Retargeted, Retargeter, load_motion
 from osik_jax.robot.loading import example_urdf
-from osik_jax.robot.loading._embedded import EXAMPLES
+from osik_jax.robot.loading._named import EXAMPLES
 from osik_jax.runtime import configure_cpu
 
 from .data_file import write_csv

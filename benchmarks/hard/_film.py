@@ -12,10 +12,10 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.viewer._animate import paint_over, write_gif
-from osik_jax.viewer._opengl import make_renderer
 from osik_jax.viewer._outline import floor_height
 from osik_jax.viewer._overlay import INK, ORANGE, Canvas
 from osik_jax.viewer._parts import RobotParts, robot_parts
+from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._stage import Camera, Stage, frame_camera
 
 from ..peers.ours import places, standing
@@ -66,8 +66,8 @@ def _pictures(found: dict[str, Motion], work: Workload, case: Case) -> Iterator[
     seen = [_corners(robot, shape, path, shift) for path, shift in zip(paths, shifts, strict=True)]
     window = (0.05, 0.95, 0.13, 0.86)
     camera = frame_camera(np.concatenate([*seen, goals]), SIZE, AZIMUTH, ELEVATION, window, lens=LENS)
-    stage = Stage([shape, shape], camera, floor=floor)
-    drawer = make_renderer("raycast", stage, camera, SIZE, floor=floor)
+    stage = Stage([shape, shape])
+    drawer = RayCaster(stage, camera, SIZE, floor=floor)
     middles = [float(np.mean(camera.project(points, SIZE)[:, 0])) for points in seen]
     speeds = [_shares(motion.path, work.velocity) for motion in found.values()]
     for frame, sources in enumerate(zip(*(mujoco_poses(robot, path) for path in paths), strict=True)):

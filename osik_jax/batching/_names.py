@@ -33,9 +33,6 @@ def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
     """Return the indices of the leaf called ``wanted``, or of all leaves under it.
 
     A ``*`` stands for any part of a name up to the next dot: ``*.weight``, ``*_foot.gain``, ``limits[*].velocity``.
-
-    Raises:
-        KeyError: no such leaf; the message lists the names.
     """
     own = "[^.]*".join(re.escape(part) for part in str(wanted).split("*"))
     pattern = re.compile(rf"{own}(?:[.\[].*)?")
@@ -48,15 +45,8 @@ def find_leaves(names: Sequence[str], wanted: str) -> tuple[int, ...]:
 def replace_named(tree: T, names: Sequence[str], values: Mapping[str, Any], *, batched: bool = False) -> T:
     """Return the tree with other numbers in its named leaves.
 
-    Args:
-        tree: any pytree.
-        names: of its leaves.
-        values: by name (``find_leaves``): one array for each of the leaves found, or a pytree with one array for each.
-        batched: whether each value has one more axis in front.
-
-    Raises:
-        KeyError: no such name.
-        ValueError: a wrong shape, or a leaf that is given twice.
+    A value is one array for each of the leaves found (``find_leaves``), or a pytree with one array for each. If
+    ``batched``, each has one more axis in front.
     """
     leaves, structure = jax.tree.flatten(tree)
     given: dict[int, str] = {}

@@ -47,8 +47,6 @@ class Demo:
     """Write the film (motion.gif; motion.mp4 too where the program ffmpeg is installed)."""
     picture: bool = False
     """Write picture.png as well: three instants side by side."""
-    renderer: Literal["auto", "mujoco", "raycast"] = "auto"
-    """mujoco needs OpenGL; raycast runs anywhere; auto takes the first that works."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -73,7 +71,6 @@ class Demo:
                 physics=self.physics,
                 animation=self.animation,
                 picture=self.picture,
-                renderer=self.renderer,
                 announce=announce,
             )
         console.print(shown)
@@ -118,13 +115,6 @@ def _check(command: Demo) -> None:
         raise CommandError(f"--duration is {command.duration:g} s; it has to last two control steps at least")
     if not command.schemes:
         raise CommandError("--schemes is empty; name at least one of: weighted, null-space, hierarchical")
-    if command.renderer == "mujoco" and command.animation:
-        from ..viewer._opengl import check_opengl
-
-        try:
-            check_opengl()
-        except RuntimeError as error:
-            raise CommandError(f"--renderer mujoco: {' '.join(str(error).split())}; use auto or raycast") from error
 
 
 def read_demo_robot(command: Demo, source: str) -> Robot:

@@ -46,7 +46,7 @@ class View:
         """Serve a page until Ctrl-C, which is how a view ends."""
         from ..viewer.live import _open, _playback, _server, load_session, serve
         from ..viewer.live._export import write_page
-        from ..viewer.live._source import RobotSource
+        from ..viewer.live._session import RobotSource
 
         with told():
             if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):

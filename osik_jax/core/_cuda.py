@@ -119,18 +119,9 @@ def call(
 ) -> list[Array]:
     """Launch a compiled kernel named ``osik_kernel`` through XLA.
 
-    Args:
-        source: CUDA text.
-        outputs: shape and dtype of each result.
-        inputs: arrays with the dtypes and memory layout that the kernel expects.
-        problems: number of problems in the batch.
-        shared: bytes of shared memory that one problem takes.
-        per_block: how many problems a block solves.
-        warps: how many warps of 32 threads a block has.
-        lanes_last: for the inputs and then the results, whether the leading axis is the fastest in memory. Default: no.
-
-    Returns:
-        The results.
+    Inputs have the dtypes and memory layout that the kernel expects, results the given shapes and dtypes. One problem
+    takes ``shared`` bytes of shared memory, a block solves ``per_block`` problems and has ``warps`` warps.
+    ``lanes_last`` says, for the inputs and then the results, whether the leading axis is the fastest in memory.
     """
     _register()
     shapes = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in outputs]
@@ -148,16 +139,10 @@ def call_lanes(
 ) -> list[Array]:
     """Call a method of ``core/kinematic_calls.hpp`` and the like on a GPU. A lane is a robot or a target of the batch.
 
-    Args:
-        method: name of its CPU handler without the prefix "osik_".
-        outputs: shape and type of each result, as for ``_library.call``.
-        inputs: floats of one precision with a leading axis of lanes, or of length 1; flat arrays of integers that all
-            lanes share, or with such an axis.
-        space: numbers of workspace of a thread.
-        members: threads of each lane: 1, 2, 4, ... 32; of a method with groups they are the last of its ``options``.
-
-    Returns:
-        The results, in the precision of the inputs.
+    ``method`` is its CPU handler without the prefix "osik_". Inputs are floats of one precision with a leading axis of
+    lanes, or of length 1, and arrays of integers, flat or with such an axis; results are floats of that precision, or
+    integers. ``space`` is the workspace of a thread in numbers. ``members``: threads of each lane, a power of two up to
+    32; a method with groups has it as the last of its options.
     """
     arrays = [jnp.asarray(a) for a in inputs]
     real = next(a.dtype for a in arrays if _is_real(a))
@@ -202,14 +187,8 @@ def _lanes_source(
 ) -> str:
     """Return CUDA text that runs a method for each lane.
 
-    Args:
-        method: as in ``call_lanes``.
-        single: whether floats are of single precision.
-        given: shape of each argument; the leading axis is 1 if all lanes share it, 2 if each has its own.
-        integers: which arguments are integers.
-        results: shape of each result; the leading axis is 1 if there is one lane.
-        labels: which results are integers.
-        space: as in ``call_lanes``.
+    The leading axis of an argument that all lanes share is 1, else 2, and so is that of the results if there is one
+    lane. ``labels``: results that are integers.
     """
 
     def table(name: str, shapes: Sequence[tuple[int, ...]]) -> str:

@@ -27,17 +27,11 @@ _lock = threading.Lock()
 
 
 class Core(NamedTuple):
-    """Compiled core of this process: its library, or the reason for its absence.
+    """Compiled core of this process: its library, or the reason for its absence."""
 
-    Attributes:
-        library: the library, None where there is none.
-        path: its file, None where there is none.
-        reason: one sentence that says which library is loaded and why, or why none is and what to do.
-    """
-
-    library: ctypes.CDLL | None
-    path: Path | None
-    reason: str
+    library: ctypes.CDLL | None  # the library, None where there is none
+    path: Path | None  # its file, None where there is none
+    reason: str  # one sentence that says which library is loaded and why, or why none is and what to do
 
 
 @cache
@@ -91,15 +85,9 @@ def call(method: str, outputs: Sequence[tuple[tuple[int, ...], Any]], *inputs: A
     """Call a method of the core on a batch of problems through XLA's FFI.
 
     There is no rule for ``vmap``: call it in a function under ``in_lanes``, which hands over a whole batch at once.
-
-    Args:
-        method: name of its handler without "osik_".
-        outputs: shape and type of each result: float (double precision in the core) or int (int32).
-        inputs: arrays; floats are passed in double precision, integers and flags as int32.
-        space: numbers of workspace, for methods of ``core/kinematic_calls.hpp``.
-
-    Returns:
-        The results; floats in the precision of the first float among the inputs.
+    ``method`` is its handler without "osik_". Results are float (double precision in the core) or int (int32); inputs
+    are passed in double precision, integers and flags as int32. Floats come back in the precision of the first float
+    among the inputs. ``space`` is in numbers, for methods of ``core/kinematic_calls.hpp``.
     """
     name = register(method)
     given = next(a.dtype for a in map(jnp.asarray, inputs) if jnp.issubdtype(a.dtype, jnp.floating))

@@ -12,9 +12,7 @@ import numpy as np
 from rich.table import Table
 
 from ..viewer import animate, hero_picture
-from ..viewer._opengl import RendererName
-from ._comparison import comparison
-from ._figures import figures, table
+from ._figures import comparison, figures, table
 from ._motion import Motion
 from ._physics import PhysicsRun, run_physics
 from ._run import TITLES, Run, run_scheme
@@ -25,11 +23,7 @@ _PICTURES = 12_000_000
 
 
 def writable_folder(path: Path, motion: Motion, *, schemes: int, dt: float) -> Path:
-    """Create the folder and check that the files can be written to it, the motion counted without compression.
-
-    Raises:
-        OSError: it cannot be made, nothing can be written to it, or too little room is left on its disk.
-    """
+    """Create the folder and check that the files can be written to it, the motion counted without compression."""
     path.mkdir(parents=True, exist_ok=True)
     try:
         with tempfile.TemporaryFile(dir=path) as file:
@@ -53,29 +47,17 @@ def run_demo(
     physics: bool = False,
     animation: bool = True,
     picture: bool = False,
-    renderer: RendererName = "auto",
     announce: Callable[[str, float], None] = lambda stage, done: None,
 ) -> tuple[Table, Sequence[Run]]:
     """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
 
-    Args:
-        motion: what to do.
-        folder: to write to; made if need be.
-        schemes: ``"weighted"``, ``"null-space"``, ``"hierarchical"``.
-        dt: control period [s].
-        physics: whether the loop is closed with MuJoCo; ``motion`` is then one of NAO.
-        animation: whether to write ``motion.gif`` (and ``motion.mp4`` where the program ffmpeg is installed) of the
-            last scheme.
-        picture: whether to write ``picture.png``: three instants side by side.
-        renderer: for the film, as in ``viewer.animate``.
-        announce: called with the current stage and the finished share, 0 to 1.
-
-    Returns:
-        The table of all figures, and the runs.
+    Return the table of all figures, and the runs. With ``physics`` the loop is closed with MuJoCo; the motion is then
+    one of NAO. The film is that of the last scheme, ``motion.gif``, and ``motion.mp4`` where the program ffmpeg is
+    installed. ``picture`` adds ``picture.png``, three instants side by side. ``announce`` is called with the current
+    stage and the finished share, 0 to 1.
 
     Raises:
         KeyError: no such scheme.
-        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
     """
     folder.mkdir(parents=True, exist_ok=True)
     run, doing = run_scheme, "compiling and running"
@@ -94,7 +76,7 @@ def run_demo(
     if animation:
         names = ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]
         for name in names:
-            _film(folder / name, motion, runs[-1], dt, renderer, lambda x: announce("filming", start + 0.35 * x))
+            _film(folder / name, motion, runs[-1], dt, lambda x: announce("filming", start + 0.35 * x))
     if picture:
         announce("drawing the picture", 0.97)
         _draw_picture(folder / "picture.png", motion, runs[-1])
@@ -119,9 +101,7 @@ def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _film(
-    path: Path, motion: Motion, run: Run, dt: float, renderer: RendererName, progress: Callable[[float], None]
-) -> None:
+def _film(path: Path, motion: Motion, run: Run, dt: float, progress: Callable[[float], None]) -> None:
     """Write a film of a scheme's motion, with a curve of the largest component of up to two goals [mm]."""
     seen, values, wanted = run.seen, {}, {}
     for label in list(motion.goals)[:2]:
@@ -133,7 +113,6 @@ def _film(
         motion.robot,
         run.q,
         dt=dt,
-        renderer=renderer,
         support=seen.support or None,
         trails=[goal.frame for label, goal in motion.goals.items() if label != "waist"],
         curves=values,

@@ -17,8 +17,7 @@ from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
 from ..viewer._crouch import crouched
 from ..viewer._outline import robot_outline
 from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
-from ._start import dexterous_start
-from ._sway import SWAY, sway, sway_of
+from ._sway import SWAY, dexterous_start, sway, sway_of
 
 
 def file_motion(
@@ -33,13 +32,8 @@ def file_motion(
 
     A robot smaller than 30 cm or larger than 10 m moves by the same share of its size. A frame that its joints cannot
     move left moves in its best direction. A floating robot is placed on the floor, with its lowest point at height 0.
-
-    Args:
-        robot: the robot.
-        name: for people.
-        frame: what moves; ``None``: the floating base, or the tip of a robot that is bolted down.
-        support: frames on the ground; none: those of a floating robot that look like feet.
-        duration: [s].
+    Without a ``frame`` the floating base moves, or the tip of a robot that is bolted down. Without ``support`` the
+    frames of a floating robot that look like feet stand.
 
     Raises:
         KeyError: no such frame; the message lists those that exist.

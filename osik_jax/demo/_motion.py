@@ -1,17 +1,18 @@
-"""Motion of a demonstration: tasks over time, and the references to judge it by."""
+"""Motion of a demonstration: tasks over time, and the paths to judge it by."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..robot import Robot
 from ..tasks import FrameTask, Task
-from ._references import Path
 
 GAIN = 20.0
 """Gain of all tasks but the posture [1/s]: at 200 Hz a step removes a tenth of an error."""
@@ -23,34 +24,21 @@ Rows = Literal["pose", "position"]
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Frame that follows a path.
+    """Frame that follows a path."""
 
-    Attributes:
-        frame: name of the frame.
-        path: reference of its pose.
-        rows: tracked part of the pose: ``"pose"`` or ``"position"``.
-    """
-
-    frame: str
-    path: Path
-    rows: Rows = "pose"
+    frame: str  # name of the frame
+    path: Path  # reference of its pose
+    rows: Rows = "pose"  # tracked part of the pose: ``"pose"`` or ``"position"``
 
 
 @dataclasses.dataclass(frozen=True)
 class Stance:
-    """Frame that stands on the ground for a time.
+    """Frame that stands on the ground for a time."""
 
-    Attributes:
-        frame: name of the frame.
-        corners: its contact corners in the frame [m]; empty: not part of the support polygon. (k, 3)
-        lifted: start and end of the time in the air [s]; ``None``: never.
-        flat: whether its orientation must stay too; a point foot may rotate.
-    """
-
-    frame: str
-    corners: np.ndarray
-    lifted: tuple[float, float] | None = None
-    flat: bool = True
+    frame: str  # name of the frame
+    corners: np.ndarray  # its contact corners in the frame [m]; empty: not part of the support polygon. (k, 3)
+    lifted: tuple[float, float] | None = None  # start and end of the time in the air [s]; ``None``: never
+    flat: bool = True  # whether its orientation must stay too; a point foot may rotate
 
     def on_ground(self, t: np.ndarray) -> np.ndarray:
         """Return whether the frame stands at each time [s]. (T,)."""
@@ -101,3 +89,44 @@ def along(task: FrameTask, goal: Goal, t: Any) -> FrameTask:
     """Return the task with the target of the path at time t [s]."""
     pose, velocity = goal.path.at(t)
     return task.replace(target=pose, target_velocity=velocity)
+
+
+def minimum_jerk(t: ArrayLike | Array, start: float, duration: float) -> tuple[Array, Array]:
+    """Return value and rate [1/s] of a minimum-jerk curve from 0 at ``start`` to 1 at ``start + duration`` [s]."""
+    s = jnp.clip((jnp.asarray(t) - start) / duration, 0.0, 1.0)
+    # the quintic with zero velocity and acceleration at both ends, and its derivative
+    return s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 30.0 * s**2 * (1.0 - s) ** 2 / duration
+
+
+@dataclasses.dataclass(frozen=True)
+class Stroke:
+    """Minimum-jerk move by ``amount`` between two times."""
+
+    start: float  # when it starts [s]
+    end: float  # when it ends [s]
+    amount: tuple[float, ...]  # how far, one number for each coordinate
+
+
+def follow(strokes: Sequence[Stroke], t: ArrayLike | Array, size: int) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return the sum of the strokes at time t [s], and its velocity. (size,) each."""
+    value = rate = jnp.zeros(size)
+    for stroke in strokes:
+        s, speed = minimum_jerk(t, stroke.start, stroke.end - stroke.start)
+        amount = jnp.asarray(stroke.amount)
+        value, rate = value + s * amount, rate + speed * amount
+    return value, rate
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """Reference of a frame over time: its position moves by strokes, its rotation stays."""
+
+    position: np.ndarray  # at the start [m]. (3,)
+    rotation: np.ndarray  # frame axes to world axes. (3, 3)
+    strokes: tuple[Stroke, ...] = ()  # moves of the position [m]
+
+    def at(self, t: ArrayLike | Array) -> tuple[tuple[Float[Array, "3"], Float[Array, "3 3"]], Float[Array, "6"]]:
+        """Return pose (p, R) and velocity [linear; angular] in world axes at time t [s]."""
+        shift, velocity = follow(self.strokes, t, 3)
+        pose = jnp.asarray(self.position) + shift, jnp.asarray(self.rotation)
+        return pose, jnp.concatenate([velocity, jnp.zeros(3)])

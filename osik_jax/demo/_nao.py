@@ -13,8 +13,7 @@ from ..kinematics._home import home_kinematics
 from ..physics._world import contact_corners
 from ..robot import Robot, load_robot
 from ..tasks import ComTask, PostureTask, Task, support_polygon
-from ._motion import GAIN, MARGIN, Goal, Motion, Stance, along, tracking
-from ._references import Path, Stroke, minimum_jerk
+from ._motion import GAIN, MARGIN, Goal, Motion, Path, Stance, Stroke, along, minimum_jerk, tracking
 
 FEET = ("l_sole", "r_sole")
 WAIST, HANDS = "torso", ("l_gripper", "r_gripper")

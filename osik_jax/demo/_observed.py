@@ -17,28 +17,18 @@ from ._motion import Motion
 
 
 class Observed(NamedTuple):
-    """Frames and balance of a motion at every configuration.
+    """Frames and balance of a motion at every configuration."""
 
-    Attributes:
-        time: [s]. (T,)
-        drift: largest distance of a standing frame from its first place [m]; NaN if none stands. (T,)
-        turn: the same for the angle of frames that may not rotate [rad]. (T,)
-        com: centre of mass [m]; NaN without a polygon. (T, 3)
-        com_inside: distance of its ground projection to the nearest edge of the support polygon [m], positive inside;
-            empty without a polygon. (T,) or (0,)
-        support: vertices of the support polygon [m], counter-clockwise; empty without one. T times (m, 2)
-        moved: displacement of each goal's frame from its first position [m]. (T, 3) each
-        wanted: displacement of its path [m]. (T, 3) each
-    """
-
-    time: Float[np.ndarray, " T"]
-    drift: Float[np.ndarray, " T"]
-    turn: Float[np.ndarray, " T"]
-    com: Float[np.ndarray, "T 3"]
+    time: Float[np.ndarray, " T"]  # [s]
+    drift: Float[np.ndarray, " T"]  # largest distance of a standing frame from its first place [m]; NaN if none stands
+    turn: Float[np.ndarray, " T"]  # the same for the angle of frames that may not rotate [rad]
+    com: Float[np.ndarray, "T 3"]  # centre of mass [m]; NaN without a polygon
+    # of its ground projection to the nearest edge of the support polygon [m], positive inside; empty without a polygon
     com_inside: Float[np.ndarray, " T"]
+    # vertices of the support polygon [m], counter-clockwise; empty without one
     support: list[Float[np.ndarray, "m 2"]]
-    moved: dict[str, Float[np.ndarray, "T 3"]]
-    wanted: dict[str, Float[np.ndarray, "T 3"]]
+    moved: dict[str, Float[np.ndarray, "T 3"]]  # displacement of each goal's frame from its first position [m]
+    wanted: dict[str, Float[np.ndarray, "T 3"]]  # displacement of its path [m]
 
     def off_path(self, label: str) -> Float[np.ndarray, " T"]:
         """Return the distance of a goal's frame from its path [m]."""

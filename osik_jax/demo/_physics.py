@@ -26,35 +26,19 @@ FEEDBACK_GAIN = 5.0
 
 @dataclasses.dataclass(frozen=True)
 class PhysicsRun(Run):
-    """Motion of one scheme with dynamics, whose configurations are sensed; T is shorter if the robot fell.
+    """Motion of one scheme with dynamics, whose configurations are sensed; T is shorter if the robot fell."""
 
-    Attributes:
-        plan: the kinematic motion.
-        recording: MuJoCo's data.
-        height_error: height of the base minus that of the plan [m]. (T,)
-        tilt_error: angle between the base and the plan [rad]. (T,)
-        effort_used: largest effort of a servo relative to its limit. (T,)
-    """
-
-    plan: Run
-    recording: Recording
-    height_error: Float[np.ndarray, " T"]
-    tilt_error: Float[np.ndarray, " T"]
-    effort_used: Float[np.ndarray, " T"]
+    plan: Run  # the kinematic motion
+    recording: Recording  # MuJoCo's data
+    height_error: Float[np.ndarray, " T"]  # height of the base minus that of the plan [m]
+    tilt_error: Float[np.ndarray, " T"]  # angle between the base and the plan [rad]
+    effort_used: Float[np.ndarray, " T"]  # largest effort of a servo relative to its limit
 
 
 def run_physics(motion: Motion, scheme: str, *, dt: float) -> PhysicsRun:
     """Run the kinematic motion as a plan, then the same tasks in closed loop with MuJoCo.
 
     NAO stands on its plastic soles, which extend 10 to 20 mm beyond its force sensors.
-
-    Args:
-        motion: of NAO.
-        scheme: ``"weighted"``, ``"null-space"`` or ``"hierarchical"``.
-        dt: control period [s].
-
-    Raises:
-        KeyError: no such scheme.
     """
     plan = run_scheme(motion, scheme, dt=dt)
     # the timestep is the largest divisor of dt up to 1 ms; 1e-9 keeps an exact divisor from being rounded up

@@ -22,31 +22,18 @@ TITLES = {"weighted": "Weighted QP", "null-space": "Null space", "hierarchical":
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """Motion of one scheme.
+    """Motion of one scheme."""
 
-    Attributes:
-        scheme: name of the scheme.
-        q: configurations, starting with the start. (steps + 1, nq)
-        solution: of each step, as NumPy arrays; every leaf has a leading axis. (steps, ...)
-        compile_seconds: tracing and compiling the whole loop [s].
-        run_seconds: running it once [s].
-        seen: frames and balance along the motion.
-    """
-
-    scheme: str
-    q: Float[np.ndarray, "T nq"]
-    solution: Solution
-    compile_seconds: float
-    run_seconds: float
-    seen: Observed
+    scheme: str  # name of the scheme
+    q: Float[np.ndarray, "T nq"]  # configurations, starting with the start
+    solution: Solution  # of each step, as NumPy arrays; every leaf has a leading axis. (steps, ...)
+    compile_seconds: float  # tracing and compiling the whole loop [s]
+    run_seconds: float  # running it once [s]
+    seen: Observed  # frames and balance along the motion
 
 
 def make_scheme(name: str) -> WeightedQP | NullSpace | HierarchicalQP:
-    """Return a scheme with its default settings.
-
-    Raises:
-        KeyError: no such scheme; the message lists those that exist.
-    """
+    """Return a scheme with its default settings."""
     if name not in _SCHEMES:
         raise unknown_name("scheme", name, tuple(_SCHEMES))
     return _SCHEMES[name]()

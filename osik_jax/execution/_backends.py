@@ -54,14 +54,7 @@ def core_is_here() -> bool:
 
 
 def check_backend(backend: Any) -> Backend:
-    """Return a checked backend.
-
-    Raises:
-        ValueError: no such backend.
-        ModuleNotFoundError: its kernels are not installed; the message says how to install them.
-    """
-    if backend in ("numba", "warp"):
-        raise OsikValueError(f"backend={backend!r} is gone: the compiled core has its kernels; take 'auto' or 'core'")
+    """Return a checked backend."""
     if backend not in BACKENDS:
         raise OsikValueError(f"backend is {backend!r}; backends: {', '.join(BACKENDS)}")
     if backend == "core" and not _library.installed():
@@ -72,14 +65,7 @@ def check_backend(backend: Any) -> Backend:
 def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
     """Return whether a solver includes the candidates of a kernel in its program.
 
-    Args:
-        backend: the requested backend.
-        kernel: "core" for CPUs, "core-cuda" for GPUs.
-        fits: whether the solver has such a kernel for problems of this kind, precision and shape.
-
-    Raises:
-        ValueError: this kernel was requested and does not fit.
-        ModuleNotFoundError: it was requested and is not installed.
+    ``fits`` says whether the solver has such a kernel for problems of this kind, precision and shape.
     """
     if kernel == "core-cuda":
         return backend in ("auto", "core") and fits and cuda_is_default()
@@ -97,9 +83,6 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     """Call a kernel's function on the kernel's platform, and the search on other platforms.
 
     The functions are not differentiated. One program may be lowered for several platforms.
-
-    Raises:
-        ValueError: a symbolic batch of ``jax.export``, or a kernel in a program that is exported.
     """
     if not kernels:
         return search(*args)

@@ -22,13 +22,9 @@ The solvers have the same, so that a block of a step is one of theirs.
 def in_blocks(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> Any:
     """Return ``function(*args)``, computed on a CPU in blocks of lanes, one after another.
 
-    A symbolic number of lanes (``jax.export``) is one block.
-
-    Args:
-        function: takes and returns pytrees whose arrays have a leading axis, the lanes.
-        args: arguments of the function.
-        size: lanes in a block; the last block is padded with copies of the first lane. Blocks are smaller if a LAPACK
-            call of this size would be split among too few workers.
+    A symbolic number of lanes (``jax.export``) is one block. All arrays have a leading axis of lanes. The last block is
+    padded with copies of the first lane. Blocks are smaller if a LAPACK call of this size would be split among too few
+    workers.
     """
     count = jax.tree.leaves(args)[0].shape[0]
     if is_symbolic(count):

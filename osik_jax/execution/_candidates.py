@@ -13,14 +13,11 @@ from ._platform import cpu_is_default
 
 
 class Candidates(NamedTuple):
-    """Functions with which a solver uses one kernel. All take batches: arrays have a leading axis of problems.
+    """Functions with which a solver uses one kernel. All take batches: arrays have a leading axis of problems."""
 
-    Attributes:
-        certified: function of the problems that returns the kernel's candidates, each with a flag: certified or not.
-        search_rest: function of these and the problems that returns the answers; it searches for the other problems.
-    """
-
+    # function of the problems that returns the kernel's candidates, each with a flag: certified or not
     certified: Callable[..., Any]
+    # function of these and the problems that returns the answers; it searches for the other problems
     search_rest: Callable[..., Any]
 
     def answers(self, *problems: Any) -> Any:
@@ -38,13 +35,8 @@ def certified_or_searched(
 
     If the only kernel is for CPUs and JAX's default backend is a CPU, the search is traced once for all platforms. On
     platforms without the kernel it begins with ``no_candidates``. The search may omit methods that the kernel has
-    tried, so a program for such a platform is faster with ``backend="jax"``.
-
-    Args:
-        kernels: functions of each kernel, by backend; empty for the search alone.
-        search: function of the problems that returns their answers.
-        problems: pytrees whose arrays have a leading axis.
-        no_candidates: function of the problems that returns uncertified candidates; default: zeros.
+    tried, so a program for such a platform is faster with ``backend="jax"``. ``kernels`` has the functions of each
+    kernel by backend; ``no_candidates`` returns uncertified candidates, by default zeros.
     """
     if len(kernels) != 1 or not kernels.keys() <= CPU_KERNELS or not cpu_is_default():
         return on_platforms({name: kernel.answers for name, kernel in kernels.items()}, search, *problems)

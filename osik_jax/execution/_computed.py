@@ -26,11 +26,8 @@ from ._rules import custom_jvp
 def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: bool = True) -> Callable[..., Any]:
     """Return the plain function, computed by a kernel for batches where the core is; keyword arguments are static.
 
-    Args:
-        plain: function of one problem, with pytrees of arrays as positional arguments.
-        kernel: the same function of batches: arrays have a leading axis, of length 1 if all lanes share the array. Its
-            first argument calls a method of the core: ``_library.call``, or on a GPU ``_cuda.call_lanes``.
-        on_gpu: whether there is a kernel for GPUs.
+    ``kernel`` takes batches: arrays have a leading axis, of length 1 if all lanes share the array. Its first argument
+    calls a method of the core: ``_library.call``, or on a GPU ``_cuda.call_lanes``.
     """
 
     @cache
@@ -66,8 +63,7 @@ def by_kernel(plain: Callable[..., Any], kernel: Callable[..., Any], *, on_gpu: 
 def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of one problem as ``in_lanes`` does, without blocks and without copies of shared arrays.
 
-    Args:
-        solve: function of pytrees whose arrays have a leading axis of lanes, or of length 1 if shared.
+    Arrays that ``solve`` takes have a leading axis of lanes, or of length 1 if shared.
     """
 
     @custom_vmap

@@ -26,14 +26,10 @@ FEW_ON_CPU, FEW = 4, 256
 
 
 def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of one problem from a batched function.
+    """Return a function of one problem from a batched function, whose arrays have a leading axis, the lanes.
 
-    Args:
-        solve: takes and returns pytrees whose arrays have a leading axis, the lanes.
-
-    Returns:
-        The function of pytrees without that axis. ``vmap`` of it, however deeply nested, calls ``solve`` on all lanes
-        (on a CPU: on blocks of them). It is not differentiable: stop gradients at its inputs.
+    ``vmap`` of it, however deeply nested, calls ``solve`` on all lanes (on a CPU: on blocks of them). It is not
+    differentiable: stop gradients at its inputs.
     """
 
     @custom_vmap
@@ -74,9 +70,7 @@ def refuse_explicit_axes(args: Any) -> None:
 def lanes_of(args: Any, axes: Any = None) -> int:
     """Return the number of lanes of some arrays; the axis of an array that all lanes share has length 1.
 
-    Args:
-        args: a pytree of arrays.
-        axes: the axis of lanes of each array; default: the first. Flags count as 0 and 1.
+    ``axes`` has the axis of lanes of each array, by default the first. Flags count as 0 and 1.
     """
     refuse_explicit_axes(args)
     leaves = jax.tree.leaves(args)
@@ -96,11 +90,8 @@ def no_lanes(solve: Callable[..., Any], args: tuple[Any, ...]) -> Any:
 def with_the_rest(state: Any, done: Bool[Array, " B"], again: Callable[[Array, Any], Any], block: int) -> Any:
     """Return the state of all lanes after ``again`` was applied to those that are not done, block by block.
 
-    Args:
-        state: a pytree whose arrays have a leading axis, the lanes.
-        done: lanes that stay as they are.
-        again: function of the indices of a block's lanes and the state of all lanes; returns the block's new state.
-        block: number of lanes in a block; a block that is not full is padded with the last lane.
+    ``again`` takes the indices of the lanes of a block and the state of all lanes; it returns the new state of the
+    block. A block that is not full is padded with the last lane.
     """
     lanes = len(done)
     if lanes == 1:  # XLA would see that every round of the loop has the same numbers, and go through it beforehand
@@ -131,14 +122,8 @@ def with_a_few(
 ) -> Any:
     """Return the state as ``with_the_rest`` does, for a function of a block's data and state.
 
-    A batch of at most ``block`` lanes is one block.
-
-    Args:
-        data: a pytree whose arrays have a leading axis, the lanes; it does not change.
-        state: likewise.
-        done: lanes that stay as they are.
-        again: function of a block's data and state; returns its new state.
-        block: number of lanes in a block; default: a few, for batches in which most lanes are done.
+    A batch of at most ``block`` lanes is one block. The data do not change. The default ``block`` is a few lanes, for
+    batches in which most lanes are done.
     """
     lanes = done.shape[0]
     if is_symbolic(lanes):

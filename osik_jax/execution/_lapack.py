@@ -33,13 +33,7 @@ def lapack_calls(function: Callable[..., Any], *args: Any) -> list[Call]:
 
 
 def lanes_in_one(function: Callable[..., Any], args: tuple[Any, ...], size: int) -> int:
-    """Return the largest number of lanes, from 1 to ``size``, for which no LAPACK call is split.
-
-    Args:
-        function: takes pytrees whose arrays have a leading axis, the lanes.
-        args: its arguments, or their shapes.
-        size: number of lanes, at least 1.
-    """
+    """Return the largest number of lanes, from 1 to ``size``, for which no LAPACK call is split."""
     block = jax.tree.map(lambda a: jax.ShapeDtypeStruct((size, *a.shape[1:]), a.dtype), args)
     # a call has so many matrices a lane, or those of a few lanes
     split = [call.operations * max(1, call.batch // size) for call in lapack_calls(function, *block) if call.is_split()]

@@ -20,9 +20,7 @@ _warned: list[int] = []
 def watch_memory_maps(name: str, compiled: Any) -> None:
     """Warn once if the process approaches Linux's maximum of memory maps, at which it would be ended.
 
-    Args:
-        name: name of the function.
-        compiled: the jitted function. Maps are counted only if it has more programs than at the last call.
+    Maps are counted only if the jitted function has more programs than at the last call.
     """
     programs = compiled._cache_size()
     if programs == _seen.get(name, 0):

@@ -157,11 +157,7 @@ _forward_kinematics = jax.jit(kinematics_at)
 
 
 def kinematics_by(backend: Backend, robot: Robot, q: Float[Array, " nq"]) -> Kinematics:
-    """Return ``forward_kinematics`` by the compiled core if possible; Jacobians of the result use the same backend.
-
-    Raises:
-        ModuleNotFoundError: the backend's package is not installed.
-    """
+    """Return ``forward_kinematics`` by the compiled core if possible; Jacobians of the result use the same backend."""
     if not takes(backend, "core", fits=True) or (cuda_is_default() and not _cuda.installed()):
         return forward_kinematics(robot, q)
     check_configuration(robot, q, "q")
@@ -200,11 +196,7 @@ def _frame_jacobians(robot: Robot, kinematics: Kinematics, frames: tuple[int, ..
 
 
 def moving_frames(robot: Robot, kinematics: Kinematics, names: Sequence[str]) -> Moving:
-    """Return positions (k, 3), rotations (k, 3, 3) and Jacobians (k, 6, nv) of several frames.
-
-    Raises:
-        KeyError: no such frame.
-    """
+    """Return positions (k, 3), rotations (k, 3, 3) and Jacobians (k, 6, nv) of several frames."""
     if kinematics.backend == "jax":
         return *kinematics.frame_poses(robot, names), frame_jacobian(robot, kinematics, names)
     for name in names:
@@ -249,11 +241,7 @@ def com_jacobian(robot: Robot, kinematics: Kinematics, subtree: str | None = Non
 def moving_center(
     robot: Robot, kinematics: Kinematics, subtree: str | None = None
 ) -> tuple[Float[Array, "3"], Float[Array, "3 nv"]]:
-    """Return ``center_of_mass`` and ``com_jacobian``.
-
-    Raises:
-        KeyError, ValueError: as in ``center_of_mass``.
-    """
+    """Return ``center_of_mass`` and ``com_jacobian``."""
     alone = _with_masses(robot, subtree)
     if kinematics.backend == "jax":
         return _center_and_jacobian(alone, kinematics)
@@ -314,11 +302,7 @@ def _moments(mass: Numbers, center: Numbers, position: Numbers, rotation: Number
 
 
 def body_masses(robot: Robot, subtree: str | None = None) -> Float[Array, " nbody"]:
-    """Return the mass of each body [kg], 0 outside the subtree, or outside the robot.
-
-    Raises:
-        KeyError, ValueError: as in ``center_of_mass``.
-    """
+    """Return the mass of each body [kg], 0 outside the subtree, or outside the robot."""
     mass, tree = robot.body_mass, robot.tree
     if subtree is None:
         own = tree.is_own

@@ -20,11 +20,7 @@ def home_kinematics(robot: Robot) -> Kinematics:
 
 
 def kinematics_on_host(robot: Robot, q: Float[Numbers, " nq"]) -> Kinematics:
-    """Return ``forward_kinematics`` as arrays of NumPy, or of JAX if the robot or q is traced.
-
-    Raises:
-        TypeError, ValueError: as ``forward_kinematics``.
-    """
+    """Return ``forward_kinematics`` as arrays of NumPy, or of JAX if the robot or q is traced."""
     if is_traced((robot, q)):
         return forward_kinematics(robot, q)
     check_robot(robot, "forward_kinematics(robot, q)")

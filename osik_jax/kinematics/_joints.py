@@ -24,18 +24,12 @@ from ._rigid import rotation_matrix
 
 
 class JointTransforms(NamedTuple):
-    """Poses and joints of all bodies, each in the frame of the body's parent.
+    """Poses and joints of all bodies, each in the frame of the body's parent."""
 
-    Attributes:
-        position: origin of each body [m]; row 0 is the world, 0. (nbody, 3)
-        rotation: from each body's axes to its parent's; row 0 is the identity. (nbody, 3, 3)
-        anchor: a point on each joint's axis [m]. (njoint, 3)
-        axis: of each joint, as long as its quaternion and axis in the model are; none for free joints. (njoint, 3)
-    """
-
-    position: Float[Numbers, "nbody 3"]
-    rotation: Float[Numbers, "nbody 3 3"]
-    anchor: Float[Numbers, "njoint 3"]
+    position: Float[Numbers, "nbody 3"]  # origin of each body [m]; row 0 is the world, 0
+    rotation: Float[Numbers, "nbody 3 3"]  # from each body's axes to its parent's; row 0 is the identity
+    anchor: Float[Numbers, "njoint 3"]  # a point on each joint's axis [m]
+    # of each joint, as long as its quaternion and axis in the model are; none for free joints
     axis: Float[Numbers, "njoint 3"]
 
 

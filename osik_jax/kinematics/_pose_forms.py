@@ -42,18 +42,9 @@ def as_pose(
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 
     Quaternions and matrices that are rounded, up to 2 %, become the nearest rotation. Traced values that are farther
-    from a rotation become NaN, which a solve answers with its status.
-
-    Args:
-        value: the pose.
-        dtype: of the result.
-        rest: position and rotation where the value has only the other part; None: the value has to have that part.
-        numbers: module of the result's arrays, ``jax.numpy`` or ``numpy``; of traced values always ``jax.numpy``.
-        what: name of the owner of the pose, for messages.
-
-    Raises:
-        TypeError: no numbers.
-        ValueError: numbers that are no pose, or a rotation or quaternion that is not one.
+    from a rotation become NaN, which a solve answers with its status. ``rest`` has position and rotation for a value
+    with only the other part; None: the value has to have that part. ``numbers`` is the module of the result's arrays,
+    for traced values always ``jax.numpy``; ``what`` names the owner of the pose in messages.
     """
     own = jnp if is_traced(value) else np
     parts = pose_parts(value, dtype, numbers=own)
@@ -81,11 +72,7 @@ def _made(numbers: Any, position: Any, rotation: Any) -> Pose:
 
 
 def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> tuple[Numbers, Numbers] | None:
-    """Return position and rotation of a pair or of an SE3, None of anything else.
-
-    Raises:
-        TypeError: as ``pose_array``.
-    """
+    """Return position and rotation of a pair or of an SE3, None of anything else."""
     if isinstance(value, jaxlie.SE3):  # its quaternion, so that no other normalisation comes in between
         both = numbers.asarray(value.wxyz_xyz, dtype)
         return both[..., 4:], both[..., :4]
@@ -95,11 +82,7 @@ def pose_parts(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any =
 
 
 def pose_array(value: Any, dtype: Any, accepted: str = _ACCEPTED, numbers: Any = jnp) -> Numbers:
-    """Return the numbers of an array, or of an object that has a matrix.
-
-    Raises:
-        TypeError: the value is not numeric; the message lists the accepted forms, by default those of a pose.
-    """
+    """Return the numbers of an array, or of an object that has a matrix."""
     if callable(getattr(value, "as_matrix", None)):
         value = value.as_matrix()
     elif hasattr(value, "homogeneous"):

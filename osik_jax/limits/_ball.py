@@ -29,19 +29,12 @@ _RETURN = 0.5
 
 
 class BallRates(NamedTuple):
-    """Bounds on the angular velocity of each independent ball joint, which follow from those on its next step.
+    """Bounds on the angular velocity of each independent ball joint, which follow from those on its next step."""
 
-    Attributes:
-        dofs: entries of v of each joint. (k, 3)
-        axis: about which each joint is turned, in its body; 0 where ``outward`` does not bind. (k, 3)
-        outward: greatest rate along the axis [rad/s], inf for none. (k,)
-        fastest: greatest absolute value of each entry [rad/s], inf for none. (k,)
-    """
-
-    dofs: list[list[int]]
-    axis: Float[Array, "k 3"]
-    outward: Float[Array, " k"]
-    fastest: Float[Array, " k"]
+    dofs: list[list[int]]  # entries of v of each joint. (k, 3)
+    axis: Float[Array, "k 3"]  # about which each joint is turned, in its body; 0 where ``outward`` does not bind
+    outward: Float[Array, " k"]  # greatest rate along the axis [rad/s], inf for none
+    fastest: Float[Array, " k"]  # greatest absolute value of each entry [rad/s], inf for none
 
 
 def ball_rates(
@@ -58,17 +51,11 @@ def ball_rates(
     """Return the bounds on a step of dt of the ball joints; None without ball joints.
 
     Farther from the end of the range than ``shortest``, a rotation shorter than the distance to the end cannot leave
-    the range. Nearer to it, ``shortest`` bounds the rotation, and a row bounds its part about the axis.
-
-    Args:
-        robot: the robot.
-        q: configuration. (nq,)
-        upper: greatest angles [rad], in the three entries of each ball joint. (nv,)
-        gain: share of the way to the end that a step may take. (nv,)
-        return_speed: from outside the range, half of which is used: each entry of the box allows that. (nv,) [rad/s]
-        dt: time of the step [s].
-        margin: share of the range that is kept clear of its end.
-        shortest: share of the range that a step may always turn by; inf: any length.
+    the range. Nearer to it, ``shortest`` bounds the rotation, and a row bounds its part about the axis. ``upper`` has
+    the greatest angles [rad] in the three entries of each ball joint, ``gain`` the share of the way to the end that a
+    step may take. Half of ``return_speed`` [rad/s] is used outside the range: each entry of the box allows that.
+    ``margin`` is the share of the range that is kept clear of its end, ``shortest`` the share that a step may always
+    turn by; inf for any length.
     """
     joints = independent_balls(robot.tree)
     if not joints:

@@ -16,12 +16,7 @@ from ._host import repeated, to_jax
 
 
 def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
-    """Return a floating-point dtype that JAX supports now; ``float`` stands for JAX's default.
-
-    Raises:
-        TypeError: not a floating-point dtype.
-        ValueError: float64 while ``jax_enable_x64`` is off.
-    """
+    """Return a floating-point dtype that JAX supports now; ``float`` stands for JAX's default."""
     wanted = np.dtype(jnp.result_type(float) if dtype is float else dtype)
     if not jnp.issubdtype(wanted, np.floating):
         raise OsikTypeError(f"dtype is {dtype!r}; {what} floating-point: float32 or float64")
@@ -31,11 +26,7 @@ def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
 
 
 def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
-    """Return a finite number that is not negative; ``dtype=None``: an array's float dtype, else JAX's default.
-
-    Raises:
-        ValueError: the value is negative, not finite, or not a scalar.
-    """
+    """Return a finite number that is not negative; ``dtype=None``: an array's float dtype, else JAX's default."""
     if dtype is None:
         own = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
         dtype = value.dtype if own else float
@@ -45,12 +36,7 @@ def as_scalar(value: Any, what: str, dtype: Any = None) -> Float[Array, ""]:
 
 
 def as_vector(value: Any, shape: tuple[int, ...], what: str, dtype: Any) -> Array:
-    """Return an array of this shape; a scalar is repeated.
-
-    Raises:
-        TypeError: the value is not numeric.
-        ValueError: any other shape, or a concrete NaN.
-    """
+    """Return an array of this shape; a scalar is repeated."""
     out = as_array(value, what, dtype)
     if out.shape not in ((), shape):
         expected = "a scalar" if shape == () else f"{shape} or a scalar"
@@ -113,11 +99,7 @@ def check_count(what: str, value: Any, *, least: int = 1) -> None:
 
 
 def as_array(value: Any, what: str, dtype: Any) -> Array:
-    """Return the value as an array of this dtype.
-
-    Raises:
-        TypeError: the value is not numeric.
-    """
+    """Return the value as an array of this dtype."""
     try:
         return to_jax(value, dtype)
     except (TypeError, ValueError):

@@ -15,13 +15,7 @@ from .._errors import OsikValueError
 def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> dict[str, Float[np.ndarray, " n"]]:
     """Return the numbers of a CSV file by the names of its columns; lines that begin with # are left out.
 
-    Args:
-        path: the file. Its head names the columns.
-        unnamed: names of the columns, from the first one, of a file that begins with numbers.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no head, equal names, no numbers, or lines of different lengths.
+    The head names the columns; ``unnamed`` does so for a file that begins with numbers.
     """
     with open(path, newline="", encoding="utf-8") as file:
         head, *lines = [row for row in csv.reader(file) if row and not row[0].startswith("#")] or [[]]

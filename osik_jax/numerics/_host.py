@@ -34,11 +34,7 @@ def is_traced(tree: Any) -> bool:
 
 
 def to_host(value: Any, dtype: Any = None) -> np.ndarray:
-    """Return a copy of real numbers as an array of NumPy.
-
-    Raises:
-        TypeError, ValueError: no real numbers, or some that are traced.
-    """
+    """Return a copy of real numbers as an array of NumPy."""
     host = np.array(value)
     if host.dtype != bool and not any(jnp.issubdtype(host.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise TypeError(f"{host.dtype} is no type of real numbers")

@@ -23,17 +23,11 @@ from ..tasks._manipulability import volume
 
 
 class Frame(eqx.Module):
-    """Frame whose kinematic chain has hinge and slide joints only.
+    """Frame whose kinematic chain has hinge and slide joints only."""
 
-    Attributes:
-        robot: the robot.
-        name: of the frame.
-        settings: limits of the joints, and where those stay that do not carry it.
-    """
-
-    robot: Robot
-    name: str = eqx.field(static=True)
-    settings: Settings
+    robot: Robot  # the robot
+    name: str = eqx.field(static=True)  # of the frame
+    settings: Settings  # limits of the joints, and where those stay that do not carry it
 
     @eqx.filter_jit
     def sampled_positions(self, count: int) -> Float[Array, "count 3"]:
@@ -73,12 +67,7 @@ class Frame(eqx.Module):
 
 
 def read_frame(robot: Robot, name: str, limits: Sequence[Limit] | None, key: int) -> Frame:
-    """Return a robot's frame, checked.
-
-    Raises:
-        KeyError: no such frame; the message lists those that exist.
-        ValueError: no joint carries it, or one that moves freely.
-    """
+    """Return a robot's frame, checked."""
     robot.tree.frame(name)
     if not is_plain(robot.tree, (name,)):
         raise OsikValueError(

@@ -1,11 +1,13 @@
-"""Grid of positions over a frame's workspace."""
+"""Grid of positions over a frame's workspace, and the orientations tried at each."""
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikTypeError, OsikValueError
+from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import check_count
 from ._frame import Frame
 
@@ -18,20 +20,18 @@ _MARGIN = 0.05
 """
 _FLAT = 1e-6
 """Share of the longest side below which a side is a rounding."""
+_FIRST = np.sqrt(2.0)
+_SECOND = 1.533751168755204288118041413
+"""The positive root of x**4 = x + 4. It and the square root of 2 are the windings for which the points are spread most
+evenly."""
 
 
 def around(frame: Frame, positions: int) -> Grid:
     """Return a grid with equal spacing along x, y and z over the bounding box of a frame's workspace.
 
     The box is that of 4,096 configurations which fill the joints' ranges evenly, and a margin. A side along which the
-    frame never moves, as a planar arm's, is a single coordinate.
-
-    Args:
-        frame: the frame.
-        positions: their number at most; it is nearly reached.
-
-    Raises:
-        ValueError: ``positions`` is no positive number.
+    frame never moves, as a planar arm's, is a single coordinate. There are at most ``positions``; that number is nearly
+    reached.
     """
     check_count("positions", positions)
     places = np.asarray(frame.sampled_positions(_SAMPLES))
@@ -65,12 +65,7 @@ def _along(middle: float, side: float, spacing: float) -> Float[np.ndarray, " n"
 
 
 def checked_grid(grid: object) -> Grid:
-    """Return a checked grid of a user.
-
-    Raises:
-        TypeError: no three sequences of numbers.
-        ValueError: coordinates that are not finite, not increasing, or none.
-    """
+    """Return a checked grid of a user."""
     expected = "it is (x, y, z): the coordinates along each axis, increasing [m]"
     if not isinstance(grid, tuple | list) or len(grid) != 3:
         raise OsikTypeError(f"grid is {grid!r}; {expected}")
@@ -82,3 +77,16 @@ def checked_grid(grid: object) -> Grid:
         if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or not (np.diff(axis) > 0.0).all():
             raise OsikValueError(f"{name} of the grid is {axis}; {expected}")
     return axes  # pyright: ignore[reportReturnType]
+
+
+def spread_rotations(count: int) -> Float[np.ndarray, "count 3 3"]:
+    """Return evenly spread rotations, one or more; the same ones every time.
+
+    They lie on a spiral around the unit quaternions, at constant density (M. Alexa, "Super-Fibonacci spirals: fast,
+    low-discrepancy sampling of SO(3)", CVPR 2022). Sets of different sizes share no rotation.
+    """
+    along = np.arange(count) + 0.5
+    inner, outer = np.sqrt(along / count), np.sqrt(1.0 - along / count)
+    alpha, beta = 2.0 * np.pi * along / _FIRST, 2.0 * np.pi * along / _SECOND
+    parts = inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)
+    return np.asarray(rotation_matrix(jnp.asarray(np.stack(parts, -1))))

@@ -30,11 +30,7 @@ class Field(NamedTuple):
 def draw_slices(found: Field, frame: str, orientations: int, at: tuple[float, float, float] | None = None) -> Figure:
     """Return three slices of a map, one across each axis.
 
-    Args:
-        found: the map.
-        frame: name of the frame that reaches.
-        orientations: how many were tried at each position.
-        at: a point that the slices go through [m]; default: of each axis, where most is reached.
+    They go through ``at`` [m], by default where most is reached along each axis.
     """
     axes, share = found.axes, found.share
     spot = fullest(share) if at is None else nearest(axes, at)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from .._progress import Progress
 from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
@@ -20,11 +21,9 @@ from ..limits import Limits
 from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..scaling import run_in_chunks
-from ..scaling._progress import Progress
 from ._frame import Frame, read_frame
-from ._grid import Grid, around, checked_grid
+from ._grid import Grid, around, checked_grid, spread_rotations
 from ._map import ReachabilityMap
-from ._rotations import spread_rotations
 
 _POSES = 16_384
 """Poses in a chunk: some seconds of work, and enough to fill the cores."""

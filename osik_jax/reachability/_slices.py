@@ -34,11 +34,7 @@ def fullest(share: Float[np.ndarray, "nx ny nz"]) -> tuple[int, int, int]:
 
 
 def nearest(axes: Sequence[np.ndarray], at: Any) -> tuple[int, int, int]:
-    """Return for each axis the index of the coordinate that is nearest to the point ``at``.
-
-    Raises:
-        ValueError: ``at`` is no point.
-    """
+    """Return for each axis the index of the coordinate that is nearest to the point ``at``."""
     try:
         point = np.asarray(at, float)
     except (TypeError, ValueError):

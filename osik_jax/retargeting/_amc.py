@@ -34,9 +34,6 @@ def read_amc(path: Path) -> HumanMotion:
     """Return the motion in an AMC file. Each joint is placed at the start of the bone of the same name; y points up.
 
     Its skeleton is the ASF file beside it with whose name its own begins, or the only one.
-
-    Raises:
-        ValueError: no skeleton is found, or a file is broken; the message says which line and what is wrong.
     """
     bones, scale, degrees = _read_asf(_skeleton_beside(path))
     frames, names = _read_frames(path, bones), list(bones)

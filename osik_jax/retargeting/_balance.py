@@ -25,19 +25,12 @@ _POINTS = np.arange(8)
 
 
 class Overhang(NamedTuple):
-    """Position of a point relative to the edge of the support polygon.
+    """Position of a point relative to the edge of the support polygon."""
 
-    Attributes:
-        distance: signed distance from the edge, positive outside, -inf without contacts [m].
-        direction: unit vector along which the distance grows. (2,)
-        coefficients: weights of the corners whose convex combination is the nearest point of the edge. (8,)
-        width: least width of the hull [m]; a margin of a third of it can always be met.
-    """
-
-    distance: Float[Array, ""]
-    direction: Float[Array, "2"]
-    coefficients: Float[Array, "8"]
-    width: Float[Array, ""]
+    distance: Float[Array, ""]  # signed distance from the edge, positive outside, -inf without contacts [m]
+    direction: Float[Array, "2"]  # unit vector along which the distance grows
+    coefficients: Float[Array, "8"]  # weights of the corners whose convex combination is the nearest point of the edge
+    width: Float[Array, ""]  # least width of the hull [m]; a margin of a third of it can always be met
 
 
 def overhang(center: Float[Array, "2"], corners: Float[Array, "8 2"], stands: Float[Array, "8"]) -> Overhang:

@@ -25,22 +25,14 @@ class BandedSystem(NamedTuple):
 
     Block (t, t) is ``square[t] + diag(alone[t])``, block (t, t - 1) is
     ``diag(first[t]) - rows[t]^T diag(weight[t]) rows[t - 1]``, and block (t, t - 2) is ``diag(second[t])``.
-
-    Attributes:
-        square: (F, n, n)
-        alone: (F, n)
-        rows: rows of the coupling between a frame and the next. (F, m, n)
-        weight: entry 0 is not used. (F, m)
-        first: entry 0 is not used. (F, n)
-        second: entries 0 and 1 are not used. (F, n)
     """
 
     square: Float[Array, "F n n"]
     alone: Float[Array, "F n"]
-    rows: Float[Array, "F m n"]
-    weight: Float[Array, "F m"]
-    first: Float[Array, "F n"]
-    second: Float[Array, "F n"]
+    rows: Float[Array, "F m n"]  # rows of the coupling between a frame and the next
+    weight: Float[Array, "F m"]  # entry 0 is not used
+    first: Float[Array, "F n"]  # entry 0 is not used
+    second: Float[Array, "F n"]  # entries 0 and 1 are not used
 
 
 def solve_banded(system: BandedSystem, right: Float[Array, "F n"]) -> Float[Array, "F n"]:

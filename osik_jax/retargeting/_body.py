@@ -69,37 +69,22 @@ def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """Dimensions and limits of a robot with its profile, taken at its home configuration, as NumPy arrays.
+    """Dimensions and limits of a robot with its profile, taken at its home configuration, as NumPy arrays."""
 
-    Attributes:
-        profile: the robot's profile.
-        points: world positions of the keypoints [m]. (3,) each
-        lengths: lengths of the limbs that give the scale (``measured``) [m].
-        ankle: height of the ankles above the soles, or of the pelvis if the robot does not walk [m].
-        root: the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]. (3,)
-        base: origin of the root body [m]. (3,)
-        turn: rotation matrix of the root body. (3, 3)
-        facing: forward, left and up axes of the robot as columns. (3, 3)
-        start: the home configuration with limbs bent (``_with_bent_limbs``). (nq,)
-        free: index of the base's free joint in q; None: the base is fixed.
-        lower: lower joint limits [rad or m]. (nv,)
-        upper: upper joint limits [rad or m]. (nv,)
-        speed: speed limits [rad/s or m/s]. (nv,)
-    """
-
-    profile: Profile
-    points: Mapping[str, Float[np.ndarray, "3"]]
-    lengths: Mapping[Limb, float]
-    ankle: float
+    profile: Profile  # the robot's profile
+    points: Mapping[str, Float[np.ndarray, "3"]]  # world positions of the keypoints [m]
+    lengths: Mapping[Limb, float]  # lengths of the limbs that give the scale (``measured``) [m]
+    ankle: float  # height of the ankles above the soles, or of the pelvis if the robot does not walk [m]
+    # the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]
     root: Float[np.ndarray, "3"]
-    base: Float[np.ndarray, "3"]
-    turn: Float[np.ndarray, "3 3"]
-    facing: Float[np.ndarray, "3 3"]
-    start: Float[np.ndarray, " nq"]
-    free: int | None
-    lower: Float[np.ndarray, " nv"]
-    upper: Float[np.ndarray, " nv"]
-    speed: Float[np.ndarray, " nv"]
+    base: Float[np.ndarray, "3"]  # origin of the root body [m]
+    turn: Float[np.ndarray, "3 3"]  # rotation matrix of the root body
+    facing: Float[np.ndarray, "3 3"]  # forward, left and up axes of the robot as columns
+    start: Float[np.ndarray, " nq"]  # the home configuration with limbs bent (``_with_bent_limbs``)
+    free: int | None  # index of the base's free joint in q; None: the base is fixed
+    lower: Float[np.ndarray, " nv"]  # lower joint limits [rad or m]
+    upper: Float[np.ndarray, " nv"]  # upper joint limits [rad or m]
+    speed: Float[np.ndarray, " nv"]  # speed limits [rad/s or m/s]
 
     @classmethod
     def of(cls, robot: Robot, profile: Profile) -> Build:
@@ -256,19 +241,12 @@ class Build:
 
 
 class TouchGoal(NamedTuple):
-    """Goal of a joint that holds an object or another joint: its vector from what it holds.
+    """Goal of a joint that holds an object or another joint: its vector from what it holds."""
 
-    Attributes:
-        first: another joint's role, or ``ORIGIN``.
-        second: the joint's role.
-        goal: vector from the first to the second [m]. (F, 3)
-        held: whether it is held. (F,)
-    """
-
-    first: str
-    second: str
-    goal: Float[np.ndarray, "F 3"]
-    held: Bool[np.ndarray, " F"]
+    first: str  # another joint's role, or ``ORIGIN``
+    second: str  # the joint's role
+    goal: Float[np.ndarray, "F 3"]  # vector from the first to the second [m]
+    held: Bool[np.ndarray, " F"]  # whether it is held
 
 
 def _pull(held: Bool[np.ndarray, " F"], fps: float) -> Float[np.ndarray, " F"]:

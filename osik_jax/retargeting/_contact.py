@@ -91,20 +91,14 @@ def find_contact(
 ) -> Bool[np.ndarray, "F k"]:
     """Return whether each point stands on the ground. (F, k).
 
-    A point stands if it is lower than ``height`` [m] above the ground and slower than 0.3 m/s, both since the
-    frame before and until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two
-    of the windows that contain a frame, a line fitted to the point's positions must be slow, and noise must explain the
+    A point stands if it is lower than ``height`` [m] above the ground and slower than 0.3 m/s, both since the frame
+    before and until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two of the
+    windows that contain a frame, a line fitted to the point's positions must be slow, and noise must explain the
     residuals. So landing and lifting are found to the frame.
 
     Gaps of up to 0.06 s (or one window) plus a frame are closed if the point stays low and returns to its place within
-    1 cm. Contacts shorter than 0.06 s are dropped.
-
-    Args:
-        points: [m]
-        fps: frames a second.
-        ground: height of the floor [m].
-        noise: standard deviation on each coordinate [m] (``find_noise``).
-        height: [m]
+    1 cm. Contacts shorter than 0.06 s are dropped. Points, ground and noise (the standard deviation of each coordinate,
+    ``find_noise``) are in metres.
     """
     steps = min(noise_steps(noise, fps), max(len(points) - 1, 1))
     low = mean_over(points[..., 2], steps) - ground < height

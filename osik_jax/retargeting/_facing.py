@@ -24,9 +24,7 @@ def by_name(names: list[str]) -> list[str]:
 def facing_at_home(robot: Robot, across: tuple[str, str] | None) -> Float[np.ndarray, "3 3"]:
     """Return the axes of a robot at home, forward, left and up as columns, to a quarter turn about the vertical.
 
-    Args:
-        robot: the robot.
-        across: a frame of its left side, and one of its right side; None: it faces x.
+    ``across`` has a frame of its left side, and one of its right side; with None it faces x.
     """
     if across is None:
         return np.eye(3)
@@ -40,9 +38,7 @@ def facing_at_home(robot: Robot, across: tuple[str, str] | None) -> Float[np.nda
 def facing_x(robot: Robot, across: tuple[str, str] | None) -> Robot:
     """Return the robot with its home rotated by quarter turns about the vertical, so that its left points along y.
 
-    Args:
-        robot: with a free base; one that is fixed stays as it is.
-        across: as of ``facing_at_home``.
+    A robot with a fixed base stays as it is.
     """
     facing = facing_at_home(robot, across)
     if not robot.floating_base or (facing == np.eye(3)).all():

@@ -25,17 +25,11 @@ _ITERATIONS, _SMALLEST = 60, 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class Floor:
-    """Height of the floor as a linear function of place and time.
+    """Height of the floor as a linear function of place and time."""
 
-    Attributes:
-        height: height at the origin in the first frame [m].
-        slope: slope along x and y [m/m].
-        drift: change of height over time [m/s].
-    """
-
-    height: float
-    slope: tuple[float, float] = (0.0, 0.0)
-    drift: float = 0.0
+    height: float  # height at the origin in the first frame [m]
+    slope: tuple[float, float] = (0.0, 0.0)  # slope along x and y [m/m]
+    drift: float = 0.0  # change of height over time [m/s]
 
     def under(self, points: Float[np.ndarray, "F ... 3"], fps: float) -> Float[np.ndarray, "F ..."]:
         """Return the height of the floor under each point [m]."""
@@ -52,12 +46,7 @@ def find_floor(points: Float[np.ndarray, "F k 3"], fps: float, noise: float) -> 
 
     The floor is flat (``find_ground``) by default. If over a tenth of at least 1 s of resting points lie more than 4 cm
     above it, a plane with slope up to 0.1, a drift up to 0.1 m/s, or both are fitted. A fit is accepted if it halves
-    both that share and the quantile loss.
-
-    Args:
-        points: [m]
-        fps: frames a second.
-        noise: standard deviation on each coordinate [m].
+    both that share and the quantile loss. Points and noise (the standard deviation of each coordinate) are in metres.
     """
     steps = noise_steps(noise, fps)
     flat = Floor(find_ground(points, steps))

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from .._errors import OsikValueError
+from .._progress import Progress, reported
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..scaling._fingerprint import differences, fingerprint, identifier
-from ..scaling._lock import only_job
-from ..scaling._progress import Progress, reported
+from ..scaling._folder import only_job
 from ._command import write_json, write_motion
 from ._lanes import Clip, shared_length
 from ._load import Reader, clips_in

@@ -213,11 +213,7 @@ def _torso(robot: Robot, arms: list[Chain]) -> str | None:
 
 
 def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
-    """Return the two halves of the rectangle that wheels stand on, at the height of their lowest point, as feet.
-
-    Raises:
-        ValueError: there are no wheels.
-    """
+    """Return the two halves of the rectangle that wheels stand on, at the height of their lowest point, as feet."""
     tree = robot.tree
     wheels = [b for b, name in enumerate(tree.body_names) if re.search(r"wheel|caster", name, re.IGNORECASE)]
     if not wheels:

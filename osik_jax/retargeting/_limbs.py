@@ -58,11 +58,7 @@ def base_body(robot: Robot) -> int:
 
 
 def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: int = 3) -> list[Chain]:
-    """Return the limbs that end in some bodies, those with ``least`` joints.
-
-    Raises:
-        ValueError: a limb has fewer joints.
-    """
+    """Return the limbs that end in some bodies, those with ``least`` joints."""
     chains = []
     for end in ends:
         others = [other for other in ends if other != end]
@@ -77,11 +73,7 @@ def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: in
 
 
 def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, pointed: bool = False) -> Limb:
-    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it.
-
-    Raises:
-        ValueError: no joint between the ends of the leg bends it.
-    """
+    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it."""
     knee = _bend(robot, kinematics, leg, 0)
     ankle = None if knee is None else _after(leg.anchors, knee)
     if knee is not None and ankle is not None and not pointed:
@@ -101,9 +93,6 @@ def find_arm(robot: Robot, kinematics: Kinematics, arm: Chain) -> Limb:
     is that last joint. Where no joint between them bends the arm, the arm has no wrist joint: the end of its last link
     is the wrist. Where none bends it so either, the arm ends at the elbow: at its last joint, or at the end of its last
     link if that is far from there.
-
-    Raises:
-        ValueError: the arm has no length.
     """
     hand = _hand(robot, arm)
     own = Chain(arm.bodies[: hand + 1], arm.anchors[: hand + 1])
@@ -152,11 +141,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> bool:
 def _bend(robot: Robot, kinematics: Kinematics, limb: Chain, first: int) -> int | None:
     """Return the index of the knee or elbow (the bending joint farthest from both ends of a limb), or None.
 
-    Args:
-        robot: the robot.
-        kinematics: at home.
-        limb: the limb, from its first joint to its end.
-        first: index of the joint at which the limb begins.
+    ``first`` is the index of the joint at which the limb begins.
     """
     first = min(first, len(limb.anchors) - 1)
     beginning, end = limb.anchors[first], limb.anchors[-1]
@@ -220,15 +205,8 @@ def find_end(
 ) -> tuple[Place, np.ndarray]:
     """Return the end of the last link of an arm or finger as a place and in the world [m].
 
-    It is a named frame, else the link's far end.
-
-    Args:
-        robot: the robot.
-        kinematics: at home.
-        arm: the arm or finger.
-        last: index of its last joint.
-        patterns: names of frames at the end, the preferred ones first.
-        least_share: least distance of such a frame from the last joint, as a share of the upper arm.
+    It is a named frame (``patterns``, the preferred ones first), else the far end of the link. Such a frame is at least
+    ``least_share`` of the upper arm from the last joint.
     """
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
     upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
@@ -254,13 +232,8 @@ def find_end(
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:
     """Return the end of a body along the line from its joint to its middle [m].
 
-    It is that of its meshes; without them, that of its other shapes or masses, whichever is farther.
-
-    Args:
-        robot: the robot.
-        body: index of the body; bodies fixed to it are included.
-        anchor: position of its joint in the world [m]. (3,)
-        most: largest length accepted without meshes [m].
+    It is that of its meshes; without them, that of its other shapes or masses, whichever is farther. Bodies fixed to it
+    count. ``anchor`` is its joint in the world; without meshes a length of ``most`` [m] is accepted.
     """
     model = robot.mj_model
     data = home_poses(robot)

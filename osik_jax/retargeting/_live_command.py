@@ -24,16 +24,7 @@ Make = Callable[[HumanMotion], LiveRetargeter]
 
 
 def replay(make: Make, motion: HumanMotion, *, paced: bool = True) -> tuple[Retargeted, list[LiveFrame]]:
-    """Retarget a clip frame by frame, each when it is due; the person is measured from the whole clip.
-
-    Args:
-        make: makes the retargeter.
-        motion: the clip.
-        paced: whether to wait until a frame is due.
-
-    Returns:
-        the retargeted motion and its frames.
-    """
+    """Retarget a clip frame by frame, each when it is due; the person is measured from the whole clip."""
     live = make(motion)
     person = read_person(motion, live.roles)
     for _ in range(live.frames_ahead + 2):  # so that all is compiled when the first frame comes
@@ -58,14 +49,8 @@ def stream(make: Make, lines: Iterable[str], out: TextIO) -> int:
     The first input line is ``{"fps": 30, "joint_names": [...]}``, with ``"standing": [[x, y, z], ...]`` if the first
     frame does not show the person standing. Each other line is a frame: ``{"positions": [[x, y, z], ...]}`` in metres,
     z up, null for a joint that is not seen, optionally ``"contact": [...]``; ``null`` is a lost frame. The first output
-    line has ``joint_names`` and ``latency`` [s]; each other line is
-    ``{"frame": 0, "qpos": [...], "contact": [...], "status": "followed"}`` in MuJoCo's order.
-
-    Returns:
-        how many frames were written.
-
-    Raises:
-        ValueError: a line is broken; the message says which, and what is wrong.
+    line has ``joint_names`` and ``latency`` [s]; each other line is ``{"frame": 0, "qpos": [...], "contact": [...],
+    "status": "followed"}`` in MuJoCo's order. Return how many frames were written.
     """
     rows = _rows(lines)
     head = next(rows, (1, None))[1]

@@ -59,23 +59,14 @@ def load_motion(
 
 @dataclasses.dataclass(frozen=True)
 class Reader:
-    """Reader for the clips of a job: motions of a person, or of a robot if ``source`` is given.
+    """Reader for the clips of a job: motions of a person, or of a robot if ``source`` is given."""
 
-    Attributes:
-        unit: unit of BVH files, as of ``load_motion``.
-        up: up axis of all files, as of ``load_motion``.
-        trim: for BVH files, as of ``load_motion``.
-        source: the robot whose motions the files hold; None: the files hold a person's motions.
-        profile: profile of ``source``, as of ``SourceMotion.load``.
-        fps: frame rate of CSV files of ``source``, as of ``SourceMotion.load``.
-    """
-
-    unit: str | float | None = None
-    up: Up | None = None
-    trim: bool = True
-    source: Robot | None = None
-    profile: Profile | None = None
-    fps: float | None = None
+    unit: str | float | None = None  # unit of BVH files, as of ``load_motion``
+    up: Up | None = None  # up axis of all files, as of ``load_motion``
+    trim: bool = True  # for BVH files, as of ``load_motion``
+    source: Robot | None = None  # the robot whose motions the files hold; None: the files hold a person's motions
+    profile: Profile | None = None  # profile of ``source``, as of ``SourceMotion.load``
+    fps: float | None = None  # frame rate of CSV files of ``source``, as of ``SourceMotion.load``
 
     def __call__(self, path: Path) -> HumanMotion | SourceMotion:
         """Read one clip."""

@@ -29,9 +29,7 @@ which each is told; and largest number of joints that a note names.
 def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]:
     """Return notes that a user must read before using a motion; empty if there are none.
 
-    Args:
-        figures: figures of ``report``.
-        balance: requested margin of the centre of mass inside the support polygon [m]; None: none.
+    ``balance`` is the requested margin of the centre of mass inside the support polygon [m].
     """
     limited, angle = figures["joints"]["at_speed_limit_share"], figures["tracking"]["segment_angle_deg_mean"]
     out = []

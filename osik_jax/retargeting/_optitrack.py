@@ -26,13 +26,7 @@ def read_optitrack(path: Path, rows: Rows) -> HumanMotion:
     """Return the motion in a table exported by Motive.
 
     Only bones are read, not markers or rigid bodies. A missing number raises ValueError with its line and column.
-
-    Args:
-        path: path of the file, for error messages.
-        rows: line number and cells of each line that is not empty.
-
-    Raises:
-        ValueError: a heading is missing, the unit is unknown, or a cell is no number.
+    ``rows`` has line number and cells of each line that is not empty.
     """
     head = dict(zip(rows[0][1][::2], rows[0][1][1::2], strict=False))
     unit, rate = head.get("Length Units", "Meters"), head.get("Export Frame Rate", "")

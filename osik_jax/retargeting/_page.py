@@ -49,17 +49,7 @@ document.querySelectorAll('#osik .now').forEach(e=>e.style.left=100*now+'%')},50
 
 
 def write_report(result: Retargeted, figures: Mapping[str, Any], motion: Path, out: Path) -> None:
-    """Write one HTML file that shows a retargeted motion without server or network.
-
-    Args:
-        result: the motion.
-        figures: its report.
-        motion: the ``motion.npz`` that it was saved to.
-        out: the page.
-
-    Raises:
-        ImportError: viser is not installed (the extra ``viewer``).
-    """
+    """Write one HTML file that shows a retargeted motion, saved to ``motion.npz`` before, without server or network."""
     from ..viewer.live._export import write_page
     from ..viewer.live._playback import read_motion
 
@@ -71,9 +61,7 @@ def write_report(result: Retargeted, figures: Mapping[str, Any], motion: Path, o
 def write_index(summary: Mapping[str, Any], out: Path) -> None:
     """Write the summary of a folder as HTML: a clip's name is a link to its page, and its notes are below its figures.
 
-    Args:
-        summary: summary of ``retarget_folder``; clips that failed come first, then those with notes.
-        out: the HTML file, in the folder of the clips' folders.
+    Clips that failed come first, then those with notes. The file is in the folder of the clips' folders.
     """
     failed, notes, rows = summary["failed"], summary["notes"], summary["figures"]
     titles = ["frames", "frames a second", *(title for title, _ in FIGURES.values())]

@@ -36,34 +36,22 @@ _CENTERED = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class Person:
-    """Motion of a person in world axes with z up and the floor at height 0.
+    """Motion of a person in world axes with z up and the floor at height 0."""
 
-    Attributes:
-        fps: frame rate [1/s].
-        points: positions by role, heels and toes included [m]. (F, 3) each
-        pelvis: forward, left and up axes of the pelvis as columns. (F, 3, 3)
-        torso: forward, left and up axes of the chest as columns. (F, 3, 3)
-        root: midpoint of the hips, or of the shoulders if the hips are unknown [m]. (F, 3)
-        feet: forward, left and up axes of the left and right foot as columns. (F, 2, 3, 3)
-        contact: whether the points of ``Profile.standing`` stand: left heel, left toe, right heel and right toe, or the
-            four feet of a four-legged robot. (F, 4)
-        lengths: lengths of the limbs and reaches with known ends [m].
-        ankle: height of the ankles above the floor when standing [m].
-        objects: poses of objects, as of ``HumanMotion``. (F, 7) each
-        touches: as of ``HumanMotion``.
-    """
-
-    fps: float
-    points: Mapping[str, Float[np.ndarray, "F 3"]]
-    pelvis: Float[np.ndarray, "F 3 3"]
-    torso: Float[np.ndarray, "F 3 3"]
-    root: Float[np.ndarray, "F 3"]
-    feet: Float[np.ndarray, "F 2 3 3"]
+    fps: float  # frame rate [1/s]
+    points: Mapping[str, Float[np.ndarray, "F 3"]]  # positions by role, heels and toes included [m]
+    pelvis: Float[np.ndarray, "F 3 3"]  # forward, left and up axes of the pelvis as columns
+    torso: Float[np.ndarray, "F 3 3"]  # forward, left and up axes of the chest as columns
+    root: Float[np.ndarray, "F 3"]  # midpoint of the hips, or of the shoulders if the hips are unknown [m]
+    feet: Float[np.ndarray, "F 2 3 3"]  # forward, left and up axes of the left and right foot as columns
+    # whether the points of ``Profile.standing`` stand: left heel, left toe, right heel and right toe, or the four feet
+    # of a four-legged robot
     contact: Bool[np.ndarray, "F 4"]
-    lengths: Mapping[Limb, float]
-    ankle: float
+    lengths: Mapping[Limb, float]  # lengths of the limbs and reaches with known ends [m]
+    ankle: float  # height of the ankles above the floor when standing [m]
+    # poses of objects, as of ``HumanMotion``
     objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
-    touches: tuple[Touch, ...] = ()
+    touches: tuple[Touch, ...] = ()  # as of ``HumanMotion``
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
@@ -100,38 +88,23 @@ def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Measures:
-    """Constant measures of a person: leg length, ankle height, floor, noise and reference poses.
+    """Constant measures of a person: leg length, ankle height, floor, noise and reference poses."""
 
-    Attributes:
-        lengths: lengths of the limbs and reaches with known ends [m].
-        ankle: height of the ankles above the floor when standing; 0 if unknown [m].
-        floor: the floor under the clip.
-        noise: standard deviation of each coordinate of the standing points [m].
-        flat: per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
-        straight: axes of pelvis and chest when the person is upright, by the rest pose or by the clip's upright
-            frames; None for a hand. (1, 3, 3) each
-    """
-
-    lengths: Mapping[Limb, float]
-    ankle: float
-    floor: Floor
-    noise: float
+    lengths: Mapping[Limb, float]  # lengths of the limbs and reaches with known ends [m]
+    ankle: float  # height of the ankles above the floor when standing; 0 if unknown [m]
+    floor: Floor  # the floor under the clip
+    noise: float  # standard deviation of each coordinate of the standing points [m]
+    # per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
     flat: Mapping[str, Mapping[str, np.ndarray]]
+    # axes of pelvis and chest when the person is upright, by the rest pose or by the clip's upright frames; None for a
+    # hand. (1, 3, 3) each
     straight: tuple[np.ndarray, np.ndarray] | None
 
 
 def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, ...] = CONTACT_POINTS) -> Measures:
     """Measure a person and the floor from a clip.
 
-    Args:
-        motion: the clip.
-        roles: of each of a person's joints, what the clip calls it (``find_roles``).
-        standing: the points that say when feet stand; none where none do.
-
-    An ``OsikWarning`` is given if z does not seem to point up.
-
-    Raises:
-        ValueError: the legs are shorter than 0.1 m or longer than 3 m, so the clip is not in metres.
+    An ``OsikWarning`` is given if z does not seem to point up. ``standing`` are the points that say when feet stand.
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
@@ -191,11 +164,8 @@ def read_person(
 ) -> Person:
     """Return the person of a clip.
 
-    Args:
-        motion: the clip.
-        roles: joint name of the clip for each role (``find_roles``).
-        measures: measures of the person if the clip is too short to show them; None: measured from the clip.
-        standing: the points whose contact with the floor counts (``Profile.standing``); empty: none.
+    ``measures`` are those of a person whom the clip is too short to show; None: measured from the clip. ``standing``
+    are the points whose contact with the floor counts (``Profile.standing``).
     """
     known = measure(motion, roles, standing) if measures is None else measures
     # a drift counts from the first frame of the measured clip, which another clip does not share
@@ -376,10 +346,6 @@ def with_path(motion: HumanMotion, roles: Mapping[str, str]) -> HumanMotion:
 
     The lowest of heels and toes (of ankles without these) is on the floor in each frame, and does not move to the next.
     So a jump has no flight. An ``OsikWarning`` says that the path is inferred.
-
-    Args:
-        motion: the clip, z up.
-        roles: joint name of the clip for each role (``find_roles``).
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     ends = [f"{side}_{part}" for side in SIDES for part in ("heel", "toe")]

@@ -21,21 +21,15 @@ _FAR = 0.1
 
 
 class Places(NamedTuple):
-    """World positions of a profile's points in each frame.
+    """World positions of a profile's points in each frame."""
 
-    Attributes:
-        keypoints: positions by role [m]. (F, 3) each
-        turns: rotation matrices of pelvis, chest (or pelvis again for a rigid trunk), left and right foot. (F, 4, 3, 3)
-        soles: corners of the soles, or lowest points of round feet [m]. (F, 8, 3), or (F, 0, 3) without feet
-        center: centre of mass [m]. (F, 3)
-        capsules: both ends of each capsule's axis [m]. (F, k, 2, 3)
-    """
-
-    keypoints: dict[str, Float[np.ndarray, "F 3"]]
+    keypoints: dict[str, Float[np.ndarray, "F 3"]]  # positions by role [m]
+    # rotation matrices of pelvis, chest (or pelvis again for a rigid trunk), left and right foot
     turns: Float[np.ndarray, "F 4 3 3"]
+    # corners of the soles, or lowest points of round feet [m]. (F, 8, 3), or (F, 0, 3) without feet
     soles: Float[np.ndarray, "F corners 3"]
-    center: Float[np.ndarray, "F 3"]
-    capsules: Float[np.ndarray, "F k 2 3"]
+    center: Float[np.ndarray, "F 3"]  # centre of mass [m]
+    capsules: Float[np.ndarray, "F k 2 3"]  # both ends of each capsule's axis [m]
 
     @property
     def standing(self) -> Float[np.ndarray, "F parts 3"]:
@@ -44,13 +38,7 @@ class Places(NamedTuple):
 
 
 def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"]) -> Places:
-    """Return the world positions of a profile's points for some configurations.
-
-    Args:
-        robot: the robot.
-        profile: its profile.
-        qpos: configurations of its MuJoCo model. (F, nq)
-    """
+    """Return the world positions of a profile's points for some configurations of its MuJoCo model."""
     data = mujoco.MjData(robot.mj_model)
     wanted = [*profile.keypoints.values(), *profile.corners]
     wanted += [(c.frame, point) for c in profile.capsules for point in (c.start, c.end)]

@@ -69,17 +69,11 @@ _STRIDE, _COARSE_ITERATIONS = 4, 8
 
 
 class Plan(NamedTuple):
-    """Plan of a clip.
+    """Plan of a clip."""
 
-    Attributes:
-        q: configurations. (F, nq)
-        cost: final cost of the goals, and of the violated bounds. (2,)
-        iterations: number of systems solved.
-    """
-
-    q: Float[Array, "F nq"]
-    cost: Float[Array, "2"]
-    iterations: Int[Array, ""]
+    q: Float[Array, "F nq"]  # configurations
+    cost: Float[Array, "2"]  # final cost of the goals, and of the violated bounds
+    iterations: Int[Array, ""]  # number of systems solved
 
 
 class _Linearised(NamedTuple):
@@ -161,16 +155,8 @@ def mend_plan(
 ) -> Plan:
     """Improve a nearly optimal plan until steps gain little, with bounds at full stiffness.
 
-    Args:
-        body: the robot.
-        goals: goals of the frames.
-        weights: weights of the cost terms.
-        bounds: joint bounds.
-        q: the plan. (F, nq)
-        free: 1 for frames that may move, 0 for past frames. (F,)
-        iterations: largest number of iterations.
-        damping: initial damping, at least ``_STIFF_DAMPING``.
-        until: "spent" runs all iterations regardless of gain (static).
+    Frames where ``free`` is 0 are past and do not move. ``damping`` is at least ``_STIFF_DAMPING``; ``until="spent"``
+    runs all iterations regardless of gain.
     """
     return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until=until)
 
@@ -231,12 +217,8 @@ def _descended(
 ) -> Plan:
     """Run the iterations of a plan: in the compiled core on CPUs if installed, else in plain JAX.
 
-    Args:
-        clip: inputs of the plan.
-        q: initial configurations. (F, nq)
-        most: largest number of iterations.
-        damping: initial damping; None: that of ``_START[until]``.
-        until: what ends the iterations early: bounds ready to get stiffer, or steps of little gain (static).
+    ``until`` says what ends them early: bounds ready to get stiffer, or steps of little gain. Without a damping it is
+    that of ``_START[until]``.
     """
     descended = _by_kernel if takes("auto", "core", fits=True) else _descended_plain
     damping = _START[until][1] if damping is None else damping

@@ -34,18 +34,8 @@ def descended(
 ) -> tuple[Array, Array, Array]:
     """Return configurations, costs and iteration counts of a batch of clips.
 
-    Args:
-        call: calls a method of the core.
-        body: the robot.
-        goals: goals of the frames.
-        weights: weights of the cost terms.
-        bounds: joint bounds.
-        free: 1 for frames that may move, 0 for past frames.
-        q: initial configurations.
-        rules: constants of the method, in the order of ``_plan.py``.
-        damping: initial damping.
-        most: largest number of iterations.
-        endings: whether it ends when bounds are ready to get stiffer, and when steps gain little (0 or 1 each).
+    ``rules`` are the constants of the method in the order of ``_plan.py``. ``endings`` says whether it ends when bounds
+    are ready to get stiffer, and when steps gain little (0 or 1 each).
     """
     frames, nq = q.shape[1:]
     integers = _structure(body)

@@ -23,19 +23,12 @@ Limb = tuple[str, str]
 
 @dataclasses.dataclass(frozen=True)
 class Foot:
-    """A foot's sole.
+    """A foot's sole."""
 
-    Attributes:
-        frame: a frame of the robot with x forward and z up when the foot stands.
-        heel: the rear left and the rear right corner in that frame [m].
-        toe: the front left and the front right corner in that frame [m].
-        radius: radius of a round foot, whose corners are its centre [m].
-    """
-
-    frame: str
-    heel: tuple[Point, Point]
-    toe: tuple[Point, Point]
-    radius: float = 0.0
+    frame: str  # a frame of the robot with x forward and z up when the foot stands
+    heel: tuple[Point, Point]  # the rear left and the rear right corner in that frame [m]
+    toe: tuple[Point, Point]  # the front left and the front right corner in that frame [m]
+    radius: float = 0.0  # radius of a round foot, whose corners are its centre [m]
 
 
 @dataclasses.dataclass(frozen=True)

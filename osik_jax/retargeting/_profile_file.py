@@ -44,11 +44,7 @@ def save_profile(profile: Profile, path: str | os.PathLike[str]) -> None:
 
 
 def find_profile(robot: Robot) -> Profile:
-    """Return the bundled profile whose frames a robot all has, else a guess.
-
-    Raises:
-        ValueError: as in ``guess_profile``.
-    """
+    """Return the bundled profile whose frames a robot all has, else a guess."""
     for name in BUNDLED:
         profile = load_profile(name)
         if set(profile.frames) <= set(robot.frame_names):

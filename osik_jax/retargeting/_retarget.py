@@ -13,11 +13,11 @@ import jax
 import numpy as np
 
 from .._errors import OsikValueError, warn
+from .._progress import reported
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..numerics._arguments import check_count
 from ..robot import Robot
-from ..scaling._progress import reported
 from ._body import measured
 from ._guess import describe_profile
 from ._lanes import (
@@ -200,10 +200,8 @@ class Retargeter(OnRobot):
     def _solved(self, clips: Sequence[Clip], length: int, lanes: int) -> list[Callable[[], Retargeted]]:
         """Retarget clips of at most ``length`` frames (``shared_length`` or more) that hold the same.
 
-        ``lanes``: the batch size of the compiled program, at least the number of clips.
-
-        Returns:
-            for each clip a function that makes its record; it raises ValueError where the motion is not finite.
+        ``lanes``: the batch size of the compiled program, at least the number of clips. Each returned function makes a
+        clip's record; it raises ValueError where the motion is not finite.
         """
         batch = [as_lane(clip, length) for clip in clips]
         if not cpu_is_default():

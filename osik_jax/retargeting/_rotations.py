@@ -17,10 +17,7 @@ def forward(
 ) -> tuple[Float[np.ndarray, "F J 3"], Float[np.ndarray, "F J 4"]]:
     """Return the positions and rotations of a tree's joints in the world from those relative to their parents.
 
-    Args:
-        parents: index of each joint's parent, which comes before it; -1 for the root.
-        offsets: positions in the parent's frame, in any unit. (J, 3) or (F, J, 3)
-        local: rotations relative to the parent.
+    Each joint's parent comes before it, -1 for the root. Offsets are positions in the parent's frame, in any unit.
     """
     positions = np.array(np.broadcast_to(offsets, (*local.shape[:2], 3)))
     turns = [Rotation.from_quat(local[:, joint], scalar_first=True) for joint in range(len(parents))]

@@ -62,20 +62,8 @@ def find_roles(
     Names are compared without case and separators, with the word for the side (``left``, ``l``) before or after. A
     prefix common to all used names (``mixamorig:``, ``Character1_``, ``Bip01``) is ignored, and so is a word for joint
     at the end. A name without such a word goes first (CMU has ``LHipJoint`` in the pelvis, and ``LeftHip``), and a
-    joint at one point with another limb joint goes last.
-
-    Args:
-        joint_names: joint names of the clip.
-        mapping: role (``ROLES``) to joint name of the clip; None: inferred from the names.
-        needed: roles that have to be found.
-        positions: positions of the joints; None: names alone count.
-
-    Returns:
-        role to joint name of the clip.
-
-    Raises:
-        KeyError: the mapping has a role or a joint that does not exist.
-        ValueError: joints that retargeting needs are not found, or two are at one point; the message says which.
+    joint at one point with another limb joint goes last. ``mapping`` gives joints for roles, ``needed`` are those that
+    have to be found. Without positions names alone count.
     """
     places = {} if positions is None else _places(joint_names, positions)
     roles = _by_name(joint_names, needed, places) if mapping is None else _checked(joint_names, mapping, needed)

@@ -61,15 +61,9 @@ def read_smpl(path: Path, arrays: Mapping[str, np.ndarray]) -> HumanMotion:
     """Return the motion in a file of SMPL, SMPL-H or SMPL-X poses.
 
     Bone lengths come from the file (``rest_joints`` or ``J``: joints in the rest pose [m], 22 body joints first).
-    Without them they are those of a person of 1.7 m, because ``betas`` needs the model's own data.
-
-    Args:
-        path: path of the file, for error messages.
-        arrays: ``poses`` (F, 3 k), rotation vectors of k joints, 22 at least, or ``root_orient`` (F, 3) and
-            ``pose_body`` (F, 63); ``trans`` (F, 3) in metres; ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``.
-
-    Raises:
-        ValueError: the rate is missing, or arrays do not agree.
+    Without them they are those of a person of 1.7 m, because ``betas`` needs the model's own data. Rotation vectors are
+    ``poses`` (F, 3 k) of k joints, 22 at least, or ``root_orient`` (F, 3) and ``pose_body`` (F, 63); ``trans`` (F, 3)
+    is in metres; the rate is ``mocap_framerate``, ``mocap_frame_rate`` or ``fps``.
     """
     count = len(_TREE)
     poses = arrays["poses"] if "poses" in arrays else np.concatenate([arrays["root_orient"], arrays["pose_body"]], -1)

@@ -20,30 +20,19 @@ _DAMPING = 1e-9
 
 
 class Stance(NamedTuple):
-    """Contact points and their landing places.
+    """Contact points and their landing places."""
 
-    Attributes:
-        landed: x and y of the landing place of left heel, left toe, right heel and right toe [m]. (4, 2)
-        stands: whether each is in contact since then. (4,)
-    """
-
-    landed: Float[Array, "4 2"]
-    stands: Bool[Array, "4"]
+    landed: Float[Array, "4 2"]  # x and y of the landing place of left heel, left toe, right heel and right toe [m]
+    stands: Bool[Array, "4"]  # whether each is in contact since then
 
 
 class Held(NamedTuple):
-    """Step of a robot that holds its contacts.
+    """Step of a robot that holds its contacts."""
 
-    Attributes:
-        q: the configuration after the step. (nq,)
-        step: the step [rad or m]. (nv,)
-        stance: contacts after the step.
-        off: largest distance of a contact point from its landing place or the floor, or of a sole below the floor [m].
-    """
-
-    q: Float[Array, " nq"]
-    step: Float[Array, " nv"]
-    stance: Stance
+    q: Float[Array, " nq"]  # the configuration after the step
+    step: Float[Array, " nv"]  # the step [rad or m]
+    stance: Stance  # contacts after the step
+    # largest distance of a contact point from its landing place or the floor, or of a sole below the floor [m]
     off: Float[Array, ""]
 
 
@@ -70,16 +59,8 @@ def hold_feet(
 
     Newton's method on the heights of the soles' corners and on the places of contact points. Each iteration takes the
     minimum-norm change of the step; dofs that reach a bound stay there. If the bounds do not allow a solution, the step
-    is the best of all iterations, the planned one included, and ``off`` is the remaining error.
-
-    Args:
-        body: the robot.
-        q: configuration before the step.
-        step: the step as planned, inside its bounds [rad or m].
-        lower: lower bounds of the step [rad or m]. (nv,)
-        upper: upper bounds of the step [rad or m]. (nv,)
-        contact: whether left heel, left toe, right heel and right toe stand after the step. (4,)
-        stance: contacts before the step.
+    is the best of all iterations, the planned one included, and ``off`` is the remaining error. Steps and bounds are in
+    rad or m; ``contact`` is that of left heel, left toe, right heel and right toe after the step.
     """
     if not body.corners:
         return Held(integrate(body.robot, q, step), step, stance, jnp.zeros((), step.dtype))

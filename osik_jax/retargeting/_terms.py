@@ -38,44 +38,31 @@ CLEARANCE, SWINGING = 3e-3, 2e-3
 
 
 class Body(eqx.Module):
-    """Robot with its profile as arrays for the cost terms.
+    """Robot with its profile as arrays for the cost terms."""
 
-    Attributes:
-        robot: the robot.
-        offsets: position of each place in its frame [m]. (places, 3)
-        radii: radii of the capsules [m]. (capsules,)
-        home: rotation matrices of pelvis, chest and feet at home, relative to the robot's forward, left and up axes.
-            (4, 3, 3)
-        lengths: nominal lengths of the reaches [m]. (reaches,)
-        rises: heights of the corners above the floor in contact: radii of round feet [m]. (corners,)
-        inside: margin of the centre of mass inside the support polygon [m]; None: not bounded.
-        frames: frame of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static).
-        keys: the role of each keypoint (static).
-        limbs: first and second keypoint of each limb that is followed, the reaches last (static).
-        turned: indices into ``home`` of the orientations that are followed (static).
-        roots: the two places whose midpoint follows the root's path; empty if the base is fixed (static).
-        corners: number of the feet's corners: 8, or 0 without feet or with a fixed base (static).
-        rolls: whether points in contact may move along the floor (static).
-        above: capsules kept above the floor: not the feet's, which have corners, nor capsules inside others (static).
-        pairs: pairs of capsules that are kept apart (static).
-    """
-
-    robot: Robot
-    offsets: Float[Array, "places 3"]
-    radii: Float[Array, " capsules"]
+    robot: Robot  # the robot
+    offsets: Float[Array, "places 3"]  # position of each place in its frame [m]
+    radii: Float[Array, " capsules"]  # radii of the capsules [m]
+    # rotation matrices of pelvis, chest and feet at home, relative to the robot's forward, left and up axes
     home: Float[Array, "4 3 3"]
-    lengths: Float[Array, " reaches"]
-    rises: Float[Array, " corners"]
-    inside: Float[Array, ""] | None
+    lengths: Float[Array, " reaches"]  # nominal lengths of the reaches [m]
+    rises: Float[Array, " corners"]  # heights of the corners above the floor in contact: radii of round feet [m]
+    inside: Float[Array, ""] | None  # margin of the centre of mass inside the support polygon [m]; None: not bounded
+    # frame of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static)
     frames: tuple[str, ...] = eqx.field(static=True)
-    keys: tuple[str, ...] = eqx.field(static=True)
+    keys: tuple[str, ...] = eqx.field(static=True)  # the role of each keypoint (static)
+    # first and second keypoint of each limb that is followed, the reaches last (static)
     limbs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    # indices into ``home`` of the orientations that are followed (static)
     turned: tuple[int, ...] = eqx.field(static=True)
+    # the two places whose midpoint follows the root's path; empty if the base is fixed (static)
     roots: tuple[int, ...] = eqx.field(static=True)
+    # number of the feet's corners: 8, or 0 without feet or with a fixed base (static)
     corners: int = eqx.field(static=True)
-    rolls: bool = eqx.field(static=True)
+    rolls: bool = eqx.field(static=True)  # whether points in contact may move along the floor (static)
+    # capsules kept above the floor: not the feet's, which have corners, nor capsules inside others (static)
     above: tuple[int, ...] = eqx.field(static=True)
-    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # pairs of capsules that are kept apart (static)
 
     @classmethod
     def of(
@@ -86,14 +73,10 @@ class Body(eqx.Module):
         inside: float | None = None,
         touching: Sequence[Limb] = (),
     ) -> Body:
-        """Return the arrays for a robot and a profile.
+        """Return the arrays for a robot and a profile; capsules of ``pairs`` are kept apart.
 
-        Args:
-            robot: the robot.
-            profile: its profile.
-            pairs: the capsules that are kept apart.
-            inside: margin of balance [m], None for no balance.
-            touching: reaches of length 1 m after those of the profile; they may begin at ``ORIGIN``.
+        Balance keeps the margin ``inside`` [m]. Reaches ``touching``, of length 1 m, come after those of the profile;
+        they may begin at ``ORIGIN``.
         """
         fixed: dict[str, Place] = {ORIGIN: (robot.tree.body_names[0], (0.0, 0.0, 0.0))} if touching else {}
         points = {**profile.keypoints, **fixed}
@@ -154,41 +137,24 @@ class Joints(NamedTuple):
 
 
 class FrameRows(NamedTuple):
-    """Cost terms of one frame; the cost is half the weighted sum of squared residuals.
+    """Cost terms of one frame; the cost is half the weighted sum of squared residuals."""
 
-    Attributes:
-        residual: residuals of goals and bounds. (m,)
-        jacobian: derivative of ``residual``. (m, nv)
-        soft: weights of goals, 0 in the rows of bounds. (m,)
-        stiff: weights of bounds, 0 in the rows of goals. (m,)
-        joints: terms of single joints.
-        stance: x and y of the four points of ``Profile.standing`` [m], 0 without feet. (8,)
-        stance_jacobian: derivative of ``stance``. (8, nv)
-    """
-
-    residual: Float[Array, " m"]
-    jacobian: Float[Array, "m nv"]
-    soft: Float[Array, " m"]
-    stiff: Float[Array, " m"]
-    joints: Joints
-    stance: Float[Array, "8"]
-    stance_jacobian: Float[Array, "8 nv"]
+    residual: Float[Array, " m"]  # residuals of goals and bounds
+    jacobian: Float[Array, "m nv"]  # derivative of ``residual``
+    soft: Float[Array, " m"]  # weights of goals, 0 in the rows of bounds
+    stiff: Float[Array, " m"]  # weights of bounds, 0 in the rows of goals
+    joints: Joints  # terms of single joints
+    stance: Float[Array, "8"]  # x and y of the four points of ``Profile.standing`` [m], 0 without feet
+    stance_jacobian: Float[Array, "8 nv"]  # derivative of ``stance``
 
 
 class Bounds(NamedTuple):
-    """Joint bounds of a plan. (nv,) each.
+    """Joint bounds of a plan. (nv,) each."""
 
-    Attributes:
-        lower: lower end of the range [rad or m], -inf without one.
-        upper: upper end of the range [rad or m], inf without one.
-        step: largest change per frame [rad or m].
-        change: largest change of that step between two frames [rad or m].
-    """
-
-    lower: Float[Array, " nv"]
-    upper: Float[Array, " nv"]
-    step: Float[Array, " nv"]
-    change: Float[Array, " nv"]
+    lower: Float[Array, " nv"]  # lower end of the range [rad or m], -inf without one
+    upper: Float[Array, " nv"]  # upper end of the range [rad or m], inf without one
+    step: Float[Array, " nv"]  # largest change per frame [rad or m]
+    change: Float[Array, " nv"]  # largest change of that step between two frames [rad or m]
 
 
 class _Motion(NamedTuple):

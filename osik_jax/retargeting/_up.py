@@ -36,18 +36,12 @@ _CLEARLY, _PERHAPS = 0.5, 0.1
 
 
 class Evidence(NamedTuple):
-    """Evidence for each axis of ``UPS``. (6,) each.
+    """Evidence for each axis of ``UPS``. (6,) each."""
 
-    Attributes:
-        upright: component along the axis of the vector from ankles to shoulders relative to its length, mean over
-            frames. (6,)
-        grounded: share of frames in which the lowest point is within 5 cm of the floor. (6,)
-        floor: height of the floor along the axis [m]. (6,)
-    """
-
+    # component along the axis of the vector from ankles to shoulders relative to its length, mean over frames
     upright: Float[np.ndarray, "6"]
-    grounded: Float[np.ndarray, "6"]
-    floor: Float[np.ndarray, "6"]
+    grounded: Float[np.ndarray, "6"]  # share of frames in which the lowest point is within 5 cm of the floor
+    floor: Float[np.ndarray, "6"]  # height of the floor along the axis [m]
 
     @property
     def score(self) -> Float[np.ndarray, "6"]:
@@ -60,12 +54,7 @@ def find_up(motion: HumanMotion, expected: Up, roles: Mapping[str, str] | None =
 
     The person stands along the up axis, and the lowest point is near one height in most frames. The expected axis is
     kept if the person stands along it, if the person lies on a floor at height 0 along it (and on none along the other
-    axis), or if no other axis is clearly better.
-
-    Args:
-        motion: a clip with any axis up, in metres.
-        expected: the axis that is kept in doubt.
-        roles: joint name of the clip for each role; None: inferred from the names.
+    axis), or if no other axis is clearly better. The clip is in metres.
     """
     found = find_evidence(motion, roles)
     if found is None:
@@ -142,12 +131,7 @@ def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
 def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMotion:
     """Return a motion rotated so that ``up`` becomes z.
 
-    Rotations are relative to the rest pose, which is rotated separately if it stands along another axis.
-
-    Args:
-        motion: a clip in which the axis ``up`` points up.
-        up: the axis.
-        rest_up: the axis that points up in the rest pose; None: the same.
+    Rotations are relative to the rest pose, which is rotated separately if it stands along another axis, ``rest_up``.
     """
     rest_up = up if rest_up is None else rest_up
     turn, rest_turn = np.array(_TO_Z_UP[up], float), np.array(_TO_Z_UP[rest_up], float)
@@ -178,12 +162,8 @@ def checked_up(up: str | None) -> Up | None:
 def standing_up(source: str, motion: HumanMotion, up: Up | None, expected: Up, rest_up: Up | None) -> HumanMotion:
     """Return a clip with z up, by the given axis or else by its motion; warn if that is not the expected axis.
 
-    Args:
-        source: the file, for the warning.
-        motion: the clip in the file's axes.
-        up: the given axis; None: found from the motion.
-        expected: the axis that this kind of file has up.
-        rest_up: the axis that points up in the rest pose; None: the same as in the motion.
+    ``up`` is the given axis, ``expected`` the one that this kind of file has up, ``rest_up`` that of the rest pose if
+    it differs from the motion's. The warning names ``source``.
     """
     own = find_up(motion, expected)[0] if up is None else up
     if up is None and own != expected:

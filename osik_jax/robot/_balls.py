@@ -34,10 +34,7 @@ def with_balls_inside(
 ) -> Float[Numbers, " nq"]:
     """Return the configuration with ball joints turned back along their axis to the end of their range.
 
-    Args:
-        tree: the robot's tree.
-        q: configuration. (nq,)
-        upper: the greatest angle [rad], in the three entries of each ball joint; inf where free. (nv,)
+    ``upper`` has the greatest angle [rad] in the three entries of each ball joint; inf where free.
     """
     xp = module_of(q)
     for joint in independent_balls(tree):

@@ -13,9 +13,7 @@ _FEET = (r"sole(?!.*corner)", r"foot", r"ankle", r"toe")
 def find_feet(frames: Iterable[tuple[str, int]], parents: Sequence[int]) -> tuple[str, ...]:
     """Return one frame of each of two or more outermost bodies that are called like feet; none if there are fewer.
 
-    Args:
-        frames: names, and the body that each is fixed to.
-        parents: of each body; body 0 is its own.
+    ``frames`` has names, and the body that each is fixed to; body 0 is its own parent.
     """
     outermost = set(range(1, len(parents))) - set(parents)
     candidates = [(name, body) for name, body in frames if body in outermost]

@@ -26,16 +26,7 @@ _OUTSIDE = 1e-6
 
 
 def home_configuration(robot: RobotModel, home: Home) -> Float[Array, " nq"]:
-    """Return a checked home configuration with unit quaternions.
-
-    Raises:
-        KeyError: no such keyframe or joint.
-        TypeError: none of the things that a home can be.
-        ValueError: a wrong length, not finite, or a quaternion of zeros.
-
-    Warns:
-        OsikWarning: a joint is outside its range; its value is kept, but for a keyframe's.
-    """
+    """Return a checked home configuration with unit quaternions; warn of joints outside their range."""
     if isinstance(home, str) or _is_integer(home):
         q: Any = _keyframe(robot, home)
     elif isinstance(home, Mapping):

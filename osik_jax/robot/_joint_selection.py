@@ -17,11 +17,7 @@ from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
 
 
 def select_joints(robot: Robot, pattern: str) -> list[int]:
-    """Return the independent joints named ``pattern``, else those (except free joints) that match it as a glob.
-
-    Raises:
-        KeyError: there are none; the message lists the independent joints.
-    """
+    """Return the independent joints named ``pattern``, else those (except free joints) that match it as a glob."""
     names = {robot.tree.joint_names[j]: j for j in robot.tree.independent}
     if pattern in names:
         return [names[pattern]]
@@ -78,12 +74,7 @@ def dof_names(robot: Robot) -> list[str]:
 
 
 def dof_values(robot: Robot, given: Any, default: Float[ArrayLike, " nv"], what: str) -> Float[Array, " nv"]:
-    """Return an array over v from a user's input: None, an array (nv,), or a mapping from names or globs to values.
-
-    Raises:
-        KeyError: the mapping names a joint that does not exist.
-        ValueError: an array of another shape.
-    """
+    """Return an array over v from a user's input: None, an array (nv,), or a mapping from names or globs to values."""
     dtype = robot.q0.dtype
     if given is None:
         return to_jax(default, dtype)

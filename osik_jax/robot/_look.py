@@ -13,25 +13,16 @@ from jaxtyping import Float
 
 @dataclasses.dataclass(frozen=True)
 class LinkShape:
-    """A shape of a link, in the link's frame.
+    """A shape of a link, in the link's frame."""
 
-    Attributes:
-        link: name of the link.
-        kind: MuJoCo's geom type.
-        size: MuJoCo's geom sizes [m]. (3,)
-        position: centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame. (3,)
-        rotation: rotation of a simple shape in the link's frame. (3, 3)
-        color: red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none.
-        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
-    """
-
-    link: str
-    kind: mujoco.mjtGeom
-    size: Float[np.ndarray, "3"]
+    link: str  # name of the link
+    kind: mujoco.mjtGeom  # MuJoCo's geom type
+    size: Float[np.ndarray, "3"]  # MuJoCo's geom sizes [m]
+    # centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame
     position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    color: tuple[float, ...] | None
-    mesh: tuple[np.ndarray, np.ndarray] | None = None
+    rotation: Float[np.ndarray, "3 3"]  # rotation of a simple shape in the link's frame
+    color: tuple[float, ...] | None  # red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none
+    mesh: tuple[np.ndarray, np.ndarray] | None = None  # vertices (k, 3) [m] and triangles (m, 3) of a mesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,13 +40,9 @@ class Look:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class UnreadLook:
-    """Visual shapes whose files are not read yet.
+    """Visual shapes whose files are not read yet."""
 
-    Attributes:
-        reader: function that reads them.
-    """
-
-    reader: Callable[[], Look]
+    reader: Callable[[], Look]  # function that reads them
 
     @cached_property
     def read(self) -> Look:

@@ -13,12 +13,9 @@ from ._robot import Robot
 
 
 class MadeForRobot(eqx.Module):
-    """Base of tasks and limits. A class whose constructor takes a ``robot`` first remembers that robot's joints.
+    """Base of tasks and limits. A class whose constructor takes a ``robot`` first remembers that robot's joints."""
 
-    Attributes:
-        made_for: names of the joints that own entries of v, in one string (static); None where no robot was given.
-    """
-
+    # names of the joints that own entries of v, in one string (static); None where no robot was given
     made_for: str | None = eqx.field(default=None, init=False, static=True, repr=False)
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:

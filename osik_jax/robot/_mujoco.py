@@ -38,11 +38,7 @@ def home_poses(robot: RobotModel) -> mujoco.MjData:
 
 
 def own_masses(robot: RobotModel) -> Float[np.ndarray, " bodies"]:
-    """Return the mass [kg] of each body of ``mj_model``, 0 where it is fixed to the world or not the robot's.
-
-    Raises:
-        ValueError: the scene has several trees that may be the robot.
-    """
+    """Return the mass [kg] of each body of ``mj_model``, 0 where it is fixed to the world or not the robot's."""
     model = robot.mj_model
     names = element_names(model, "body")
     roots = {int(model.body_rootid[names.index(robot.tree.body_names[top])]) for top in robot.tree.tops}

@@ -40,11 +40,7 @@ def warn_of_far_joints(robot: RobotModel, q: Any, what: str) -> None:
 def warn_of_fast_joints(names: Any, given: Any, own: Any, what: str) -> None:
     """Give one ``OsikWarning`` that names the entries whose given speed is more than ten times the file's.
 
-    Args:
-        names: of each entry.
-        given: speeds [rad/s or m/s]; infinite ones say that none is meant.
-        own: of the file, infinite where it has none.
-        what: what the message calls the speeds.
+    Infinite speeds [rad/s or m/s] say that none is meant, or that the file has none.
     """
     if isinstance(given, Tracer) or isinstance(own, Tracer):
         return

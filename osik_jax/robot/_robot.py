@@ -18,10 +18,9 @@ from . import loading
 from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
-from ._links import Factors, scaled_leaves
 from ._model import RobotModel
 from ._plausible import warn_of_far_joints
-from ._replace import replaced_leaves
+from ._replace import Factors, replaced_leaves, scaled_leaves
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
 

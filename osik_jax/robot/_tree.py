@@ -33,25 +33,15 @@ DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 
 @dataclasses.dataclass(frozen=True)
 class UnreadMesh:
-    """Collision mesh of a URDF, whose file is read when distances to it are needed.
+    """Collision mesh of a URDF, whose file is read when distances to it are needed."""
 
-    Attributes:
-        link: name of its link.
-        file: its address, as the URDF has it.
-        scale: of the file's numbers along x, y and z.
-        position: of the shape in its link [m].
-        rotation: from the shape's axes to the link's, row by row.
-        beside: path of the URDF, which relative addresses start from; None for a text.
-        folders: where packages are looked for first.
-    """
-
-    link: str
-    file: str
-    scale: tuple[float, ...]
-    position: tuple[float, ...]
-    rotation: tuple[tuple[float, ...], ...]
-    beside: str | None
-    folders: tuple[str, ...]
+    link: str  # name of its link
+    file: str  # its address, as the URDF has it
+    scale: tuple[float, ...]  # of the file's numbers along x, y and z
+    position: tuple[float, ...]  # of the shape in its link [m]
+    rotation: tuple[tuple[float, ...], ...]  # from the shape's axes to the link's, row by row
+    beside: str | None  # path of the URDF, which relative addresses start from; None for a text
+    folders: tuple[str, ...]  # where packages are looked for first
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -60,19 +50,16 @@ class ModelHolder:
 
     Two holders are equal if their models have equal content, so a function of ``jax.jit`` is compiled anew for a robot
     of another file. What a function reads from the model while it is traced is then that robot's own.
-
-    Attributes:
-        model: the MuJoCo model; None in a stack of robots whose models differ.
-        report: what the file asks for and the robot does not keep.
-        meshes: collision meshes whose files are not read; they are the last of the tree's geoms.
-        look: visual shapes of a URDF, read when they are drawn; None: those of the model.
-        path: URDF file, whose SRDF is looked for beside it; None: the robot was made from a text or an MJCF.
     """
 
-    model: mujoco.MjModel | None
+    model: mujoco.MjModel | None  # the MuJoCo model; None in a stack of robots whose models differ
+    # what the file asks for and the robot does not keep
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
+    # collision meshes whose files are not read; they are the last of the tree's geoms
     meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
+    # visual shapes of a URDF, read when they are drawn; None: those of the model
     look: UnreadLook | None = dataclasses.field(default=None, repr=False)
+    # URDF file, whose SRDF is looked for beside it; None: the robot was made from a text or an MJCF
     path: Path | None = dataclasses.field(default=None, repr=False)
 
     def __eq__(self, other: object) -> bool:

@@ -32,9 +32,8 @@ from ..schemes import Scheme
 from ..schemes._default import scheme_for
 from ..tasks import Task
 from ._parts import decode_parts, encode_parts
-from ._version_2 import converted
 
-_FORMAT, _OLDER = "osik-jax controller 3", "osik-jax controller 2"
+_FORMAT = "osik-jax controller 3"
 _CHECKSUM = ',\n "checksum": '
 _ACCURACY = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-4}
 """Largest difference of a step's numbers, relative to the largest of each array, that is roundoff of an MJCF."""
@@ -143,7 +142,7 @@ def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
     try:
         text = Path(path).read_text(encoding="utf-8")
         content = json.loads(text)
-        known = isinstance(content, dict) and content.get("format") in (_FORMAT, _OLDER)
+        known = isinstance(content, dict) and content.get("format") == _FORMAT
     except (RecursionError, ValueError):
         known = False
     if not known:
@@ -159,10 +158,6 @@ def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def _made(content: Mapping[str, Any], robot: Robot) -> _Saved:
     """Return the controller of a file's content, with its robot."""
-    if content["format"] == _OLDER:
-        content = {
-            name: converted(value) for name, value in content.items() if name in ("tasks", "scheme", "limits", "dt")
-        }
     tasks, scheme, limits = decode_parts(content, robot)
     # a scheme's constructor takes no robot, so it does not know the robot's precision
     scheme = jax.tree.map(lambda number: number.astype(robot.q0.dtype), scheme)

@@ -14,18 +14,29 @@ import numpy as np
 import osik_jax
 
 from .._errors import OsikValueError, OsikWarning
+from ..collision import CollisionShape
+from ..collision._geometry import Kind, UnitCore
 from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, no_limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ..tasks import AdaptiveGain, SupportPolygon, Task
 from ..tasks._repr import ROW_NAMES
-from ._collision import collision_arguments, collision_data
 
 Data = dict[str, Any]
 """``{"kind": name of a public class, argument: value, ...}``; an argument that is missing has its default."""
 
 _CLASSES = (Task, Limit, Scheme, AdaptiveGain, SupportPolygon)
 _NO_LIMITS = "no_limits"
+_KINDS = {
+    "capsule": Kind.SEGMENT,
+    "box": Kind.BOX,
+    "cylinder": Kind.CYLINDER,
+    "half-space": Kind.PLANE,
+    "hull": Kind.HULL,
+}
+_NAMES = {kind: name for name, kind in _KINDS.items()}
+_PLACE = ("position", "rotation", "size")
+_CORE = UnitCore._fields
 
 
 def encode_parts(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit]) -> Data:
@@ -47,13 +58,7 @@ def decode_parts(content: Mapping[str, Any], robot: Robot) -> tuple[dict[str, Ta
 def encode(part: Any, robot: Robot, where: str) -> Data:
     """Return a task, limit, scheme or gain as plain data.
 
-    Args:
-        part: an object of a public class.
-        robot: the robot that it was made for.
-        where: name of the object, for messages.
-
-    Raises:
-        ValueError: a class that is not public in osik_jax, or an object that its constructor does not make again.
+    ``where`` is its name in messages.
     """
     if isinstance(part, NoLimits):
         return {"kind": _NO_LIMITS}
@@ -88,11 +93,7 @@ def makes(data: Data, robot: Robot, part: Any) -> bool:
 
 
 def decode(data: Any, robot: Robot, where: str) -> Any:
-    """Return the object of data from ``encode``, made by its constructor for this robot.
-
-    Raises:
-        ValueError: no such data, a class that this version does not have, or arguments that it does not take.
-    """
+    """Return the object of data from ``encode``, made by its constructor for this robot."""
     kind = data.get("kind") if isinstance(data, Mapping) else None
     if kind == _NO_LIMITS:
         return no_limits
@@ -183,3 +184,55 @@ def _plain(value: Any, robot: Robot, where: str) -> Any:
 def _value(data: Any, robot: Robot, where: str) -> Any:
     """Return an argument from plain data."""
     return decode(data, robot, where) if isinstance(data, Mapping) and "kind" in data else data
+
+
+def collision_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, Any]:
+    """Return the constructor's arguments for the pairs that are kept apart, and the pairs left out as a record."""
+    if limit.scene is not None:
+        raise OsikValueError("a CollisionAvoidanceLimit has a scene, which a file cannot hold: make it after loading")
+    numbers = {name: np.asarray(getattr(limit, name)).tolist() for name in limit.replaceable}
+    pairs = {name: [list(pair) for pair in getattr(limit, name)] for name in ("pairs", "left_out")}
+    return {**pairs, "shapes": _shapes_data(limit, robot), **numbers, "max_pairs": limit.max_pairs}
+
+
+def collision_arguments(given: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
+    """Return the constructor's arguments of data, and the pairs that were left out.
+
+    The pairs are those that were kept, so the constructor leaves none out (``q0_distance=-inf``). Data of a session may
+    have globs as pairs and an ``exclude``.
+    """
+    arguments = {"q0_distance": -np.inf, **given}
+    left_out = tuple((first, second) for first, second in arguments.pop("left_out", ()))
+    for name in ("pairs", "exclude"):
+        if name in arguments:
+            arguments[name] = [tuple(pair) for pair in arguments[name]]
+    arguments["shapes"] = {name: _shape(one) for name, one in arguments.get("shapes", {}).items()}
+    return arguments, left_out
+
+
+def _shapes_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, dict[str, Any]]:
+    """Return the shapes added to the robot's own, by name."""
+    scene, out = limit.layout, {}
+    own = len(scene.geoms)
+    for number, name in enumerate(scene.names[own:]):
+        kind = scene.kinds[own + number]
+        out[name] = {
+            "shape": _NAMES[kind],
+            "frame": robot.frame_names[scene.frames[number]],
+            **{field: np.asarray(getattr(limit.shapes, field))[number].tolist() for field in _PLACE},
+        }
+        if kind is Kind.HULL:
+            hull = scene.hulls[own + number]
+            out[name]["hull"] = {field: np.asarray(getattr(limit.hulls, field))[hull].tolist() for field in _CORE}
+    return out
+
+
+def _shape(data: Mapping[str, Any]) -> CollisionShape:
+    """Return the shape of data, equal to the last bit."""
+    kind = _KINDS.get(data["shape"])
+    if kind is None:
+        raise OsikValueError(f"{data['shape']!r} is no shape: there are {', '.join(_KINDS)}")
+    place = {field: jnp.asarray(data[field], float) for field in _PLACE}
+    hull = data.get("hull")
+    core = hull and UnitCore(*(np.reshape(hull[field], () if field == "radius" else (-1, 3)) for field in _CORE))
+    return CollisionShape(kind, data["frame"], **place, hull=core)

@@ -78,12 +78,7 @@ def complete(parts: Iterable[Part]) -> dict[int, list[Part]]:
 def write_chunk(folder: Path, part: Part, job: str, blocks: Sequence[Block], arrays: Mapping[str, np.ndarray]) -> None:
     """Write the results of some lanes.
 
-    Args:
-        folder: where to.
-        part: which lanes they are.
-        job: identifier of the job.
-        blocks: ranges of lanes that the rows of the arrays are.
-        arrays: by name, with the lanes in front.
+    ``blocks`` are the ranges of lanes that the rows of the arrays are; arrays have the lanes in front.
 
     Raises:
         OSError: the file cannot be written.
@@ -134,12 +129,7 @@ def unwritable(folder: Path, what: str, error: OSError) -> OSError:
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """Open a file for reading inside the block; yield its arrays.
-
-    Raises:
-        DamagedFile: one of them cannot be read.
-        OSError: the file is not there, or may not be read.
-    """
+    """Open a file for reading inside the block; yield its arrays."""
     try:
         with open_npz(path) as file:
             yield file
@@ -152,12 +142,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def check_chunk(path: Path, part: Part, job: str) -> None:
-    """Read a file once, against its checksums.
-
-    Raises:
-        DamagedFile: a byte that matters has changed, or the file is of another chunk.
-        OtherJob: the file is whole, and of another job.
-    """
+    """Read a file once, against its checksums."""
     with opened(path) as file:
         broken = file.zip.testzip()
         if broken is not None:
@@ -168,12 +153,7 @@ def check_chunk(path: Path, part: Part, job: str) -> None:
 def read_chunk(
     path: Path, part: Part, job: str, names: Sequence[str] | None = None
 ) -> tuple[list[Block], dict[str, np.ndarray]]:
-    """Return the lanes that a file has, and some of its arrays by name, or all.
-
-    Raises:
-        DamagedFile: something of it cannot be read, or it is of another chunk.
-        OtherJob: it is of another job.
-    """
+    """Return the lanes that a file has, and some of its arrays by name, or all."""
     with opened(path) as file:
         _check_marks(file, path, part, job)
         wanted = result_names(file) if names is None else names

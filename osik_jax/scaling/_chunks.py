@@ -12,13 +12,12 @@ import jax
 import numpy as np
 
 from .._errors import OsikValueError
+from .._progress import Progress, check_progress, reported
 from ..batching._names import leaf_names
 from ..numerics._arguments import check_count
 from ._chunk_file import Block, Part, read_chunk, remove_partial_files, write_chunk
 from ._fingerprint import differences, fingerprint, identifier
-from ._folder import check_space, claim
-from ._lock import only_job
-from ._progress import Progress, check_progress, reported
+from ._folder import check_space, claim, only_job
 from ._saved import FORMAT, Saved
 
 Batch = Any

@@ -29,12 +29,7 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest of a folder; None if there is none.
-
-    Raises:
-        DamagedFile: it is not as it was written.
-        ValueError: it is of another version.
-    """
+    """Return the manifest of a folder; None if there is none."""
     path = folder / MANIFEST
     if not path.exists():
         return None

@@ -276,11 +276,7 @@ class Scheme(Replaceable):
 
 
 def as_max_iterations(value: Any) -> int | None:
-    """Return a checked maximum of iterations: an integer from 0 up, or None.
-
-    Raises:
-        ValueError: anything else.
-    """
+    """Return a checked maximum of iterations: an integer from 0 up, or None."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:

@@ -108,15 +108,9 @@ def _diagonal_terms(
 
     With the bound b on the tasks' curvature, a dof whose terms are d gets the fraction ``b / (b + 30 d)`` of the
     curvature damping: nearly all of it if a target is far out of reach, and almost none if its damping or its posture
-    is strong enough (docs/dev/derivations.md, "Curvature damping").
-
-    Args:
-        single_dof: rows of tasks that ask for the velocity of one dof each.
-        problem: the step.
-        damping: of every dof.
-        curvature: b, kappa times the bound on the tasks' curvature.
-        curvature_damping: kappa times what the tasks' own rows do not resist.
-        backend: of the solver.
+    is strong enough (docs/dev/derivations.md, "Curvature damping"). ``single_dof`` are rows of tasks that ask for the
+    velocity of one dof each. ``curvature`` is b, kappa times the bound on the tasks' curvature; ``curvature_damping``
+    is kappa times what the tasks' own rows do not resist.
     """
     n = problem.lower.shape[0]
     diagonal, weighted = jnp.full(n, damping, problem.lower.dtype), jnp.zeros(n, problem.lower.dtype)

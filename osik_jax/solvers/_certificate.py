@@ -21,16 +21,10 @@ def is_farkas_certificate(
     """Check that a Farkas vector z proves that no point of the box satisfies the rows C.
 
     Where all rows hold at x + d, ``-z'C d`` is at least ``z'gap``; in the box it is at most the sum of |C'z|_j times
-    the distance of x_j to its bound in the direction of -(C'z)_j. If the latter is smaller, there is no such d.
-    Where a variable has no such bound, values up to a thousand times those at hand are considered.
-
-    Args:
-        rows: C.
-        certificate: z, of the sign of the gap in each row; the gaps themselves at the least violation.
-        gap: C x minus the nearest points of the rows' intervals; 0 for rows that do not count.
-        x: a point in the box.
-        lower: lower bounds of the box.
-        upper: upper bounds of the box.
+    the distance of x_j to its bound in the direction of -(C'z)_j. If the latter is smaller, there is no such d. Where a
+    variable has no such bound, values up to a thousand times those at hand are considered. z has the sign of the gap in
+    each row: the gaps themselves at the least violation. The gap is C x minus the nearest point of each row's interval,
+    0 for rows that do not count; x is in the box.
     """
     # -z'C d as a linear function of d, whose coefficients below roundoff are 0
     gradient = apply(rows.T, certificate)
@@ -53,17 +47,11 @@ def relative_kkt_residual(
 ) -> Float[Array, ""]:
     """Return the KKT residual of a point without units, comparable between problems of any weights.
 
-    Args:
-        stationarity: the gradient of the Lagrangian at variables without an active bound, and multipliers of the wrong
-            sign at the others (not positive where the sign is right).
-        gradient_scale: for each variable, the sum of the absolute terms of that gradient.
-        wrong_sign: multipliers of the rows that have the wrong sign, in units of the gradient.
-        violation: by how much each row is violated.
-        violation_scale: for each row, the size of its terms and bounds.
-
-    Returns:
-        The larger of two: the largest stationarity residual or wrong multiplier, relative to the largest gradient
-        scale, and the largest relative violation.
+    It is the larger of two: the largest stationarity residual or wrong multiplier over the largest gradient scale, and
+    the largest violation of a row over the size of its terms and bounds. ``stationarity`` has the gradient of the
+    Lagrangian at variables without an active bound, and at the others multipliers of the wrong sign (not positive where
+    the sign is right). A gradient scale is the sum of the gradient's absolute terms; ``wrong_sign`` is in units of the
+    gradient.
     """
     residual, scale = largest_of_each(stationarity, gradient_scale)
     # stationarity and signs in units of the forces; feasibility in those of the rows' own terms

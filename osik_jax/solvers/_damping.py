@@ -73,14 +73,7 @@ class Damping(NamedTuple):
 def per_level(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
     """Return the dampings of ``count`` levels of n variables as one object with a leading axis of levels.
 
-    Args:
-        damping: a number or a ``Damping``: one for all levels, or a sequence with one for each.
-        count: of levels.
-        n: variables.
-        dtype: of the numbers.
-
-    Raises:
-        ValueError: a sequence of another length.
+    ``damping`` is a number or a ``Damping`` for all levels, or a sequence with one for each.
     """
     single = isinstance(damping, Damping) or not isinstance(damping, Sequence)
     given = [damping] * count if single else list(damping)
@@ -111,15 +104,8 @@ def level_damping(
 
     ``unmet`` and ``demand`` are fields of ``damping``. The ratio is what the damped step leaves of the level's error,
     over ``demand``, and at most 1. As the step depends on the damping, it is a fixed point, found from 1 downwards.
-
-    Args:
-        damping: of the level.
-        level: the level, weights multiplied in.
-        x: where the levels above have ended.
-        projector: onto what they leave free.
-        lower: lower bounds of the box, -inf where unbounded.
-        upper: upper bounds of the box, inf where unbounded.
-        above: rows of the levels above that the step may not violate; None for none.
+    Weights are multiplied into the level; x is where the levels above have ended, and the projector is onto what they
+    leave free. The step may not violate the rows ``above``.
     """
     # the level's step does not depend on what x has in the projector's range
     base = x - apply(projector, x)
@@ -196,19 +182,8 @@ def narrow_box(
     A motion d of the levels below changes no row of this level at first order. At second order it costs the level up to
     ``1/2 residual size sum_j c_j d_j^2``, with the size (Frobenius norm) of its rows and the curvatures c. The level's
     gain is ``1/2 (demand^2 - residual^2)``. The box keeps the cost under a fraction of the gain, in equal parts for all
-    variables. Without a residual the box stays.
-
-    Args:
-        damping: of the level.
-        level: the level.
-        curvature: bound on the curvature of the levels above along each variable, in units of the Frobenius norm of
-            their rows.
-        x: where the level has ended.
-        lower: lower bounds of the box, -inf where unbounded.
-        upper: upper bounds of the box, inf where unbounded.
-
-    Returns:
-        Lower and upper bounds of the new box, and the curvature with the level's own in it.
+    variables. Without a residual the box stays. ``curvature`` bounds that of the levels above along each variable, in
+    units of the Frobenius norm of their rows; it is returned with the level's own in it, behind the bounds.
     """
     longest_square = jnp.max(jnp.sum(level.matrix**2, -1), initial=0.0)
     size = safe_norm(level.matrix.ravel())

@@ -104,12 +104,8 @@ def dual_active_set(
 ) -> DualState:
     """Find the active sets of a batch; every argument has a leading axis of problems.
 
-    Args:
-        constraints: bounds, tolerances and scales.
-        start: where the search begins.
-        searching: problems to work on.
-        iterations: changes of the active set so far.
-        max_iterations: limit on the changes of the active set.
+    ``iterations`` has the changes of the active set so far, ``max_iterations`` limits them; other problems than those
+    that are ``searching`` stay as they are.
     """
 
     def is_running(state: DualState) -> Bool[Array, ""]:
@@ -247,12 +243,8 @@ def _partial_step(
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """Return the partial (dual) step length t1 (Goldfarb, Idnani), and the inequality that leaves the active set there.
 
-    Beyond t1 the multiplier of that inequality would have the wrong sign; t1 is infinite if there is none.
-
-    Args:
-        s: the iterate.
-        sign: sign of the entering constraint's multiplier.
-        column: rates of all values and multipliers per unit of that multiplier: a column of the tableau. (m,)
+    Beyond t1 the multiplier of that inequality would have the wrong sign; t1 is infinite if there is none. ``sign`` is
+    that of the entering constraint's multiplier; ``column`` has the rates of all values and multipliers per unit of it.
     """
     bound_sign = jnp.where(s.active == AT_LOWER, 1.0, jnp.where(s.active == AT_UPPER, -1.0, 0.0)).astype(column.dtype)
     rate = bound_sign * sign * column

@@ -34,14 +34,8 @@ def row_space_and_motion(
 
     The rank is decided by pivots: rows that have no more than the cutoff outside the span of the longer ones count as
     dependent. The projector comes from an orthonormal basis and not from an inverse, so it is idempotent to roundoff
-    however dependent the rows are. Derivatives are those at constant rank.
-
-    Args:
-        matrix: A.
-        target: values of the rows; the right-hand side.
-        cutoff: the smallest pivot that is not 0.
-        damping: of the solution, in squared singular values.
-        backend: of the factors (static).
+    however dependent the rows are. Derivatives are those at constant rank. ``cutoff`` is the smallest pivot that is not
+    0; the damping is in squared singular values.
     """
     factors = row_factors(matrix, cutoff, damping, backend)
     motion = apply(factors.basis.T, _solved(factors, target))

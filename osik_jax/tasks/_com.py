@@ -224,11 +224,7 @@ def axis_numbers(axes: str) -> np.ndarray:
 
 
 def check_axes(axes: str) -> str:
-    """Return the names of axes, or raise ValueError unless they are x, y or z, each at most once.
-
-    Raises:
-        ValueError: they are not.
-    """
+    """Return the names of axes, or raise ValueError unless they are x, y or z, each at most once."""
     if not axes or len(set(axes)) != len(axes) or not set(axes) <= set("xyz"):
         raise OsikValueError(f"axes is {axes!r}; it is made of x, y and z, each at most once")
     return axes

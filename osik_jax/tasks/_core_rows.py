@@ -21,15 +21,7 @@ def fields_of(rows: TaskRows) -> Fields:
 def fields_by_core(
     call: Call, method: str, nv: int, weight: Float[Array, "lanes m"], *given: Array | np.ndarray
 ) -> Fields:
-    """Return the arguments of ``equality_rows`` for a batch.
-
-    Args:
-        call: calls a method of the core.
-        method: its name.
-        nv: number of columns of the rows.
-        weight: of the rows.
-        given: arguments of the method: numbers have a leading axis, of the lanes or of length 1.
-    """
+    """Return the arguments of ``equality_rows`` for a batch: arrays with an axis of lanes, or of length 1, in front."""
     count, lanes = weight.shape[1], max(len(a) for a in given if jnp.issubdtype(a.dtype, jnp.floating))
     shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (lanes, count)
     error, rows, wanted, *rest = call(method, [(shape, float) for shape in shapes], *given)

@@ -86,8 +86,7 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
 def share_of_far(distance: Float[Array, " k"]) -> Float[Array, " k"]:
     """Return 0 for a task at its target, rising to 1 for a task whose error is many lever arms. (k,).
 
-    Args:
-        distance: the errors, in lever arms: times their weighted pulls, over the curvatures. (k,)
+    The distances are errors in lever arms: times their weighted pulls, over the curvatures.
     """
     ratio = jnp.clip(distance / NEAR_ERROR, 0.0, FARTHEST_ERROR)
     return ratio**2 / (1.0 + ratio**2)
@@ -97,10 +96,8 @@ def near_part(far: Float[Array, ""]) -> Float[Array, ""]:
     """Return the factor on the curvature bounds: ``NEAR_PART`` if all tasks are at their targets, 1 if one is far.
 
     Near the target, directions that the rows hardly resist have a quarter of the greatest eigenvalue at most, and half
-    of it as damping keeps a step stable. More damping makes a frame lag behind a moving target.
-
-    Args:
-        far: ``share_of_far`` of the farthest task.
+    of it as damping keeps a step stable. More damping makes a frame lag behind a moving target. ``far`` is
+    ``share_of_far`` of the farthest task.
     """
     return NEAR_PART + (1.0 - NEAR_PART) * far
 
@@ -112,12 +109,9 @@ def fraction_to_damp(
 
     Rows resist a motion v with ``1/2 v'J'W J v`` and leave out ``1/2 dt p . (grad^2 e)[v, v]``, which is large where
     the frame moves across p. There it is up to b, the resistance up to g, and b / (b + 2 g) of the bound is enough.
-    What bends elsewhere is a small part of it (docs/dev/derivations.md, "Curvature damping").
-
-    Args:
-        bound: dt times the curvature, b. (k,)
-        far: ``share_of_far`` of the tasks. (k,)
-        stiffness: squared Frobenius norm of the Jacobian, its weights' roots multiplied in, g. (k,)
+    What bends elsewhere is a small part of it (docs/dev/derivations.md, "Curvature damping"). ``bound`` is b: dt times
+    the curvature; ``far`` is ``share_of_far`` of the tasks; ``stiffness`` is g, the squared Frobenius norm of the
+    Jacobian with its weights' roots multiplied in.
     """
     total = 0.5 * bound + stiffness
     resisted = quotient(stiffness, jnp.where(total > 0.0, total, 1.0))

@@ -30,11 +30,7 @@ WeightLike = ArrayLike | Array | Mapping[str, float]
 
 
 def as_own_weight(value: Any) -> Float[Array, "..."]:
-    """Return a scalar or a vector of weights as an array; float arrays keep their precision, all else becomes float.
-
-    Raises:
-        ValueError: it is neither a scalar nor a vector, or negative or not finite.
-    """
+    """Return a scalar or a vector of weights as an array; float arrays keep their precision, all else becomes float."""
     rows = np.shape(value)
     if len(rows) > 1:
         raise OsikValueError(f"weight has shape {rows}, expected a scalar or a vector. Batch with jax.vmap.")
@@ -46,9 +42,6 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
     """Return a weight for all rows, or one per row; a scalar takes the shape ``like``.
 
     ``rows=None`` accepts a scalar only.
-
-    Raises:
-        ValueError: any other shape, or a weight that is negative or not finite.
     """
     out = as_array(value, "weight", dtype)
     if out.shape not in ((), (rows,)):
@@ -62,10 +55,6 @@ def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "
     """Return one weight per row of some dofs.
 
     It is given as a scalar, in the order of these rows, in the order of v, or by joint names.
-
-    Raises:
-        KeyError: a name that is none of the joints'.
-        ValueError: any other shape, or a weight that is negative or not finite.
     """
     dtype = robot.q0.dtype
     if isinstance(value, Mapping) or (np.shape(value) == (robot.nv,) and len(dofs) != robot.nv):

@@ -36,20 +36,12 @@ class PlaneTask(FramedTask):
 
 
 def as_normal(value: Any, dtype: Any) -> Float[Array, "3"]:
-    """Return a unit normal from a vector of any non-zero length.
-
-    Raises:
-        ValueError: it is not such a vector.
-    """
+    """Return a unit normal from a vector of any non-zero length."""
     return to_jax(unit(on_host(as_direction(value, "normal", dtype))))
 
 
 def as_offset(value: Any, dtype: Any) -> Float[Array, ""]:
-    """Return the offset of a plane along its normal from the world's origin [m].
-
-    Raises:
-        ValueError: not a scalar.
-    """
+    """Return the offset of a plane along its normal from the world's origin [m]."""
     return as_vector(value, (), "offset", dtype)
 
 

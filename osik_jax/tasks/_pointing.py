@@ -143,11 +143,7 @@ def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
 
 
 def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:
-    """Return a vector (3,), or raise ValueError if its length is 0.
-
-    Raises:
-        ValueError: it is not.
-    """
+    """Return a vector (3,), or raise ValueError if its length is 0."""
     out = as_vector(value, (3,), what, dtype)
     seen = concrete(out)
     if seen is not None and not (np.isfinite(seen).all() and seen.any()):

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, ClassVar, Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -26,7 +27,6 @@ from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_ne
 from ._repr import ROWS
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._task import POSE, CoreCard, TaskRows, check_priority
-from ._twist import pose_log, seen_from
 
 RADIAN = 0.1
 """Length [m] that an error of one radian counts as in pose tasks by default, and in ``inverse_kinematics``: a hand that
@@ -302,22 +302,14 @@ def _row_weight(value: Any, name: str, dtype: Any) -> Float[Array, "3"]:
 
 
 def option(name: str, value: str, available: tuple[str, ...]) -> str:
-    """Return a value that is one of the available options.
-
-    Raises:
-        ValueError: it is not; the message lists the options.
-    """
+    """Return a value that is one of the available options."""
     if value not in available:
         raise OsikValueError(f"{name} is {value!r}; it is one of: {', '.join(map(repr, available))}")
     return value
 
 
 def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
-    """Return six booleans from the name of a set of rows, or from six booleans.
-
-    Raises:
-        ValueError: no such name, not six, or none of them is true.
-    """
+    """Return six booleans from the name of a set of rows, or from six booleans."""
     if isinstance(rows, str):
         if rows not in ROWS:
             raise OsikValueError(unknown_name("row set", rows, tuple(ROWS)).args[0])
@@ -326,3 +318,32 @@ def row_mask(rows: str | Sequence[bool]) -> tuple[bool, ...]:
     if len(mask) != 6 or not any(mask):
         raise OsikValueError(f"rows has six booleans (x, y, z, rotation about x, y, z), at least one true; got {rows}")
     return mask
+
+
+def pose_log(
+    position: Float[Array, "3"], rotation: Float[Array, "3 3"]
+) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    """Return the logarithm (6,) of a pose T, [linear; angular], and L (6, 6) with ``log(T)' = L twist``.
+
+    The twist is the frame's own, [linear; angular] in its own axes: ``T' = T [twist]``. With phi = log(R) and E the
+    inverse left Jacobian of SO(3) at phi, the logarithm is (E p, phi). Its rate is
+
+        phi' = E' w        (E p)' = E R v + d(E p)/d(phi) phi' = E' v + D E' w
+
+    because E R = E', the inverse right Jacobian. L is Pinocchio's ``Jlog6`` and mink's ``jlog``, the inverse right
+    Jacobian of SE(3) at log(T).
+    """
+    angle = rotation_log(rotation)
+    left = inverse_left_jacobian(angle)
+    derivative = jax.jacfwd(lambda phi: dot(inverse_left_jacobian(phi), position))(angle)
+    right = left.T
+    top = jnp.concatenate([right, dot(derivative, right)], axis=1)
+    bottom = jnp.concatenate([jnp.zeros_like(right), right], axis=1)
+    return jnp.concatenate([dot(left, position), angle]), jnp.concatenate([top, bottom])
+
+
+def seen_from(position: Float[Array, "3"], rotation: Float[Array, "3 3"], twist: Float[Array, "6 ..."]) -> Array:
+    """Return twists (6, ...) of a frame in its own axes as twists of a second frame, whose relative pose is given."""
+    linear, angular = twist[:3], twist[3:]
+    # v + w x p at the second frame's origin, and w x p = -p x w
+    return jnp.concatenate([dot(rotation.T, linear - dot(cross_matrix(position), angular)), dot(rotation.T, angular)])

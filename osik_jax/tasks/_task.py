@@ -134,17 +134,11 @@ class TaskRows(eqx.Module):
 
 
 class CoreCard(NamedTuple):
-    """Facts by which the compiled step computes the rows of a task (``core/step_rows.hpp``).
+    """Facts by which the compiled step computes the rows of a task (``core/step_rows.hpp``)."""
 
-    Attributes:
-        kind: ``POSE``, ``CENTER`` or ``POSTURE``: ``StepTask`` in ``core/moving_rows.hpp``.
-        rows: their number.
-        options: indices and flags of this kind.
-    """
-
-    kind: int
-    rows: int
-    options: list[int]
+    kind: int  # ``POSE``, ``CENTER`` or ``POSTURE``: ``StepTask`` in ``core/moving_rows.hpp``
+    rows: int  # their number
+    options: list[int]  # indices and flags of this kind
 
 
 POSE, CENTER, POSTURE, GIVEN = range(4)

@@ -65,17 +65,11 @@ class History:
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State to resume a tuning: next parameters, optimiser state and history.
+    """State to resume a tuning: next parameters, optimiser state and history."""
 
-    Attributes:
-        vector: parameters of the next iteration, in the space that the optimiser moves in. (p,)
-        optimizer: the optimiser's state.
-        history: of the iterations so far.
-    """
-
-    vector: Any
-    optimizer: Any
-    history: History
+    vector: Any  # parameters of the next iteration, in the space that the optimiser moves in. (p,)
+    optimizer: Any  # the optimiser's state
+    history: History  # of the iterations so far
 
 
 def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
@@ -90,14 +84,7 @@ def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace
 def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:
     """Return a state that ``save_state`` wrote.
 
-    Args:
-        path: of the file.
-        space: space of the parameters, equal to that of the saved state.
-        optimizer: the optimiser's first state, for its structure.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: it is of other parameters, or another optimiser.
+    ``space`` is that of the saved state; ``optimizer`` is the first state of the optimiser, for its structure.
     """
     with open_npz(path) as file:
         arrays = dict(file)

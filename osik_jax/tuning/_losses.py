@@ -44,15 +44,10 @@ class Loss(eqx.Module):
 
 
 class WeightedSum(Loss):
-    """Several losses, each times a weight.
+    """Several losses, each times a weight."""
 
-    Attributes:
-        losses: functions of a trajectory and a loop, ready ones and others.
-        weights: one for each.
-    """
-
-    losses: tuple[LossFunction, ...]
-    weights: Float[Array, " k"]
+    losses: tuple[LossFunction, ...]  # functions of a trajectory and a loop, ready ones and others
+    weights: Float[Array, " k"]  # one for each
 
     def __call__(self, trajectory: Trajectory, loop: Loop) -> Float[Array, ""]:
         """Return the sum."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -16,13 +17,13 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError, missing_extra
+from .._progress import progress_bar
 from ..batching._structure import Static, put_together, taken_apart
 from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
 from ._history import History, State, load_state, save_state
 from ._loop import Loop
 from ._losses import LossFunction
 from ._parameters import Parameter, ParameterSpace, overlap
-from ._progress import reported
 from ._scenarios import Scenarios
 
 try:
@@ -32,6 +33,7 @@ except ImportError as missing:
 
 LEARNING_RATE = 0.1
 """Learning rate of the default optimiser: weights and gains change by up to 10 % an iteration."""
+_default_optimizer = optax.with_extra_args_support(optax.adam(LEARNING_RATE))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,9 +152,6 @@ def _optimizer(given: Any) -> optax.GradientTransformationExtraArgs:
     return optax.with_extra_args_support(given)
 
 
-_default_optimizer = optax.with_extra_args_support(optax.adam(LEARNING_RATE))
-
-
 def _first_state(space: ParameterSpace, optimizer: optax.GradientTransformationExtraArgs, resume: Any) -> State:
     fresh = State(space.initial, optimizer.init(space.initial), History.empty(len(space.names)))
     if resume is None:
@@ -252,3 +251,24 @@ def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tu
         space=space,
         state=state,
     )
+
+
+@contextlib.contextmanager
+def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], None]]:
+    """Yield a function that takes the history after each iteration; it draws a bar if wanted."""
+    if not shown:
+        yield lambda history: None
+        return
+    with progress_bar(iterations, unit="iterations") as update:
+        yield lambda history: update(len(history), describe(history))
+
+
+def describe(history: History) -> str:
+    """Return the last iteration in a line."""
+    if not len(history):
+        return "compiling"
+    parts = [f"loss {history.loss[-1]:.3e}", f"best {history.loss[history.best]:.3e}"]
+    if history.held_out[-1] == history.held_out[-1]:
+        parts.append(f"held out {history.held_out[-1]:.3e}")
+    lost = int(history.dropped[-1] + history.held_out_dropped[-1])
+    return ", ".join(parts + ([f"{lost} dropped"] if lost else []))

@@ -65,37 +65,22 @@ class StepVerdict(NamedTuple):
 
 
 class _Stops(NamedTuple):
-    """Joints, limits and tasks that stop one goal.
+    """Joints, limits and tasks that stop one goal."""
 
-    Attributes:
-        joints: -1 or 1 where a dof's lower or upper bound does, else 0. (nv,)
-        limits: whether the rows of each limit do.
-        tasks: whether each other task does, by name.
-        stretched: whether the goal has no force on the dofs that are not at a bound.
-    """
-
-    joints: Array
-    limits: list[Array]
-    tasks: dict[str, Array]
-    stretched: Array
+    joints: Array  # -1 or 1 where a dof's lower or upper bound does, else 0. (nv,)
+    limits: list[Array]  # whether the rows of each limit do
+    tasks: dict[str, Array]  # whether each other task does, by name
+    stretched: Array  # whether the goal has no force on the dofs that are not at a bound
 
 
 class _Measured(NamedTuple):
-    """Numbers of a step from which its verdict is made.
+    """Numbers of a step from which its verdict is made."""
 
-    Attributes:
-        speed: of the fastest joint [rad/s or m/s].
-        errors: of each goal: [m] and [rad]. {name: (2,)}
-        stops: by goal.
-        tightest: the place of the limit that gives each dof's lower and upper bound. (2, nv)
-        gaps: of each collision limit, the distances of its pairs less the least ones [m].
-    """
-
-    speed: Any
-    errors: dict[str, Any]
-    stops: dict[str, _Stops]
-    tightest: Any
-    gaps: list[Any]
+    speed: Any  # of the fastest joint [rad/s or m/s]
+    errors: dict[str, Any]  # of each goal: [m] and [rad]. {name: (2,)}
+    stops: dict[str, _Stops]  # by goal
+    tightest: Any  # the place of the limit that gives each dof's lower and upper bound. (2, nv)
+    gaps: list[Any]  # of each collision limit, the distances of its pairs less the least ones [m]
 
 
 class _Reasons(NamedTuple):

@@ -19,7 +19,6 @@ from PIL import Image
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
-from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
 from ._parts import RobotParts, Style, robot_parts
@@ -38,7 +37,6 @@ def animate(
     dt: float,
     frames_per_second: float = 12.5,
     size: tuple[int, int] = (720, 405),
-    renderer: RendererName = "auto",
     style: Style = "auto",
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
@@ -50,9 +48,7 @@ def animate(
     elevation: float = 13.0,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Write a film of a motion as GIF or MP4, without a display.
-
-    MuJoCo's renderer is used where OpenGL works, else ray casting on the CPU.
+    """Write a film of a motion as GIF or MP4, by ray casting, without a display.
 
     Args:
         path: a ``.gif``, or an ``.mp4`` if the program ffmpeg is installed.
@@ -61,7 +57,6 @@ def animate(
         dt: time between two configurations [s].
         frames_per_second: at most so many pictures a second are taken from ``q``.
         size: width and height [pixels].
-        renderer: ``"mujoco"`` (OpenGL), ``"raycast"`` (CPU), or ``"auto"``: the first of them that works.
         style: ``"geoms"``, ``"sticks"``, or ``"auto"``: what its URDF shows, else geoms, else sticks.
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
             centre of mass is drawn too, and a panel shows both from above.
@@ -80,7 +75,6 @@ def animate(
     Raises:
         ValueError: the suffix is neither .gif nor .mp4, or ffmpeg is missing for .mp4.
         OSError: the file cannot be written.
-        RuntimeError: ``renderer="mujoco"`` where OpenGL does not work.
     """
     path = Path(path)
     _check_path(path)
@@ -92,7 +86,6 @@ def animate(
         frames,
         frames * dt,
         size,
-        renderer,
         robot_parts(robot, style=style),
         _each(support, frames),
         trails,
@@ -137,7 +130,6 @@ class _Film:
         frames: np.ndarray,
         time: np.ndarray,
         size: tuple[int, int],
-        renderer: RendererName,
         shape: RobotParts,
         support: Polygons | None,
         trails: Sequence[str],
@@ -157,8 +149,8 @@ class _Film:
         self._floor = floor_height(robot, shape, mujoco_poses(robot, self._q))
         window = (0.04, 0.54 if panels else 0.96, 0.10 if caption else 0.04, 0.92)
         self._camera = frame_camera(np.concatenate([points, self._on_floor()]), size, azimuth, elevation, window)
-        self._stage = Stage([self._shape], self._camera, floor=self._floor)
-        self._renderer = make_renderer(renderer, self._stage, self._camera, size, floor=self._floor)
+        self._stage = Stage([self._shape])
+        self._renderer = RayCaster(self._stage, self._camera, size, floor=self._floor)
         self._canvas = Canvas(size)
         self._add_text(caption)
         self._add_marks()
@@ -216,13 +208,7 @@ class _Film:
             progress((frame + 1) / len(self._q))
 
     def _draw(self, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
-        """Yield pictures of the stage in order.
-
-        Ray casting may use several threads; a GL context belongs to one.
-        """
-        if not isinstance(self._renderer, RayCaster):
-            yield from (self._renderer.image(*job) for job in jobs)
-            return
+        """Yield pictures of the stage in order."""
         cores = os.cpu_count() or 1
         with ThreadPoolExecutor(cores) as pool:
             ahead: deque[Future[np.ndarray]] = deque()

@@ -15,10 +15,10 @@ from ..collision._table import CoveringSpheres
 from ..robot import Robot
 from ..robot._mujoco import model_bodies, mujoco_poses, robot_com
 from ._animate import paint_over
-from ._opengl import RendererName, make_renderer
 from ._outline import floor_height
 from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer
 from ._parts import Part, RobotParts, fixed_parts, robot_parts
+from ._raycast import RayCaster
 from ._stage import Camera, Stage, frame_camera
 
 _LONG_LENS = 10.0
@@ -39,7 +39,6 @@ def hero_picture(
     size: tuple[int, int] = (1600, 720),
     azimuth: float = 20.0,
     elevation: float = 14.0,
-    renderer: RendererName = "raycast",
 ) -> Path:
     """Save a picture of one robot at several instants, side by side on one floor.
 
@@ -56,7 +55,6 @@ def hero_picture(
         size: width and height [pixels].
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
-        renderer: as in ``animate``.
     """
     shape = robot_parts(robot)
     sources = [next(mujoco_poses(robot, q)) for q in configurations]
@@ -72,11 +70,10 @@ def hero_picture(
     seen = [np.concatenate([points, boxes]) + shift for points, shift in zip(corners, shifts, strict=True)]
     window = (0.03, 0.97, 0.05, 0.90 if labels else 0.95)
     camera = frame_camera(np.concatenate([*seen, *crosses, *paths]), size, azimuth, elevation, window, lens=_LONG_LENS)
-    stage = Stage([shape] * len(sources) + [fixed] * len(sources), camera, floor=floor)
+    stage = Stage([shape] * len(sources) + [fixed] * len(sources))
     data = stage.pose([*sources, *sources], np.concatenate([shifts, shifts]))
-    drawer = make_renderer(renderer, stage, camera, size, floor=floor)
     moved = [corners + shift[:2] for corners, shift in zip(support or (), shifts, strict=False)]
-    base = drawer.image(data, polygon_layer(moved, camera, size, floor=floor))
+    base = RayCaster(stage, camera, size, floor=floor).image(data, polygon_layer(moved, camera, size, floor=floor))
     canvas = Canvas(size, scale=size[1] / 450)
     for source, shift in zip(sources if support else (), shifts, strict=False):
         ComMark(canvas, camera, floor=floor, moving=False).place(robot_com(robot, source) + shift)
@@ -103,8 +100,8 @@ def sphere_picture(path: str | Path, robot: Robot, spheres: CoveringSpheres) -> 
     seen = np.concatenate([points + shift for points, shift in zip(corners, shifts, strict=True)])
     camera = frame_camera(seen, size, azimuth, 14.0, lens=_LONG_LENS)
     floor = float(seen[:, 2].min())
-    stage = Stage(figures, camera, floor=floor)
-    picture = make_renderer("raycast", stage, camera, size, floor=floor).image(stage.pose([source, source], shifts))
+    stage = Stage(figures)
+    picture = RayCaster(stage, camera, size, floor=floor).image(stage.pose([source, source], shifts))
     Image.fromarray((255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)).save(path, optimize=True)
     return Path(path)
 

@@ -16,17 +16,11 @@ from ._parts import RobotParts, robot_parts
 
 
 class Outline(NamedTuple):
-    """Dimensions of a robot at one configuration.
+    """Dimensions of a robot at one configuration."""
 
-    Attributes:
-        size: diagonal of a box about all that is drawn of it [m].
-        lowest: height of its lowest point [m].
-        base: height of the lowest point of what is fixed to the world, 0 where nothing of that is drawn [m].
-    """
-
-    size: float
-    lowest: float
-    base: float
+    size: float  # diagonal of a box about all that is drawn of it [m]
+    lowest: float  # height of its lowest point [m]
+    base: float  # height of the lowest point of what is fixed to the world, 0 where nothing of that is drawn [m]
 
 
 def robot_outline(robot: Robot, q: ArrayLike) -> Outline:

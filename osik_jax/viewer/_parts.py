@@ -42,21 +42,13 @@ _HIDDEN_GROUP = 3
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One shape of a robot.
+    """One shape of a robot."""
 
-    Attributes:
-        index: of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``.
-        kind: MuJoCo's geom type.
-        size: MuJoCo's geom sizes [m]. (3,)
-        color: red, green, blue, alpha. (4,)
-        mesh: vertices (k, 3) [m] and triangles (m, 3) of a mesh.
-    """
-
-    index: int
-    kind: mujoco.mjtGeom
-    size: np.ndarray
-    color: np.ndarray
-    mesh: tuple[np.ndarray, np.ndarray] | None = None
+    index: int  # of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``
+    kind: mujoco.mjtGeom  # MuJoCo's geom type
+    size: np.ndarray  # MuJoCo's geom sizes [m]. (3,)
+    color: np.ndarray  # red, green, blue, alpha. (4,)
+    mesh: tuple[np.ndarray, np.ndarray] | None = None  # vertices (k, 3) [m] and triangles (m, 3) of a mesh
 
     @functools.cached_property
     def corners(self) -> Float[np.ndarray, "8 3"]:
@@ -93,21 +85,14 @@ class Part:
 
 @dataclasses.dataclass(frozen=True)
 class RobotParts:
-    """Shapes of a robot for pictures.
+    """Shapes of a robot for pictures."""
 
-    Attributes:
-        model: the MuJoCo model.
-        style: ``"look"``, ``"geoms"`` or ``"sticks"``.
-        parts: the shapes.
-        bodies: MuJoCo's index of the body that carries each part. (parts,)
-        anchors: position [m] and rotation of each part in its body; of sticks, which change with the configuration, the
-            bodies without children, and of each the farthest named point in its frame [m].
-    """
-
-    model: mujoco.MjModel
-    style: Literal["look", "geoms", "sticks"]
-    parts: tuple[Part, ...]
-    bodies: Int[np.ndarray, " parts"]
+    model: mujoco.MjModel  # the MuJoCo model
+    style: Literal["look", "geoms", "sticks"]  # ``"look"``, ``"geoms"`` or ``"sticks"``
+    parts: tuple[Part, ...]  # the shapes
+    bodies: Int[np.ndarray, " parts"]  # MuJoCo's index of the body that carries each part
+    # position [m] and rotation of each part in its body; of sticks, which change with the configuration, the bodies
+    # without children, and of each the farthest named point in its frame [m]
     anchors: tuple[np.ndarray, np.ndarray]
 
     def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
@@ -135,9 +120,6 @@ def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
         robot: the robot.
         style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the
             visual shapes of its URDF, else the geoms if most moving bodies have a visible one, else sticks.
-
-    Raises:
-        ValueError: ``style="geoms"`` of a model that has no visible geom.
     """
     model, unread = robot.mj_model, robot.holder.look
     if unread is not None and style == "auto":
@@ -252,11 +234,7 @@ def _link_frames(along: Float[np.ndarray, "links 3"]) -> Float[np.ndarray, "link
 
 
 def fixed_parts(robot: Robot, shapes: Iterable[CollisionShape]) -> RobotParts:
-    """Return shapes of the world as parts that the world's body carries.
-
-    Raises:
-        ValueError: a shape on a frame of the robot, a half-space or a convex hull.
-    """
+    """Return shapes of the world as parts that the world's body carries."""
     shapes = tuple(shapes)
     for shape in shapes:
         if shape.frame is not None or shape.kind not in _KINDS:

@@ -18,7 +18,6 @@ _TILES = np.array([[0.925, 0.937, 0.952], [0.968, 0.975, 0.985]])
 _SHADOW_MAP = 112
 _CORNERS = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(8, 3)
 _SUBPIXELS = np.array([[0.125, 0.625], [0.375, 0.125], [0.625, 0.875], [0.875, 0.375]])
-_GROUPS = np.array([1, 1, 1, 1, 1, 0], np.uint8)
 
 
 class _Hits(NamedTuple):
@@ -43,11 +42,10 @@ class RayCaster:
         self._background, self._ground = self._empty_floor()
 
     def image(self, data: mujoco.MjData, under: Float[np.ndarray, "height width 4"] | None = None) -> Image:
-        """Return a picture of the stage; ``under`` is painted on the floor with shadows, behind the robots.
+        """Return a picture of the stage, posed by ``Stage.pose``.
 
-        Args:
-            data: from ``Stage.pose``.
-            under: red, green, blue and alpha from 0 to 1, alpha not multiplied in.
+        ``under`` is painted on the floor with shadows, behind the robots: red, green, blue and alpha from 0 to 1, alpha
+        not multiplied in.
         """
         picture = self._background * self._shadow(data)[..., None]
         if under is not None:
@@ -86,9 +84,9 @@ class RayCaster:
 
     def _near_robots(self, data: mujoco.MjData) -> np.ndarray:
         """Return the pixels that the geoms' bounding boxes may cover. (height, width)."""
-        boxes, turns = self.stage.model.geom_aabb[1:], data.geom_xmat[1:].reshape(-1, 3, 3)  # the floor is geom 0
+        boxes, turns = self.stage.model.geom_aabb, data.geom_xmat.reshape(-1, 3, 3)
         corners = boxes[:, None, :3] + boxes[:, None, 3:] * _CORNERS
-        places = self.camera.project(data.geom_xpos[1:, None] + corners @ turns.mT, self.size)
+        places = self.camera.project(data.geom_xpos[:, None] + corners @ turns.mT, self.size)
         first = np.maximum(np.floor(places.min(1)).astype(int), 0)
         last = np.ceil(places.max(1)).astype(int)
         inside = np.zeros((self.size[1], self.size[0]), bool)
@@ -101,7 +99,7 @@ class RayCaster:
         geom, distance, normal = np.full(n, -1, np.int32), np.zeros(n), np.zeros(3 * n)
         flat = np.ascontiguousarray(rays).ravel()
         mujoco.mj_multiRay(
-            self.stage.model, data, origin, flat, _GROUPS, 1, -1, geom, distance, normal, n, mujoco.mjMAXVAL
+            self.stage.model, data, origin, flat, None, 1, -1, geom, distance, normal, n, mujoco.mjMAXVAL
         )
         return _Hits(geom, distance, normal.reshape(n, 3))
 
@@ -118,7 +116,7 @@ class RayCaster:
         turned = np.flatnonzero(n @ TO_LAMP > 0.0)  # only these faces can be in another part's shadow
         # lifted off the surface, or rounding would put points in their own shadow
         lit[turned] = self._lit(data, (point + 1e-3 * self.camera.height * n)[turned])
-        color[seen] = light(self.stage.colors[hits.geom[seen] - 1], n, ray, lit)
+        color[seen] = light(self.stage.colors[hits.geom[seen]], n, ray, lit)
         return color
 
     def _lit(self, data: mujoco.MjData, points: Float[np.ndarray, "n 3"]) -> np.ndarray:
@@ -130,7 +128,7 @@ class RayCaster:
 
     def _shadow(self, data: mujoco.MjData) -> Float[np.ndarray, "height width"]:
         """Return the fraction of the light that each pixel of the floor receives; shadows have soft edges."""
-        center, radius = data.geom_xpos[1:], self.stage.model.geom_rbound[1:, None]
+        center, radius = data.geom_xpos, self.stage.model.geom_rbound[:, None]
         way = center - self._lamp
         foot = self._lamp + way * ((self._floor - self._lamp[2]) / way[:, 2:])
         # a slanted lamp stretches the shadow of a sphere along the floor
@@ -179,11 +177,8 @@ def light(
 ) -> Float[np.ndarray, "n 3"]:
     """Return the colours of points under a bright sky and one lamp.
 
-    Args:
-        colors: surface colours without shading. (n, 3)
-        normals: unit vectors, towards the camera. (n, 3)
-        rays: unit vectors from the camera. (n, 3)
-        lit: share of the lamp that each point sees, 0 (in shadow) to 1. (n,)
+    Normals point towards the camera, rays away from it, both of unit length. ``lit`` is the share of the lamp that each
+    point sees, 0 (in shadow) to 1.
     """
     lamp = lit * np.clip(normals @ TO_LAMP, 0.0, 1.0)
     half = TO_LAMP - rays

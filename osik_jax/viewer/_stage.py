@@ -11,9 +11,6 @@ from jaxtyping import Float
 
 from ._parts import Part, RobotParts
 
-FLOOR_GROUP = 5
-"""Geom group of the floor: MuJoCo's renderer shows it, the ray caster draws its own floor."""
-
 LENS = 3.6
 """Distance of the camera in picture heights."""
 
@@ -22,26 +19,13 @@ TO_LAMP = np.array([0.42, -0.38, 0.82]) / np.linalg.norm([0.42, -0.38, 0.82])
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """Pinhole camera that looks at a point.
+    """Pinhole camera that looks at a point."""
 
-    Attributes:
-        center: what it looks at [m]. (3,)
-        distance: from there to the lens [m].
-        azimuth: of the lens about the vertical, 0 from +x [deg].
-        elevation: of the lens above the horizon [deg].
-        height: of what it sees at the centre, top to bottom of the picture [m].
-    """
-
-    center: tuple[float, float, float]
-    distance: float
-    azimuth: float
-    elevation: float
-    height: float
-
-    @property
-    def view_angle(self) -> float:
-        """Return the vertical field of view [deg]."""
-        return float(2.0 * np.rad2deg(np.arctan2(0.5 * self.height, self.distance)))
+    center: tuple[float, float, float]  # what it looks at [m]. (3,)
+    distance: float  # from there to the lens [m]
+    azimuth: float  # of the lens about the vertical, 0 from +x [deg]
+    elevation: float  # of the lens above the horizon [deg]
+    height: float  # of what it sees at the centre, top to bottom of the picture [m]
 
     @property
     def axes(self) -> Float[np.ndarray, "3 3"]:
@@ -74,14 +58,6 @@ class Camera:
         scale = self.distance / depth * height / self.height
         return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale], -1)
 
-    def for_mujoco(self) -> mujoco.MjvCamera:
-        """Return the same camera for MuJoCo's renderer; the model's ``vis.global_.fovy`` must equal ``view_angle``."""
-        camera = mujoco.MjvCamera()
-        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:] = self.center
-        camera.distance, camera.azimuth, camera.elevation = self.distance, self.azimuth + 180.0, -self.elevation
-        return camera
-
 
 def frame_camera(
     points: Float[np.ndarray, "n 3"],
@@ -93,13 +69,8 @@ def frame_camera(
 ) -> Camera:
     """Return the nearest camera that sees all points [m] within a window of its picture.
 
-    Args:
-        points: what has to be seen [m]. (n, 3)
-        size: width and height of the picture [pixels].
-        azimuth: as in ``Camera``.
-        elevation: as in ``Camera``.
-        window: left, right, top and bottom as parts of the picture.
-        lens: how far the camera is, in heights of what it sees at its centre; farther means less perspective.
+    The window is left, right, top and bottom as parts of the picture. ``lens`` is how far the camera is, in heights of
+    what it sees at its centre; farther means less perspective.
     """
     left, right, top, bottom = window
     axes = Camera((0.0, 0.0, 0.0), 1.0, azimuth, elevation, 1.0).axes
@@ -126,19 +97,19 @@ def frame_camera(
 
 
 class Stage:
-    """Scene of robots' shapes on mocap bodies, a floor and a lamp.
+    """Scene of robots' shapes on mocap bodies.
 
     Attributes:
         model: the MuJoCo model.
         parts: of all robots; the part k is on the body k + 1.
-        colors: of each geom but the floor, red, green and blue. (geoms, 3)
+        colors: of each geom, red, green and blue. (geoms, 3)
     """
 
-    def __init__(self, robots: Sequence[RobotParts], camera: Camera, *, floor: float) -> None:
-        """Build the model; ``floor`` is the height of the floor [m]."""
+    def __init__(self, robots: Sequence[RobotParts]) -> None:
+        """Build the model."""
         self._robots = tuple(robots)
         self.parts = tuple(part for robot in robots for part in robot.parts)
-        spec = _surroundings(camera, floor)
+        spec = mujoco.MjSpec()
         for part in self.parts:
             _add_part(spec, part)
         self.model = spec.compile()
@@ -157,8 +128,6 @@ class Stage:
                 mujoco.mju_mat2Quat(data.mocap_quat[start], rotation.ravel())
                 start += 1
         mujoco.mj_kinematics(self.model, data)
-        mujoco.mj_comPos(self.model, data)
-        mujoco.mj_camlight(self.model, data)
         return data
 
 
@@ -172,32 +141,3 @@ def _add_part(spec: mujoco.MjSpec, part: Part) -> None:
     mesh = spec.add_mesh(name=name, uservert=vertices.ravel(), userface=faces.ravel())
     mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL  # the others want a closed surface
     body.add_geom(type=part.kind, meshname=name, rgba=part.color, contype=0, conaffinity=0)
-
-
-def _surroundings(camera: Camera, floor: float) -> mujoco.MjSpec:
-    """Return floor, lamp and sky for MuJoCo's renderer, with an off-screen buffer for large pictures."""
-    x, y, _ = camera.center
-    tall, lamp, way = camera.height, np.asarray(camera.center) + 4.0 * camera.height * TO_LAMP, -TO_LAMP
-    return mujoco.MjSpec.from_string(f"""<mujoco>
-    <statistic extent="1"/>  <!-- the lengths of map are multiples of it -->
-    <visual>
-      <global offwidth="2560" offheight="1440" fovy="{camera.view_angle}"/>
-      <headlight ambient="0.42 0.42 0.42" diffuse="0.28 0.28 0.28" specular="0 0 0"/>
-      <quality shadowsize="4096"/>
-      <map shadowclip="{4.0 * tall}" fogstart="{4.5 * tall}" fogend="{11.0 * tall}" znear="{0.1 * tall}"
-        zfar="{40.0 * tall}"/>
-      <rgba fog="1 1 1 1"/>
-    </visual>
-    <asset>
-      <texture name="tiles" type="2d" builtin="checker" rgb1="0.9 0.91 0.93" rgb2="0.96 0.965 0.975" width="512"
-        height="512"/>
-      <texture name="sky" type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1" width="64" height="384"/>
-      <material name="floor" texture="tiles" emission="0.1" specular="0" texrepeat="{2.5 / tall} {2.5 / tall}"
-        texuniform="true"/>
-    </asset>
-    <worldbody>
-      <geom type="plane" size="0 0 1" pos="{x} {y} {floor}" material="floor" group="{FLOOR_GROUP}"/>
-      <light type="directional" pos="{lamp[0]} {lamp[1]} {lamp[2]}" dir="{way[0]} {way[1]} {way[2]}"
-        diffuse="0.45 0.45 0.45" specular="0.2 0.2 0.2"/>
-    </worldbody>
-    </mujoco>""")

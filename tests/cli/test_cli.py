@@ -21,7 +21,6 @@ from osik_jax import cli
 from osik_jax._progress import spoken
 from osik_jax.cli._pose_file import read_pose_file
 from osik_jax.demo import _demo
-from osik_jax.viewer import _opengl
 
 ARM_FILE = str(MJCF / "three_joints.xml")
 
@@ -47,7 +46,7 @@ def test_help_names_commands_and_options(capsys):
     with pytest.raises(SystemExit):
         cli.main(["demo", "--help"])
     said = capsys.readouterr().out
-    for option in ("motion", "robot", "frame", "support", "duration", "frequency", "schemes", "out", "renderer"):
+    for option in ("motion", "robot", "frame", "support", "duration", "frequency", "schemes", "out"):
         assert f"--{option}" in said
     assert "--no-animation" in said
 
@@ -102,15 +101,6 @@ def test_options_that_make_no_sense_are_explained(capsys):
     line = refused(capsys, "demo", "--robot", ARM_FILE, "--motion", "single-support")
     assert "--motion single-support is NAO's" in line and "--frame" in line
     assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")
-
-
-def test_a_renderer_that_does_not_work_is_explained(capsys, monkeypatch):
-    def broken(*args, **kwargs):
-        raise mujoco.FatalError("no\nOpenGL context")
-
-    monkeypatch.setattr(_opengl, "_failures", [])
-    monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
-    assert "no OpenGL context; use auto or raycast" in refused(capsys, "demo", "--renderer", "mujoco")
 
 
 def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):

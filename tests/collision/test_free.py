@@ -18,7 +18,7 @@ from robot_support import pinocchio_geometry
 import osik_jax as osik
 from osik_jax.collision._robot_shapes import robot_shapes
 from osik_jax.core import _library
-from osik_jax.robot.loading._embedded import EXAMPLES
+from osik_jax.robot.loading._named import EXAMPLES
 
 pytestmark = pytest.mark.skipif(not _library.installed(), reason="no compiled core")
 UP = np.array([0.0, 0.0, 1.0])

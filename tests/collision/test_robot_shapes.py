@@ -11,7 +11,7 @@ from robot_support import beside_pinocchio, directions, table_support
 import osik_jax as osik
 from osik_jax.collision._robot_shapes import robot_shapes
 from osik_jax.collision._table import ShapeKind
-from osik_jax.robot.loading._embedded import EXAMPLES
+from osik_jax.robot.loading._named import EXAMPLES
 from osik_jax.robot.loading._srdf import read_srdf
 
 

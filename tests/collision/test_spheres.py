@@ -12,7 +12,7 @@ from osik_jax.collision._convex import ConvexShape, shape_table
 from osik_jax.collision._spheres import LEAST, MOST, covering_balls
 from osik_jax.collision._table import CoveringSpheres, ShapeKind
 from osik_jax.robot._size import robot_size
-from osik_jax.robot.loading._embedded import EXAMPLES
+from osik_jax.robot.loading._named import EXAMPLES
 
 NO_POINTS = np.zeros((0, 3))
 

@@ -18,7 +18,7 @@ from osik_jax.execution._lanes import first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _core, _cuda, _dispatch, _search, _solve
-from osik_jax.solvers.qp._candidate import Candidate
+from osik_jax.solvers.qp._core import Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._problem import QP, pack
 

@@ -14,12 +14,11 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.demo import _nao
-from osik_jax.demo._comparison import comparison
 from osik_jax.demo._demo import run_demo
-from osik_jax.demo._figures import Figure, figures, table
+from osik_jax.demo._figures import Figure, comparison, figures, table
 from osik_jax.demo._file import guess_moving_frame
+from osik_jax.demo._motion import Path, Stroke, minimum_jerk
 from osik_jax.demo._observed import observe
-from osik_jax.demo._references import Path, Stroke, minimum_jerk
 from osik_jax.demo._run import Run, make_scheme, run_scheme
 from osik_jax.robot._feet import guess_feet
 
@@ -31,7 +30,7 @@ FEET = ("l_sole", "r_sole")
 def short(tmp_path_factory):
     """A demonstration of half a second: its folder, table, motion and run."""
     folder, motion = tmp_path_factory.mktemp("demo"), _nao.double_support(0.5)
-    shown, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT, renderer="raycast")
+    shown, (run,) = run_demo(motion, folder, schemes=("weighted",), dt=DT)
     return folder, shown, motion, run
 
 

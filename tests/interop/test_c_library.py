@@ -21,7 +21,7 @@ from osik_jax.core import _build
 from osik_jax.core._library import core
 
 SOURCES = _build.FOLDER / "c"
-STORED = Path(__file__).parents[1] / "data" / "controller_2.json"
+STORED = Path(__file__).parents[1] / "data" / "controller_3.json"
 COMPILER = shutil.which(os.environ.get("CXX") or "c++")
 COUNT = 10_000
 pytestmark = [

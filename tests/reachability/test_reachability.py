@@ -10,8 +10,7 @@ import osik_jax as osik
 from osik_jax import cli, reachability
 from osik_jax.reachability import _reachability_map
 from osik_jax.reachability._frame import read_frame
-from osik_jax.reachability._grid import around
-from osik_jax.reachability._rotations import spread_rotations
+from osik_jax.reachability._grid import around, spread_rotations
 from osik_jax.viewer.live._open import is_map
 
 UPPER, FORE, HAND = 0.5, 0.4, 0.2

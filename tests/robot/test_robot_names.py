@@ -11,7 +11,7 @@ import osik_jax as osik
 from osik_jax.cli import CommandError, read_robot
 from osik_jax.cli._retarget import _robot_to_retarget
 from osik_jax.robot.loading import NAMES, example_urdf
-from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._session import RobotSource
 
 
 @pytest.mark.parametrize("name", NAMES)

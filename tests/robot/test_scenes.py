@@ -15,7 +15,7 @@ from osik_jax.physics import build_world
 from osik_jax.retargeting._body import Build
 from osik_jax.retargeting._profile_file import find_profile
 from osik_jax.robot._mujoco import mujoco_poses, own_masses, robot_com
-from osik_jax.viewer.live._default import default_session
+from osik_jax.viewer.live._open import default_session
 
 CUBE = '<body name="cube" pos="1 0 .1"><freejoint name="cube_free"/><geom type="box" size=".1 .1 .1" mass="5"/></body>'
 FEET = ("l_sole", "r_sole")

@@ -223,39 +223,6 @@ def test_other_files_and_classes_are_refused(tmp_path, arm):
         refuses(ValueError, "scheme is .*, which is no task, limit, scheme or gain of this", osik.load_controller, path)
 
 
-def version_2(module: str, cls: str, **fields: Any) -> dict[str, Any]:
-    """Return an object as the format before this one has it: with all its fields."""
-    common = {"made_for": "j", "weight": number(3.0), "gain": number(5.0), "priority": 2, "hard": False}
-    return {"class": f"osik_jax.{module}.{cls}", "fields": {**common, **fields}}
-
-
-def number(value: Any) -> dict[str, Any]:
-    return {"array": value, "shape": np.shape(value), "dtype": "float64", "of": "jax"}
-
-
-def test_a_file_of_the_older_format_is_read_or_refused_with_what_to_do(saved, arm, tmp_path):
-    joints = {"names": "joint_names", "of": ["joint2", "joint4"]}
-    fields = dict(target=number([0.3]), target_velocity=number([0.1]), lower=None, upper=None)
-    gear = version_2("tasks._moved", "JointCouplingTask", joints=joints, ratios=number([1.0, -2.0]), **fields)
-    capped = {"class": "osik_jax.limits._velocity.VelocityLimit", "fields": {"velocity": number([0.5] * 7)}}
-    scheme = {"class": "osik_jax.WeightedQP", "fields": {"damping": number(1e-5)}}  # the rest at its default
-    content = json.loads(saved) | {"format": "osik-jax controller 2", "scheme": scheme, "limits": [capped]}
-    content["tasks"] = [["gear", gear]]
-    (path := tmp_path / "c.json").write_text(edited(content))
-    found = osik.load_controller(path)
-    options: dict[str, Any] = dict(weight=3.0, gain=5.0, priority=2)
-    ratios = {"joint2": 1.0, "joint4": -2.0}
-    assert same(found.tasks["gear"], osik.JointCouplingTask(arm, ratios, target=0.3, target_velocity=0.1, **options))
-    assert same(found.limits[0], osik.VelocityLimit(arm, velocity={"*": 0.5})) and same(
-        found.scheme, osik.WeightedQP(1e-5)
-    )
-    content["tasks"] = [["index", version_2("tasks", "ManipulabilityTask", dofs={"sequence": "tuple", "items": [0]})]]
-    path.write_text(edited(content))
-    refuses(
-        ValueError, "ManipulabilityTask .* older version with dofs, .* make the controller", osik.load_controller, path
-    )
-
-
 def test_a_file_has_public_names_and_what_is_missing_in_it_is_the_default(saved, arm, tmp_path):
     content = json.loads(saved)
     kinds = [one["kind"] for one in (content["scheme"], *content["tasks"].values())]

@@ -3,8 +3,8 @@
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.reachability._grid import spread_rotations
 from osik_jax.reachability._map import ReachabilityMap
-from osik_jax.reachability._rotations import spread_rotations
 
 X, Y, Z = np.array([-0.6, -0.3, 0.2, 0.5, 0.65]), np.array([-0.4, 0.0, 0.3]), np.array([0.1, 0.4, 0.6, 1.0])
 ORIENTATIONS = 6

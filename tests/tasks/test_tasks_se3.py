@@ -25,7 +25,7 @@ from task_checks import (
 )
 
 import osik_jax as osik
-from osik_jax.tasks._twist import pose_log, seen_from
+from osik_jax.tasks._pose import pose_log, seen_from
 
 DT = 0.01
 

@@ -19,10 +19,10 @@ import osik_jax as osik
 from osik_jax.cli._retarget import Retarget
 from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer import export_html, serve, serve_reach
-from osik_jax.viewer.live._default import default_session
+from osik_jax.viewer.live._open import default_session
 from osik_jax.viewer.live._page import LiveView
 from osik_jax.viewer.live._reach import ReachView
-from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._session import RobotSource
 
 pytestmark = pytest.mark.slow
 ROBOT = osik.load_robot("nao")

@@ -21,11 +21,10 @@ from osik_jax.collision._geometry import Kind
 from osik_jax.robot._mujoco import model_bodies, mujoco_poses
 from osik_jax.viewer._parts import RobotParts, robot_parts
 from osik_jax.viewer.live._covers import link_covers
-from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._obstacles import MARGIN, _as_model
-from osik_jax.viewer.live._session import session_from_json
-from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._open import default_session
+from osik_jax.viewer.live._session import RobotSource, session_from_json
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")

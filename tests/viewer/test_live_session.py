@@ -20,11 +20,10 @@ from osik_jax.control import _checks
 from osik_jax.robot._hands import find_hands
 from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
-from osik_jax.viewer.live._default import default_session
 from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._open import default_session
 from osik_jax.viewer.live._python import python
-from osik_jax.viewer.live._session import Session
-from osik_jax.viewer.live._source import RobotSource
+from osik_jax.viewer.live._session import RobotSource, Session
 from osik_jax.viewer.live._step import Controller, compile_step
 
 ROBOT = osik.load_robot("nao")

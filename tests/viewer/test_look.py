@@ -176,7 +176,7 @@ def test_no_instant_is_cut_and_no_head_is_under_the_title(tmp_path):
     robot = osik.Robot.from_urdf(path, floating_base=False)
     q = np.linspace(-0.4, 0.4, 9)[:, None]
     picture = viewer.hero_picture(tmp_path / "h.png", robot, list(q[::4]), size=(320, 144))
-    film = viewer.animate(tmp_path / "f.gif", robot, q, dt=0.1, size=(240, 136), renderer="raycast", caption="a title")
+    film = viewer.animate(tmp_path / "f.gif", robot, q, dt=0.1, size=(240, 136), caption="a title")
     pictures = [np.asarray(Image.open(picture).convert("RGB"), float)]
     with Image.open(film) as frames:
         for k in range(getattr(frames, "n_frames", 1)):

@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-import types
 
 import jax
 import mujoco
@@ -17,14 +16,12 @@ from refusals import refuses
 import osik_jax as osik
 from osik_jax import viewer
 from osik_jax.robot import _mujoco
-from osik_jax.viewer import _animate, _opengl
-from osik_jax.viewer._opengl import check_opengl
+from osik_jax.viewer import _animate
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._stage import Camera, Stage
 from osik_jax.viewer.live._surfaces import part_triangles
 
-CAMERA = Camera((0.0, 0.0, 0.3), 2.0, 30.0, 10.0, 0.8)
 BALL = """<mujoco><worldbody><body name="ball" pos="0 0 0.5"><joint name="j" axis="0 0 1"/>
 <geom type="sphere" size="0.2" rgba="1 0 0 1"/></body></worldbody></mujoco>"""
 
@@ -147,14 +144,17 @@ def test_camera_is_mujocos_camera():
     nao = osik.load_robot("nao")  # whose model is changed here
     camera = Camera((0.1, -0.2, 0.3), 2.0, 35.0, 20.0, 0.8)
     scene = mujoco.MjvScene(nao.mj_model, maxgeom=10)
-    nao.mj_model.vis.global_.fovy = camera.view_angle
+    nao.mj_model.vis.global_.fovy = 2.0 * np.rad2deg(np.arctan2(0.5 * camera.height, camera.distance))
+    same = mujoco.MjvCamera()
+    same.type, same.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, camera.center
+    same.distance, same.azimuth, same.elevation = camera.distance, camera.azimuth + 180.0, -camera.elevation
     options = mujoco.MjvOption()
     mujoco.mjv_updateScene(
         nao.mj_model,
         mujoco_at(nao, nao.q0),
         options,
         mujoco.MjvPerturb(),
-        camera.for_mujoco(),
+        same,
         mujoco.mjtCatBit.mjCAT_STATIC,
         scene,
     )
@@ -177,7 +177,7 @@ def test_rays_and_projection_undo_each_other():
 def picture_of_a_ball(pixels, *floor):
     robot = osik.Robot.from_mjcf(BALL)
     camera = Camera((0.0, 0.0, 0.5), 20.0, 10.0, 0.0, 1.0)
-    stage = Stage([robot_parts(robot)], camera, floor=0.0)
+    stage = Stage([robot_parts(robot)])
     return RayCaster(stage, camera, (pixels, pixels), floor=0.0).image(stage.pose([mujoco_at(robot, robot.q0)]), *floor)
 
 
@@ -208,7 +208,6 @@ def test_gif_has_its_frames(tmp_path, nao):
         dt=0.02,
         frames_per_second=12.5,
         size=(240, 136),
-        renderer="raycast",
         support=support,
         trails=("l_gripper",),
         curves={"waist": 1e3 * q[:, 1]},
@@ -240,77 +239,7 @@ def test_what_ffmpeg_says_is_told(tmp_path, nao, monkeypatch):
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(OSError, match=r"ffmpeg could not write .*m\.mp4: no space left"):
-        viewer.animate(tmp_path / "m.mp4", nao, np.asarray(nao.q0)[None], dt=0.1, size=(64, 36), renderer="raycast")
-
-
-def test_without_opengl_rays_are_cast(nao, monkeypatch):
-    tries = []
-
-    def broken(*args, **kwargs):
-        tries.append(args)
-        raise mujoco.FatalError("no OpenGL context")
-
-    monkeypatch.setattr(_opengl, "_failures", [])
-    monkeypatch.setattr(_opengl.mujoco, "Renderer", broken)
-    camera, stage = CAMERA, Stage([robot_parts(nao)], CAMERA, floor=0.0)
-    assert isinstance(_opengl.make_renderer("auto", stage, camera, (32, 32), floor=0.0), RayCaster)
-    refuses(RuntimeError, "no OpenGL context", _opengl.make_renderer, "mujoco", stage, camera, (32, 32), floor=0.0)
-    refuses(RuntimeError, "no OpenGL context", check_opengl)
-    assert len(tries) == 1
-
-
-@pytest.mark.release
-def test_without_a_screen_asking_twice_is_safe():
-    """MuJoCo's own renderer aborts the process at its second failure."""
-    code = """
-from osik_jax.viewer._opengl import check_opengl
-for _ in range(2):
-    try:
-        check_opengl()
-    except RuntimeError as error:
-        print(error)
-"""
-    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
-    first, *rest = done.stdout.splitlines() or [""]
-    assert all(line == first for line in rest)
-
-
-def test_with_opengl_mujocos_renderer_draws(nao, monkeypatch):
-    """The same calls that MuJoCo's renderer gets, on one that answers without a screen."""
-
-    class Recorder:
-        segments = False
-
-        def __init__(self, model, height, width):
-            self.shape = (height, width)
-            self.scene = types.SimpleNamespace(flags=np.zeros(len(mujoco.mjtRndFlag.__members__), bool))
-
-        def update_scene(self, data, camera, scene_option):
-            assert camera.distance == 2.0 and scene_option.geomgroup.all()
-
-        def enable_segmentation_rendering(self):
-            self.segments = True
-
-        def disable_segmentation_rendering(self):
-            self.segments = False
-
-        def render(self):
-            if not self.segments:
-                return np.full((*self.shape, 3), 51, np.uint8)
-            ids = np.full((*self.shape, 2), -1, np.int32)
-            ids[2:] = 0  # the floor
-            ids[4:] = 7  # a part of the robot
-            return ids
-
-    monkeypatch.setattr(_opengl, "_failures", [])
-    monkeypatch.setattr(_opengl.mujoco, "Renderer", Recorder)
-    camera, stage = CAMERA, Stage([robot_parts(nao)], CAMERA, floor=0.0)
-    renderer = _opengl.make_renderer("auto", stage, camera, (6, 8), floor=0.0)
-    picture = renderer.image(stage.pose([mujoco_at(nao, nao.q0)]), np.tile(np.array([1.0, 0.0, 0.0, 0.5]), (8, 6, 1)))
-    np.testing.assert_allclose(picture[:4], np.broadcast_to([0.6, 0.1, 0.1], (4, 6, 3)), atol=1e-12)
-    np.testing.assert_allclose(picture[4:], 0.2, atol=1e-12)
+        viewer.animate(tmp_path / "m.mp4", nao, np.asarray(nao.q0)[None], dt=0.1, size=(64, 36))
 
 
 def test_hero_picture_shows_shapes_and_trails_where_they_are(tmp_path):

@@ -22,26 +22,15 @@ class Refused(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class JointNames:
-    """Joints of a robot under their ROS names.
+    """Joints of a robot under their ROS names."""
 
-    Attributes:
-        names: ROS names of the independent joints, in the order of v. (n,)
-        index: entry of q of each joint. (n,)
-        dofs: entry of v of each joint. (n,)
-        ignored: ROS names that are known and not used: joints that follow others, and locked ones.
-    """
-
-    names: tuple[str, ...]
-    index: np.ndarray
-    dofs: np.ndarray
-    ignored: frozenset[str]
+    names: tuple[str, ...]  # ROS names of the independent joints, in the order of v. (n,)
+    index: np.ndarray  # entry of q of each joint. (n,)
+    dofs: np.ndarray  # entry of v of each joint. (n,)
+    ignored: frozenset[str]  # ROS names that are known and not used: joints that follow others, and locked ones
 
     def read(self, message: Any) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-        """Return indices in ``names``, positions [rad or m], and the names that no joint has.
-
-        Raises:
-            Refused: a name that comes twice, a position without a name, or one that is not finite.
-        """
+        """Return indices in ``names``, positions [rad or m], and the names that no joint has."""
         if len(message.name) != len(message.position):
             raise Refused(f"a joint state has {len(message.name)} names and {len(message.position)} positions")
         if len(set(message.name)) != len(message.name):
@@ -57,12 +46,7 @@ class JointNames:
 
 
 def joint_names(robot: Robot, settings: Settings) -> JointNames:
-    """Return the joints of a robot, renamed as the settings say.
-
-    Raises:
-        KeyError: the settings name a joint that does not exist.
-        ValueError: a joint that is no hinge and no slide, which a JointState cannot hold.
-    """
+    """Return the joints of a robot, renamed as the settings say."""
     tree, ros = robot.tree, {model: name for name, model in settings.names.items()}
     for name in ros:
         if name not in tree.joint_names:
@@ -78,11 +62,7 @@ def joint_names(robot: Robot, settings: Settings) -> JointNames:
 
 
 def stamp_of(message: Any, received_ns: int, settings: Settings) -> int:
-    """Return the stamp of a message [ns], or its time of reception if stamps are not checked.
-
-    Raises:
-        Refused: the stamp is zero, or far from this machine's clock.
-    """
+    """Return the stamp of a message [ns], or its time of reception if stamps are not checked."""
     if not settings.check_stamps:
         return received_ns
     stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
@@ -96,11 +76,7 @@ def stamp_of(message: Any, received_ns: int, settings: Settings) -> int:
 
 
 def pose_of(message: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return position (3,) [m] and rotation matrix (3, 3) of a PoseStamped.
-
-    Raises:
-        Refused: numbers that are not finite, or no unit quaternion.
-    """
+    """Return position (3,) [m] and rotation matrix (3, 3) of a PoseStamped."""
     p, o = message.pose.position, message.pose.orientation
     position, quaternion = np.array([p.x, p.y, p.z], float), np.array([o.x, o.y, o.z, o.w], float)
     if not (np.isfinite(position).all() and np.isfinite(quaternion).all()):

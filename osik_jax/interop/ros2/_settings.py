@@ -143,11 +143,7 @@ def topic_of_frame(prefix: str, frame: str) -> str:
 
 
 def dds_name(topic: str) -> str:
-    """Return the DDS name of a topic of ROS 2: ``/joint_states`` is ``rt/joint_states``.
-
-    Raises:
-        ValueError: not an absolute ROS 2 name of letters, digits and underscores between slashes.
-    """
+    """Return the DDS name of a topic of ROS 2: ``/joint_states`` is ``rt/joint_states``."""
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic):
         raise OsikValueError(
             f"topic {topic!r} is no absolute name of ROS 2: a slash before each part, and letters, digits and "

@@ -35,21 +35,13 @@ _SUPPORT, _BALANCE, _POSITION, _ORIENTATION = 1e4, 1e3, 10.0, 0.1
 
 
 class Advance(NamedTuple):
-    """Answer of one step.
+    """Answer of one step."""
 
-    Attributes:
-        q: the next configuration. (nq,)
-        velocity: that leads there. (nv,)
-        warm_start: for the next step.
-        poses: of the frames, at the next configuration.
-        status: a ``Status`` code.
-    """
-
-    q: Array
-    velocity: Array
-    warm_start: Any
-    poses: dict[str, Pose]
-    status: Array
+    q: Array  # the next configuration. (nq,)
+    velocity: Array  # that leads there. (nv,)
+    warm_start: Any  # for the next step
+    poses: dict[str, Pose]  # of the frames, at the next configuration
+    status: Array  # a ``Status`` code
 
 
 class Steps:

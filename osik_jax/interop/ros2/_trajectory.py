@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 def joint_trajectory(motion: Motion) -> Any:
     """Return a motion as a ``trajectory_msgs/JointTrajectory``, a point for each sample, times from the first on.
 
-    Args:
-        motion: of ``osik_jax.motion``; its joints have names.
+    Its joints have names.
     """
     rows = zip(*(np.asarray(a).tolist() for a in (motion.position, motion.velocity, motion.acceleration)), strict=True)
     nanoseconds = np.rint(1e9 * np.asarray(motion.time - motion.time[0])).astype(np.int64)

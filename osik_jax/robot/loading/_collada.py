@@ -18,28 +18,18 @@ _Color = tuple[float, float, float, float]
 
 
 class Triangles(NamedTuple):
-    """Part of a mesh that has one colour.
+    """Part of a mesh that has one colour."""
 
-    Attributes:
-        vertices: [m]. (k, 3)
-        faces: counter-clockwise seen from outside. (m, 3)
-        color: red, green, blue, alpha; ``None`` where the file has none.
-        y_up: whether the file says that its y axis points up; its numbers are left as they are.
-    """
-
-    vertices: Float[np.ndarray, "k 3"]
-    faces: Int[np.ndarray, "m 3"]
-    color: _Color | None
-    y_up: bool = False
+    vertices: Float[np.ndarray, "k 3"]  # [m]
+    faces: Int[np.ndarray, "m 3"]  # counter-clockwise seen from outside
+    color: _Color | None  # red, green, blue, alpha; ``None`` where the file has none
+    y_up: bool = False  # whether the file says that its y axis points up; its numbers are left as they are
 
 
 def read_collada(path: Path) -> list[Triangles]:
     """Return the triangles and polygons of the scene in metres, in the file's axes; ``up_axis`` is ignored.
 
     Skins, splines and lines are left out; of a texture, the mean colour is taken.
-
-    Raises:
-        ValueError: the file is not COLLADA, or holds nothing to draw.
     """
     try:
         root = _without_namespaces(ElementTree.parse(path).getroot())

@@ -18,16 +18,11 @@ KINDS = {
 
 
 class Ends(NamedTuple):
-    """The two ends of a connect or weld.
+    """The two ends of a connect or weld."""
 
-    Attributes:
-        frames: names of the frames that they are fixed to.
-        anchors: points that meet, in these frames [m]. (2, 3)
-        relative: rotation of a weld, from the axes in which the second frame should be to the first frame's. (3, 3)
-    """
-
-    frames: tuple[str, str]
-    anchors: np.ndarray
+    frames: tuple[str, str]  # names of the frames that they are fixed to
+    anchors: np.ndarray  # points that meet, in these frames [m]. (2, 3)
+    # rotation of a weld, from the axes in which the second frame should be to the first frame's. (3, 3)
     relative: np.ndarray
 
 

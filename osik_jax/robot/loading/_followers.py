@@ -88,9 +88,6 @@ def equality_followers(model: mujoco.MjModel) -> tuple[list[Follower], dict[int,
     """Return the followers, linear in another joint, and the constant joints of the active joint equality constraints.
 
     Those of a higher degree are left out.
-
-    Raises:
-        ValueError: a joint is held at two values.
     """
     followers: list[Follower] = []
     constants: dict[int, np.ndarray] = {}
@@ -118,9 +115,6 @@ def resolve_followers(
     """Return the followers of independent joints, chains followed to their end, and the values of all locked joints.
 
     A follower whose leader is locked is locked where the leader puts it.
-
-    Raises:
-        ValueError: relations contradict each other, or a joint cannot be locked where it is asked to be.
     """
     table, constants = _independent(names, relations, constants)
     locked = {joint: lock.value for joint, lock in asked.items() if joint not in table} | dict(constants)

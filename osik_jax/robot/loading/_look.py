@@ -33,12 +33,7 @@ def read_look(urdf: Urdf, packages: Packages, beside: Path | None) -> Look:
 
     Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
     shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
-    whatever the package is called there.
-
-    Args:
-        urdf: links and joints.
-        packages: folders for ``package://`` addresses.
-        beside: path of the URDF; None if it was given as text.
+    whatever the package is called there. ``beside`` is the path of the URDF; None if it was given as text.
     """
     return _Reader(urdf, packages, beside).look()
 

@@ -20,11 +20,7 @@ SUFFIXES = (".dae", ".stl", ".obj", ".msh")
 
 
 def read_mesh(path: Path) -> list[Triangles]:
-    """Return the triangles of a mesh file, in the file's axes.
-
-    Raises:
-        ValueError: the file is of another kind, broken, or empty.
-    """
+    """Return the triangles of a mesh file, in the file's axes."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
@@ -51,12 +47,7 @@ def joined(parts: Sequence[Triangles]) -> tuple[Float[np.ndarray, "k 3"], Int[np
 
 
 def unread_points(mesh: UnreadMesh) -> Float[np.ndarray, "k 3"]:
-    """Return the vertices of a collision mesh [m], in the axes of its shape.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file cannot be read.
-    """
+    """Return the vertices of a collision mesh [m], in the axes of its shape."""
     beside = None if mesh.beside is None else Path(mesh.beside)
     path = Packages(mesh.folders).path(mesh.file, beside=beside)
     return joined(read_mesh(path))[0] * np.array(mesh.scale)

@@ -31,15 +31,10 @@ class Packages:
         self.folders = tuple(Path(folder) for folder in folders)
 
     def path(self, address: object, *, beside: Path | None = None) -> Path:
-        """Return the file of an address.
+        """Return the file of an address: ``package://NAME/...``, ``model://NAME/...``, ``file://...``, or a path.
 
-        Args:
-            address: ``package://NAME/...``, ``model://NAME/...``, ``file://...``, or a path.
-            beside: the file that names it: plain paths are relative to its folder, and any folder above it that is
-                called ``NAME`` is taken for the package, last of all.
-
-        Raises:
-            FileNotFoundError: there is no such file; the message lists where it was looked for.
+        Plain paths are relative to the folder of ``beside``, the file that names them. Any folder above it that is
+        called ``NAME`` is taken for the package, last of all.
         """
         text = str(address)
         spellings = dict.fromkeys([text, unquote(text), unquote(text).replace("\\", "/")])

@@ -23,17 +23,8 @@ def robot_trees(
     A tree is all that hangs from one body of the world, and is called by that body's number. Of the trees that move,
     the robot is the one with a joint that an actuator drives; if there is none, the one with a limited joint; if there
     is none, the only one with a joint that is not free. All that moves is one robot where none of this applies.
-
-    Args:
-        model: the model.
-        names: of its bodies.
-        locked: numbers of the joints that do not move.
-        root: names of bodies or sites whose trees are the robot; None: the model's custom text ``robot_roots``, or the
-            rule above.
-
-    Raises:
-        KeyError: no such body or site.
-        ValueError: nothing moves in the tree that ``root`` names.
+    ``root`` names bodies or sites whose trees are the robot; None: the model's custom text ``robot_roots``, or the
+    rule.
     """
     moving = np.setdiff1d(np.arange(model.njnt), list(locked)).astype(int)
     trees = _trees(model, moving)

@@ -22,27 +22,15 @@ def is_mjcf(path: str | os.PathLike[str]) -> bool:
 
 
 class Source(NamedTuple):
-    """XML before it is parsed.
+    """XML before it is parsed."""
 
-    Attributes:
-        label: what error messages call it: the file's path, or "the XML text".
-        content: the XML.
-        path: of the file, None where the text itself was given.
-    """
-
-    label: str
-    content: str | bytes
-    path: Path | None
+    label: str  # what error messages call it: the file's path, or "the XML text"
+    content: str | bytes  # the XML
+    path: Path | None  # of the file, None where the text itself was given
 
 
 def read_source(given: str | os.PathLike[str], kind: str) -> Source:
-    """Read a file, or take the text itself (anything that starts with ``<``).
-
-    Raises:
-        FileNotFoundError: no such file; the message lists the files of the same suffix that lie there.
-        TypeError: neither a path nor text.
-        ValueError: an empty text.
-    """
+    """Read a file, or take the text itself (anything that starts with ``<``)."""
     if not isinstance(given, str | os.PathLike):
         raise OsikTypeError(f"{given!r} is no {kind}: give a path, or the XML text itself")
     if not str(given).strip():
@@ -59,9 +47,6 @@ def parse_xml(source: Source) -> ElementTree.Element:
     """Return the root element of XML that may break three rules, as robot files often do.
 
     Comments may hold ``--``, an ``&`` may stand alone, and prefixes of names (``drake:``) may be undeclared.
-
-    Raises:
-        ValueError: the XML is broken; the message gives line and column.
     """
     try:
         return ElementTree.fromstring(_edited(source.content, _well_formed))

@@ -69,9 +69,6 @@ def srdf_beside(urdf: Path | None) -> Path:
     """Return the SRDF of a URDF file, in its folder or in ``srdf`` beside that; its name begins like the URDF's.
 
     ``ur5.srdf`` is that of ``ur5_robot.urdf``, and ``baxter_manipulation.srdf`` that of ``baxter.urdf``.
-
-    Raises:
-        FileNotFoundError: there is none, or several fit equally well; the message lists those that are there.
     """
     if urdf is None:
         raise FileNotFoundError("srdf=True needs a robot read from a URDF file; give the path of the SRDF, or its text")

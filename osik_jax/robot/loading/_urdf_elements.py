@@ -99,11 +99,7 @@ class Urdf:
 
 
 def read_urdf(element: ElementTree.Element) -> Urdf:
-    """Return links and joints of a ``<robot>`` element; everything else in it is ignored.
-
-    Raises:
-        ValueError: an element is broken, or the links do not form one tree; the message names it.
-    """
+    """Return links and joints of a ``<robot>`` element; everything else in it is ignored."""
     _refuse_xacro(element)
     notes: list[LoadNote] = []
     colors = {m.get("name", ""): color for m in element.findall("material") if (color := _rgba(m))}

@@ -25,18 +25,9 @@ def meshes_of(
 ) -> tuple[list[tuple[str, Shape, dict[str, Any]]], list[LoadNote]]:
     """Return the collision shapes that are meshes: link, shape and the arguments of ``MjSpec.add_mesh``.
 
-    Shapes with the same file and scale have the same arguments.
-
-    Args:
-        urdf: the robot.
-        packages: where files are looked for.
-        beside: the URDF's own file.
-        checked: try each mesh alone. A flat one is thickened, one that MuJoCo cannot read is left out, and the notes
-            say so. Without, all are returned as they are, which is quicker.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a file of a kind that cannot be read.
+    Shapes with the same file and scale have the same arguments. If ``checked``, each mesh is tried alone: a flat one is
+    thickened, one that MuJoCo cannot read is left out, and the notes say so. Without, all are returned as they are,
+    which is quicker.
     """
     known: dict[tuple[Path, tuple[float, ...]], tuple[dict[str, Any] | None, str]] = {}
     found, notes = [], []

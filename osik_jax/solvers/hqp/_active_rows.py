@@ -26,10 +26,7 @@ class ActiveRows(NamedTuple):
 def factor_active_rows(problem: LevelProblem, active: Int[Array, " h"], rank_tol: Array | float) -> ActiveRows:
     """Factor the active hard rows within the null space of the frozen rows.
 
-    Args:
-        problem: the level.
-        active: -1 at the lower bound, 1 at the upper, 0 inactive. (h,)
-        rank_tol: a unit row is dependent if less than this of its length lies outside the span of the others.
+    A unit row is dependent if less than ``rank_tol`` of its length lies outside the span of the others.
     """
     n = len(problem.x)
     is_active = active != 0
@@ -66,10 +63,7 @@ def restoring_step(
 def multipliers(problem: LevelProblem, rows: ActiveRows, downhill: Float[Array, " n"]) -> Float[Array, " h"]:
     """Return the multipliers whose combination of active rows is nearest to ``downhill`` in least squares.
 
-    Args:
-        problem: the level.
-        rows: factors of the active rows.
-        downhill: the negative gradient of the level's cost, projected onto what is not frozen. (n,)
+    ``downhill`` is the negative gradient of the level's cost, projected onto what is not frozen.
     """
     right = jnp.where(rows.valid, apply(rows.basis.T, downhill), 0.0)
     solved = jax.scipy.linalg.solve_triangular(rows.triangle, right) / jnp.where(rows.valid, rows.length, 1.0)

@@ -51,12 +51,7 @@ def solve_cascade(
 ) -> CascadeResult:
     """Solve all levels of a batch of hierarchies; arrays have a leading axis of problems, then of levels if any.
 
-    Args:
-        layout: sizes and row indices (static).
-        max_iterations: limit on the active-set iterations of one level (static).
-        hierarchy: the numbers.
-        tolerances: what counts as zero.
-        warm_start: working sets to try first, or None; all zeros in a problem for none.
+    ``max_iterations`` limits the active-set iterations of one level. A warm start of zeros in a problem is none.
     """
     everywhere = jnp.ones(hierarchy.hard.shape[0], bool)
     # all zeros stand for no warm start: an equality of a solution has a 2
@@ -122,12 +117,8 @@ def _solve_again_without_guesses(
     """Solve all levels; repeat without the warm start if it failed or led far beyond the answer.
 
     Tolerances and roundoff of a level are relative to the largest x on its way. So a guess with variables at 1e10
-    leaves 1e-6 of roundoff in rows that should hold exactly.
-
-    Args:
-        solve_levels: from the problems to solve and those with a usable warm start to the last state and the outcomes.
-        everywhere: True in all problems. (B,)
-        known: problems that have a warm start. (B,)
+    leaves 1e-6 of roundoff in rows that should hold exactly. ``solve_levels`` takes the problems to solve (all of them
+    ``everywhere``) and those with a usable warm start (``known``).
     """
 
     def is_running(p: _Passes) -> Bool[Array, ""]:
@@ -247,17 +238,7 @@ def _solve_level(
 def _solve_on_warm_start(
     problem: LevelProblem, usable: Bool[Array, " B"], tolerances: Tolerances, guess: WorkingSet | None
 ) -> WorkingSetSolution:
-    """Solve each level on the warm start's working set.
-
-    Args:
-        problem: the levels.
-        usable: problems with a warm start whose level is to be solved. (B,)
-        tolerances: what counts as zero.
-        guess: the warm start's working sets of this level, or None.
-
-    Returns:
-        The solutions; placeholders in problems without a usable warm start.
-    """
+    """Solve each level on the warm start's working set; problems without a usable one get placeholders."""
     nothing = jax.vmap(placeholder)(problem)
     if guess is None:
         return nothing

@@ -47,12 +47,8 @@ def answers(
 ) -> CascadeResult:
     """Return a kernel's uncertified answers in the form of the search's.
 
-    Args:
-        call: calls the kernel. It is given the shapes of the results, in the order of ``Answer`` in
-            ``core/hierarchy.hpp``, and the numbers and the integers of ``Problem``.
-        hierarchy: as for ``solve``, and so the following.
-        tolerances: of each problem.
-        warm_start: working sets to try first.
+    ``call`` is given the shapes of the results, in the order of ``Answer`` in ``core/hierarchy.hpp``, and the numbers
+    and the integers of ``Problem``.
     """
     batch, count, m, n = hierarchy.levels.matrix.shape
     h = hierarchy.hard.shape[1]

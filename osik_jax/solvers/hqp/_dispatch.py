@@ -37,10 +37,7 @@ def hierarchy_solver(
 ) -> Callable[[PaddedHierarchy, Tolerances, WorkingSet | None], CascadeResult]:
     """Return the function that solves all levels of one problem, in double precision.
 
-    Args:
-        layout: sizes and row indices.
-        max_iterations: limit on the active-set iterations of one level; None for 10 (n + rows of the longest level).
-        backend: whose candidates are taken.
+    ``max_iterations`` limits the active-set iterations of one level; None for 10 (n + rows of the longest level).
     """
     limit = 10 * (layout.variables + layout.rows) if max_iterations is None else max_iterations
     return in_lanes(in_double(partial(_solve_on_platform, layout, limit, backend)))
@@ -64,13 +61,7 @@ def _solve_on_platform(
 
 
 def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve) -> Candidates:
-    """Return the function that uses a kernel: certified candidates, and the search in blocks for other problems.
-
-    Args:
-        layout: sizes and row indices.
-        max_iterations: limit on the active-set iterations of one level.
-        solve: calls the kernel.
-    """
+    """Return the function that uses a kernel: certified candidates, and the search in blocks for other problems."""
 
     def certified(hierarchy: PaddedHierarchy, tolerances: Tolerances, warm_start: WorkingSet | None) -> CascadeResult:
         candidates = solve(layout, hierarchy, tolerances, warm_start, max_iterations)

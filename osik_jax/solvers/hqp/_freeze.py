@@ -60,14 +60,7 @@ class _Determined(NamedTuple):
 def freeze(
     state: CascadeState, problem: LevelProblem, end: PrimalState, tolerances: Tolerances
 ) -> tuple[CascadeState, LevelOutcome]:
-    """Freeze the rows that a level determines, and report the level.
-
-    Args:
-        state: what the levels above have fixed.
-        problem: the level.
-        end: its optimum.
-        tolerances: what counts as zero.
-    """
+    """Freeze the rows that a level determines at its optimum ``end``, and report the level."""
     found = _determined(problem, end, tolerances)
     frozen_count = jnp.sum(found.frozen, dtype=jnp.int32)
     same_cost = jnp.all(found.in_cost == end.in_cost)
@@ -165,14 +158,8 @@ def _row_space(
 ) -> tuple[Float[Array, "n k"], Int[Array, ""]]:
     """Return an orthonormal basis of the row space inside the projector's range, and its dimension.
 
-    Args:
-        rows: rows of unit length, or of the length 1 at most. (m, n)
-        projector: onto what is not frozen. (n, n)
-        known_rank: the dimension where it is known; where negative, it is the number of pivots above ``rank_tol``.
-        rank_tol: the rank tolerance.
-
-    Returns:
-        The basis, with columns of 0 beyond its dimension, and the dimension.
+    The rows have unit length at most. Where ``known_rank`` is negative, the dimension is the number of pivots above
+    ``rank_tol``. The basis has columns of 0 beyond its dimension.
     """
     basis, triangle, _ = jax.scipy.linalg.qr(product(rows, projector).T, mode="economic", pivoting=True)
     pivots = jnp.abs(jnp.diagonal(triangle))

@@ -37,11 +37,7 @@ def with_derivative(
 ) -> Float[Array, " n"]:
     """Return ``x`` unchanged, with the derivatives of the cascade at fixed active sets.
 
-    Args:
-        x: the answer. (n,)
-        active_sets: those of each level, with a leading axis.
-        hierarchy: what the derivatives are with respect to.
-        singular_tol: singular values up to this part of the longest row are 0, whatever the rank of the active sets.
+    Singular values up to ``singular_tol`` times the longest row are 0, whatever the rank of the active sets.
     """
     return _attach(jax.lax.stop_gradient(x), active_sets, singular_tol, hierarchy)
 
@@ -119,10 +115,8 @@ def _fit_rows(
     """Move x within the projector's range to bring the active rows nearest to their bounds.
 
     With C the active rows times the projector P and g what they miss, the motion is ``C^+ g``, with a pseudo-inverse of
-    the given rank at most. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``.
-
-    Returns:
-        The new x, and the projector without the row space of C.
+    the given rank at most. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``. Return the new x, and the
+    projector without the row space of C.
     """
     is_active = active != 0
     target = jnp.where(active < 0, _masked(lower, active < 0), _masked(upper, active > 0))

@@ -102,18 +102,10 @@ def pad_hierarchy(
     pinned: Bool[Array, " n"],
     damping: Damping,
 ) -> tuple[Layout, PaddedHierarchy]:
-    """Pad the levels of a hierarchy to the row count of the longest.
+    """Pad the levels of a hierarchy to the row count of the longest; return the static layout and the numbers.
 
-    Args:
-        levels: highest priority first, with their weights multiplied in.
-        is_equality: rows of each level that are equalities.
-        lower: lower bounds of the box. (n,)
-        upper: upper bounds of the box. (n,)
-        pinned: variables whose bounds are one number. (n,)
-        damping: fields with a leading axis of levels.
-
-    Returns:
-        The static layout and the numbers.
+    Levels are in the order of priority, with their weights multiplied in. Variables whose bounds are one number are
+    ``pinned``; the damping's fields have a leading axis of levels.
     """
     n, m = lower.shape[0], max(level.matrix.shape[0] for level in levels)
     # levels of equalities alone bound nothing below them: they are frozen, so they add no hard rows

@@ -45,16 +45,9 @@ class PrimalState(NamedTuple):
 def primal_active_set(
     problem: LevelProblem, start: PrimalState, tolerances: Tolerances, max_iterations: int
 ) -> PrimalState:
-    """Minimise the level's cost from a feasible start.
+    """Minimise the level's cost from a feasible start; return the last iterate, ``done`` where it is the optimum.
 
-    Args:
-        problem: the level.
-        start: feasible x, and active rows that are independent of each other and of the frozen ones.
-        tolerances: what counts as zero.
-        max_iterations: limit on the iterations (static).
-
-    Returns:
-        The last iterate; ``done`` where it is the optimum.
+    The active rows of the start are independent of each other and of the frozen ones.
     """
     level = problem.level
 

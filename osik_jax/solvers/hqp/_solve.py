@@ -113,14 +113,8 @@ def _solution(
 ) -> HQPSolution:
     """Return the answer with its status: x exactly inside its box, all numbers finite.
 
-    Args:
-        levels: as the caller gave them, with lower bounds not above upper ones.
-        result: of all levels, the last one that minimises |x|^2 too.
-        x: the result's x, with its derivative. (n,)
-        is_finite: whether the data can be computed with.
-        bounds_are_ordered: whether no lower bound of the data is above its upper bound.
-        lower: lower bounds of the box. (n,)
-        upper: upper bounds of the box. (n,)
+    x is the result's, with its derivative. ``is_finite`` says whether the data can be computed with,
+    ``bounds_are_ordered`` whether no lower bound of the data is above its upper bound.
     """
     # at an active bound x is that bound, to the last bit and with its derivative
     at_bound = jnp.where(result.active_bounds < 0, lower, jnp.where(result.active_bounds > 0, upper, x))

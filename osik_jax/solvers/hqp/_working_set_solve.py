@@ -35,12 +35,8 @@ def solve_on_working_set(
 ) -> WorkingSetSolution:
     """Minimise the level's cost with the working set kept, and check the optimality conditions.
 
-    Args:
-        problem: the level.
-        x: a point with the frozen rows at their values; directions that neither the working set nor the level
-            determines keep their component of it. (n,)
-        working_set: hard rows that are active, and own rows that are in the cost.
-        tolerances: what counts as zero.
+    At x the frozen rows have their values. Directions that neither the working set nor the level determines keep their
+    component of x.
     """
     level = problem.level
     rows = factor_active_rows(problem, working_set.hard, tolerances.rank)
@@ -93,19 +89,10 @@ def factor_least_squares(
 ) -> tuple[Callable[[Float[Array, " n"], Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:
     """Factor the least-squares problem of a level within the null space of frozen and active rows.
 
-    With P that null space's projector, C = A P the rows in the cost and ``C' = Q R`` by pivoted QR, the cost
-    ``1/2 |slack + A d|^2 + 1/2 damping |x + d|^2`` over ``d = Q y - P x`` is a least-squares problem of the size of R:
-    ``[R'; sqrt(damping) I] y = [C x - slack; 0]``. Without damping ``d = Q y`` with
-    ``R' y = -slack``: the step has no part in directions that change no row.
-
-    Args:
-        problem: the level.
-        in_cost: the rows A of the level that are in the cost. (m,)
-        active_rows: factors of the active rows.
-        tolerances: what counts as zero.
-
-    Returns:
-        The function from x and its slack to the minimising step d, and the rank of C.
+    With P that null space's projector, C = A P the rows in the cost and ``C' = Q R`` by pivoted QR, the cost ``1/2
+    |slack + A d|^2 + 1/2 damping |x + d|^2`` over ``d = Q y - P x`` is a least-squares problem of the size of R: ``[R';
+    sqrt(damping) I] y = [C x - slack; 0]``. Without damping ``d = Q y`` with ``R' y = -slack``: the step has no part in
+    directions that change no row. Return the function from x and its slack to the minimising step d, and the rank of C.
     """
     level, damping = problem.level, problem.damping
     rows = jnp.where(in_cost[:, None], product(level.matrix, active_rows.projector), 0.0)
@@ -141,14 +128,7 @@ def wrong_signs(
     """Return which active rows have a multiplier of the wrong sign (they pull x away from their bound).
 
     Forces multiplier * row length are compared with the multiplier tolerance of the gradient's norm, plus ``roundoff``.
-
-    Args:
-        problem: the level.
-        active: label of each hard row at the point.
-        multiplier: of each hard row, as ``multipliers`` has it.
-        gradient: of the level's cost there.
-        roundoff: of that gradient.
-        tolerances: what counts as zero.
+    ``roundoff`` is that of the gradient of the level's cost.
     """
     # a force is positive where it holds x back: at an upper bound (1) downhill points up, at a lower (-1) down
     force = multiplier * active * problem.length

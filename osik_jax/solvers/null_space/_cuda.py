@@ -65,13 +65,7 @@ extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
 
 
 def fits(n: int, rows: Sequence[int], method: str = "projection") -> bool:
-    """Return whether a GPU has room for a problem of n variables and levels of so many rows.
-
-    Args:
-        n: number of variables.
-        rows: number of rows of each level.
-        method: "projection" (the classical one) or "saturation".
-    """
+    """Return whether a GPU has room for a problem of n variables and levels of so many rows."""
     most = max(rows)
     return _cuda.installed() and min(n, most) <= _MAX_RANK and _cuda.space_of(method, n, most) <= _cuda.shared_bytes()
 

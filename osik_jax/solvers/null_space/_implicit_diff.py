@@ -53,14 +53,7 @@ Answer = tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, " L"]]
 
 
 def with_derivative(answer: Answer, sets: ActiveJoints, problem: Problem, backend: Backend = "jax") -> Answer:
-    """Return the answer unchanged, with the derivatives of the linear equations at its active sets.
-
-    Args:
-        answer: x, the projector and the scales.
-        sets: active sets of each level, with a leading axis.
-        problem: what the derivatives are with respect to.
-        backend: of the factors (static).
-    """
+    """Return the answer unchanged, with the derivatives of the linear equations at its active sets."""
     return _attach(jax.lax.stop_gradient(answer), sets, problem, backend=backend)
 
 

@@ -54,13 +54,8 @@ def pad_levels(
 ) -> Problem:
     """Return the padded problem; a secondary motion is one more level without rows.
 
-    Args:
-        levels: highest priority first, weights multiplied in.
-        lower: lower bounds of the box.
-        upper: upper bounds of the box.
-        secondary: what x comes as near to as levels and box allow, or None.
-        damping: of each level.
-        rank_tol: relative length under which a row counts as dependent.
+    Levels are in the order of priority, weights multiplied in. Rows of a relative length under ``rank_tol`` count as
+    dependent.
     """
     n, dtype = len(lower), lower.dtype
     targets = [jnp.zeros(n, dtype)] * len(levels)

@@ -40,12 +40,7 @@ def solve_forward(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Return the answer, and the projector onto the null space of all levels.
 
-    Args:
-        levels: highest priority first, weights multiplied in.
-        secondary: motion that is projected onto what all levels leave free.
-        damping: of each level.
-        rank_tol: relative length under which a row counts as dependent.
-        backend: of the factors (static).
+    The arguments are those of ``pad_levels``; the secondary motion is projected onto what all levels leave free.
     """
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
     curvature = jnp.zeros_like(x)
@@ -81,14 +76,9 @@ def level_motion(
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, ""]]:
     """Return the motion of one level from x, the projector for the next level, and the level's damping.
 
-    Args:
-        level: the level; rows inside their interval at x take no part.
-        x: what the levels above have reached.
-        projector: P_{k-1}, onto the null space of the levels above; the motion stays in it.
-        damping: the parts of the level's damping.
-        rank_tol: rows that stand out of the span of the others by less than this, relative to the norm of all that take
-            part, count as dependent.
-        backend: of the factors (static).
+    Rows inside their interval at x take no part. ``projector`` is P_{k-1}, onto the null space of the levels above; the
+    motion stays in it. Rows that stand out of the span of the others by less than ``rank_tol``, relative to the norm of
+    all that take part, count as dependent.
     """
     if not level.matrix.shape[0]:
         return jnp.zeros_like(x), projector, jnp.zeros_like(x[0])
@@ -113,14 +103,8 @@ def damped_step_length(
 
     Without bounds, the motion of a level is the damped optimum. Where bounds stop some joints, the others may need far
     larger motions for the same rows, which cost more than they gain; so only a part t of the step d is taken. Its cost,
-    ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2``, is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``.
-
-    Args:
-        level: the level, A the rows of it that take part at ``start``.
-        start: what the levels above have reached.
-        step: d, to where the bounds let the level go at most.
-        damping: of the level, in squared singular values.
-        rank_tol: as in ``level_motion``.
+    ``1/2 |t A d - error|^2 + 1/2 damping t^2 |d|^2``, is least at ``t = error'A d / (|A d|^2 + damping |d|^2)``. A are
+    the rows of the level that take part at ``start``; the damping is in squared singular values.
     """
     task = ActiveTask.at(level, start, rank_tol)
     change = apply(task.rows, step)

@@ -77,11 +77,8 @@ def _least_change(
 ) -> Float[Array, " n"]:
     """Return the motion of a level that changes the rows of lower levels least, the higher of these first.
 
-    Args:
-        change: the level's motion of least norm, to which a motion in ``free`` is added.
-        free: projector onto the null space of the level.
-        below: rows and damping of the levels below, the lowest first.
-        rank_tol: relative length under which a row counts as dependent.
+    A motion in ``free``, the projector onto the null space of the level, is added to ``change``, the level's motion of
+    least norm. ``below`` has rows and damping of the levels below, the lowest first.
     """
     is_projector = jnp.asarray(True)
     for rows, damping in reversed(below):

@@ -76,17 +76,8 @@ def solve_saturated(
     """Solve level after level, then approach the secondary motion within the remaining freedom.
 
     The levels are solved in double precision whatever the data are, because roundoff would decide which joints are at
-    their bounds. The derivative, at the active sets that were found, is in the precision of the data.
-
-    Args:
-        levels: highest priority first, weights multiplied in.
-        lower: lower bounds of the box.
-        upper: upper bounds of the box.
-        secondary: motion for what the levels leave free, or None.
-        damping: of each level.
-        rank_tol: relative length under which a row counts as dependent.
-        max_iterations: limit on the changes of the active set, for each level (static).
-        backend: whose kernels compute (static).
+    their bounds. The derivative, at the active sets that were found, is in the precision of the data. The arguments are
+    those of ``pad_levels``; ``max_iterations`` limits the changes of the active set in each level.
     """
     problem = pad_levels(levels, lower, upper, secondary, damping, rank_tol)
     solve = in_lanes(in_double(partial(_solve_on_platform, max_iterations, backend)))

@@ -44,15 +44,8 @@ def least_cost(
     """Return the answers at the scales of least damped cost, how each was found (a kind), and a fraction.
 
     ``WHOLE``: that scale is the largest. ``PART``: it is smaller. ``STRAIGHT``: it was not found, and the answer is the
-    fraction of the straight line to the largest scale. For other kinds the fraction is 1.
-
-    Args:
-        problem: the motions; every array has a leading axis of problems, as have the following.
-        end: the answers at the largest scale.
-        level: the levels, A the rows of each that take part at ``start``.
-        damping: damping of each level, in squared singular values.
-        rank_tol: as in ``level_motion``.
-        max_iterations: limit on the changes of the active set (static).
+    fraction of the straight line to the largest scale. For other kinds the fraction is 1. ``end`` has the answers at
+    the largest scale; every array has a leading axis of problems.
     """
     chord = jax.vmap(damped_step_length)(level, problem.start, end.x - problem.start, damping, rank_tol)
     wanted = end.done & (chord < 1.0) & (chord * end.scale > 0.0)
@@ -98,13 +91,7 @@ def best_scale(
 ) -> Float[Array, ""]:
     """Return the scale with the least damped cost for these joints at their bounds; 1 without any motion.
 
-    Args:
-        problem: the motion of the level.
-        level: the level.
-        damping: of the level.
-        rank_tol: as in ``level_motion``.
-        active: the saturated joints.
-        dual: their ``dual_basis``, where it is known.
+    ``dual`` is the saturated joints' ``dual_basis``, where it is known.
     """
     known = dual_basis(problem.projector, active) if dual is None else dual
     none = jnp.zeros((), problem.start.dtype)

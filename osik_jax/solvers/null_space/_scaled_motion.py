@@ -80,12 +80,7 @@ class SaturationResult(NamedTuple):
 
 
 def solve_scaled_motion(problem: ScaledMotion, max_iterations: int) -> SaturationResult:
-    """Return saturated joints, scale and answer of a batch; not ``done`` at the iteration limit.
-
-    Args:
-        problem: every array has a leading axis of problems.
-        max_iterations: limit on the iterations of the primal method (static).
-    """
+    """Return saturated joints, scale and answer of a batch; not ``done`` at the iteration limit."""
     unbounded = jax.vmap(_unbounded)(problem)
 
     def search() -> SaturationResult:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ...core import _library
 from ...execution._computed import side_by_side
-from ._candidate import Candidate, of_core
+from ...numerics._constants import INACTIVE, REDUNDANT
 from ._cost import LeastSquares
 from ._problem import QP, arrays
 
@@ -33,3 +35,25 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         *(matrix, packed, guess, tolerance, jnp.full(1, max_iterations, jnp.int32)),
     )
     return of_core(x, y, active, report)
+
+
+class Candidate(NamedTuple):
+    """Answers of a kernel for a batch."""
+
+    x: Float[Array, "B n"]
+    row_multipliers: Float[Array, "B p"]
+    active: Int[Array, "B n+p"]
+    converged: Int[Array, " B"]  # whether the kernel has nothing left to change; 2 on a GPU if it is certified
+    iterations: Int[Array, " B"]
+    factorizations: Int[Array, " B"]
+    redundant: Bool[Array, "B n+p"] | None = None  # constraints that the active ones imply; None for none
+    residual: Float[Array, " B"] | None = None  # ``kkt_residual``, of a GPU
+
+
+def of_core(
+    x: Float[Array, "B n"], row_multipliers: Float[Array, "B p"], active: Int[Array, "B n+p"], report: Int[Array, "B 3"]
+) -> Candidate:
+    """Return the core's candidates, whose labels may be REDUNDANT."""
+    redundant = active == REDUNDANT
+    active = jnp.where(redundant, INACTIVE, active)
+    return Candidate(x, row_multipliers, active, *(report[:, i] for i in range(3)), redundant=redundant)

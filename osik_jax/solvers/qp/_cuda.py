@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from ...core import _cuda, _library
 from ...numerics._constants import KKT_TOLERANCE
-from ._candidate import Candidate, of_core
+from ._core import Candidate, of_core
 from ._cost import LeastSquares
 from ._problem import QP
 

@@ -35,7 +35,7 @@ from ...numerics._constants import (
 from ...numerics._dense import apply
 from .._goldfarb_idnani import Roundoff
 from . import _core, _cuda
-from ._candidate import Candidate
+from ._core import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
 from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, multiplier_roundoff, unpack
@@ -54,10 +54,6 @@ def qp_solver(max_iterations: int, backend: Backend) -> Callable[[QP, AsGiven | 
     """Return the function that solves one problem, from its data, a guess of the active set and the tolerance.
 
     The data may be passed as they were given too: a GPU solves these, so that no copy of them has to be made.
-
-    Args:
-        max_iterations: limit on the changes of the active set.
-        backend: whose candidates are taken.
     """
     return in_lanes(partial(_solve_on_platform, max_iterations, backend))
 
@@ -81,11 +77,7 @@ def _solve_on_platform(
 
 
 def cuda_candidates(max_iterations: int) -> Candidates:
-    """Return the function that uses the core on a GPU in the data's precision, and the search for the rest.
-
-    Args:
-        max_iterations: limit on the changes of the active set.
-    """
+    """Return the function that uses the core on a GPU in the data's precision, and the search for the rest."""
 
     def certified(_: QP, as_given: AsGiven, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
         qp, is_valid = as_given
@@ -118,9 +110,7 @@ def cuda_candidates(max_iterations: int) -> Candidates:
 def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
     """Return the function that uses the core on a CPU in double precision, and the search for the rest.
 
-    Args:
-        kkt_tol: the largest residual that is certified.
-        max_iterations: limit on the changes of the active set.
+    Residuals up to ``kkt_tol`` are certified.
     """
 
     def certified(qp: QP, _: AsGiven | None, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:

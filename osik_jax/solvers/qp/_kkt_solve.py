@@ -34,13 +34,7 @@ class KKTFactor(NamedTuple):
 
 
 def factorize(qp: QP, hessian: Float[Array, "n n"], active: Int[Array, " n_and_p"]) -> KKTFactor:
-    """Factor the KKT system of one problem at an active set.
-
-    Args:
-        qp: the problem.
-        hessian: of its cost.
-        active: labels of the variables, then of the rows.
-    """
+    """Factor the KKT system of one problem at an active set: labels of the variables, then of the rows."""
     n, p = hessian.shape[0], qp.rows.shape[0]
     eps = float(jnp.finfo(hessian.dtype).eps)
     free, active_rows = active[:n] == INACTIVE, active[n:] != INACTIVE
@@ -88,11 +82,7 @@ def _refine(
 ) -> tuple[Float[Array, "B n"], Float[Array, "B p"]]:
     """Return x and y, refined until the last correction of each problem is small.
 
-    Args:
-        correction: from x and y of all problems to their corrections, by exact residuals.
-        x: minimisers to be refined.
-        y: row multipliers to be refined.
-        root: root of the curvature of each variable, which takes the units out of x.
+    ``correction`` uses exact residuals. ``root``, of the curvature of each variable, takes the units out of x.
     """
     limit = LAST_CORRECTION[x.dtype]
 

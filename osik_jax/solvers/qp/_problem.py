@@ -18,25 +18,16 @@ from ._cost import LeastSquares, Quadratic
 
 
 class QP(eqx.Module):
-    """Problem min cost(x) + 1/2 sum_i t_i^2 / compliance_i subject to lower <= [x; C x + t] <= upper.
+    """Problem min cost(x) + 1/2 sum_i t_i^2 / compliance_i subject to lower <= [x; C x + t] <= upper."""
 
-    Attributes:
-        cost: of x, strictly convex.
-        rows: C; p may be 0. (p, n)
-        compliance: of the rows; 0 for a hard row (t = 0), 1 / weight for a soft one. (p,)
-        lower: lower bounds of x, then of the rows; -inf allowed. (n + p,)
-        upper: upper bounds; inf allowed, equal to the lower for an equality. (n + p,)
-        known_equalities: constraints that are equalities to the lower bound, whatever the upper is (static); None for
-            none.
-        packed: all of the arrays above but the cost's matrix, one after another, where these are at hand as one. (k,)
-    """
-
-    cost: Quadratic | LeastSquares
-    rows: Float[Array, "p n"]
-    compliance: Float[Array, " p"]
-    lower: Float[Array, " n+p"]
-    upper: Float[Array, " n+p"]
+    cost: Quadratic | LeastSquares  # of x, strictly convex
+    rows: Float[Array, "p n"]  # C; p may be 0
+    compliance: Float[Array, " p"]  # of the rows; 0 for a hard row (t = 0), 1 / weight for a soft one
+    lower: Float[Array, " n+p"]  # lower bounds of x, then of the rows; -inf allowed
+    upper: Float[Array, " n+p"]  # upper bounds; inf allowed, equal to the lower for an equality
+    # constraints that are equalities to the lower bound, whatever the upper is (static); None for none
     known_equalities: tuple[bool, ...] | None = eqx.field(default=None, static=True)
+    # all of the arrays above but the cost's matrix, one after another, where these are at hand as one
     packed: Float[Array, " k"] | None = None
 
     @property
@@ -145,12 +136,6 @@ def constraint_scales(qp: QP, diagonal: Float[Array, " n"], x: Float[Array, " n"
     """Return scales independent of the variables' units: each variable is measured by the root of its curvature.
 
     Where the constraints hold all of x at 0, the Newton step of each variable alone takes the place of x.
-
-    Args:
-        qp: the problem.
-        diagonal: of the Hessian.
-        x: the point.
-        y: the multipliers of the rows.
     """
     root = jnp.sqrt(jnp.where(diagonal > 0.0, diagonal, 1.0))
     newton = jnp.abs(qp.cost.gradient(x)) / root**2
@@ -176,13 +161,8 @@ def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: I
     """Return the largest violation of the optimality conditions, without units (``QPSolution.kkt_residual``).
 
     The conditions are stationarity, ``grad cost(x) - C'y = multipliers of the box``; signs of the multipliers;
-    feasibility, and complementarity of the rows with a multiplier.
-
-    Args:
-        qp: the problem.
-        x: the point, inside its box.
-        y: multipliers of the rows; those of the box follow from the gradient.
-        active: labels of the box, then of the rows.
+    feasibility, and complementarity of the rows with a multiplier. x is inside its box; y are the multipliers of the
+    rows, and those of the box follow from the gradient.
     """
     n = len(x)
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)

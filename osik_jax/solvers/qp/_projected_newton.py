@@ -98,12 +98,8 @@ def projected_newton(
 ) -> NewtonResult:
     """Return the minimisers of a batch: every argument has a leading axis of problems.
 
-    Args:
-        qp: the problems.
-        start: where the descent begins, once clipped into the box.
-        iterations: changes of the active set so far.
-        feasibility_tol: violation of a hard row that counts as none, relative to its scale.
-        max_iterations: limit on the changes of the active set.
+    The start is clipped into the box. ``feasibility_tol`` is the violation of a hard row that counts as none, relative
+    to its scale; ``iterations`` are changes of the active set so far.
     """
     first = jax.vmap(_initial_state)(qp, start, iterations)
 
@@ -222,10 +218,8 @@ def _line_search(
 ) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
     """Return the step along Newton's direction with the lowest cost, by a projected line search.
 
-    The direction is clipped into the box at many lengths, or followed to the first bound.
-
-    Returns:
-        The step, whether it lowers the cost, whether it is the full Newton step, and whether that stays in the box.
+    The direction is clipped into the box at many lengths, or followed to the first bound. Return that step, whether it
+    lowers the cost, whether it is the full Newton step, and whether that stays in the box.
     """
     lower, upper = _box(qp)
     # the step length at which the first bound is met

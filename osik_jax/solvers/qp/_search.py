@@ -89,15 +89,8 @@ def search(
     """Solve a batch: every argument has a leading axis of problems.
 
     The search is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside
-    heavy rows is below the roundoff of single precision.
-
-    Args:
-        qp: the problems.
-        guess: labels of the active sets to try first.
-        tolerance: violation that counts as none, relative to the scale of the constraint.
-        max_iterations: limit on the changes of the active set (static).
-        by_pivots: whether the dual method goes on from a guess that is wrong; without it projected Newton does at once
-            (static). A kernel has tried the former by then, and it is much of what there is to compile.
+    heavy rows is below the roundoff of single precision. Without ``by_pivots`` projected Newton follows a wrong guess
+    at once, not the dual method: a kernel has tried the latter by then, and it is much of what there is to compile.
     """
     kkt_tol = KKT_TOLERANCE[qp.lower.dtype]
     rounds = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
@@ -306,12 +299,8 @@ def violated_conditions(
 ) -> Bool[Array, " m"]:
     """Return which constraints are violated, are inactive equalities, or have a multiplier of the wrong sign.
 
-    Args:
-        qp: the problem.
-        result: the iterate, of which the active set and the redundant equalities are looked at.
-        x: the minimiser on that active set.
-        y: multipliers of the rows there; those of the box follow from the gradient.
-        roundoff: which violations and multipliers are none.
+    x is the minimiser on the active set of ``result``, y the multipliers of the rows there; those of the box follow
+    from the gradient.
     """
     active = result.active
     gradient = qp.cost.gradient(x) - apply(qp.rows.T, y)

@@ -173,15 +173,7 @@ def _solve(
     tolerance: ArrayLike | None,
     backend: Backend,
 ) -> QPSolution:
-    """Solve and certify without derivatives.
-
-    Args:
-        qp: the problem as it was given.
-        guess: labels of the active set to try first, or None.
-        max_iterations: limit on the changes of the active set, or None.
-        tolerance: violation that counts as none, or None.
-        backend: whose candidates are taken.
-    """
+    """Solve and certify without derivatives."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
     tolerance = jnp.asarray(FEASIBILITY if tolerance is None else tolerance, dtype)
@@ -223,12 +215,6 @@ def _differentiable(
     """Return x and the row multipliers with their derivatives (0 if not finite), and whether they are finite.
 
     The derivative is that of the problem which x solves: with infeasible hard rows, the softened one.
-
-    Args:
-        safe: the problem, or a placeholder.
-        result: of the search.
-        is_valid: whether the numbers that were given are valid.
-        backend: whose kernels solve for the derivative.
     """
     compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)
     solved = replace(safe, packed=None, compliance=compliance)

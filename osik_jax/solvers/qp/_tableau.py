@@ -33,19 +33,9 @@ def find_active_set(
     iterations: Int[Array, " B"],
     max_iterations: int,
 ) -> DualState:
-    """Find the active sets of a batch by the dual method.
+    """Find the active sets of a batch by the dual method, from minimisers x and y on ``active`` and KKT factors there.
 
-    Args:
-        qp: the problems; every argument has a leading axis of problems.
-        hessian: of their costs.
-        factor: KKT factors at ``active``.
-        active: where the search begins.
-        roundoff: of the constraints' values and multipliers.
-        x: the minimisers on ``active``.
-        y: their row multipliers.
-        searching: problems to work on.
-        iterations: changes of the active set so far.
-        max_iterations: limit on the changes of the active set.
+    Every argument has a leading axis of problems; ``iterations`` has the changes of the active set so far.
     """
     tableau = _tableau(qp, hessian, factor)
     start, constraints = jax.vmap(_scaled_start)(qp, hessian, tableau, factor.free, active, roundoff, x, y)

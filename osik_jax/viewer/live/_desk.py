@@ -89,11 +89,7 @@ class Desk:
             self._put(name, self.task(name).replace(**numbers))
 
     def rank(self, name: str, priority: int) -> None:
-        """Set the priority of a task.
-
-        Raises:
-            ValueError: a task of a class of somebody's own.
-        """
+        """Set the priority of a task."""
         with self._lock:
             task, robot = self.task(name), self._session.robot
             if task.priority != priority:
@@ -145,11 +141,7 @@ class Desk:
             return self._seen[1]
 
     def add_obstacle(self, kind: str, position: Float[np.ndarray, "3"], size: float) -> str:
-        """Add a ball or box at a position [m] and return its name; the first one adds the limit for obstacles.
-
-        Raises:
-            ValueError: there are as many as there may be, or the robot has no links that move.
-        """
+        """Add a ball or box at a position [m] and return its name; the first one adds the limit for obstacles."""
         with self._lock:
             if not any(map(keeps_off_world, self._session.limits)):
                 self._put_limit(world_limit(self._session.robot, self._covers, size))
@@ -171,11 +163,7 @@ class Desk:
         self.move_obstacle(name, position=PARKED)
 
     def avoid_itself(self) -> None:
-        """Add the limit that avoids self-collision.
-
-        Raises:
-            ValueError: no two links of it are apart.
-        """
+        """Add the limit that avoids self-collision."""
         with self._lock:
             session = self._session
             self._put_limit(own_limit(session.robot, self._covers, session.q))
@@ -189,21 +177,13 @@ class Desk:
         self.edit(limits=(*self._session.limits, limit))
 
     def load(self, session: Session) -> None:
-        """Replace the session by another one of the same robot, at the current configuration.
-
-        Raises:
-            ValueError: a session of another robot.
-        """
+        """Replace the session by another one of the same robot, at the current configuration."""
         if session.robot.tree != self._session.robot.tree:
             raise OsikValueError("the session is of another robot: start osik view with it")
         self.edit(**{f.name: getattr(session, f.name) for f in dataclasses.fields(session) if f.name != "robot"})
 
     def task(self, name: str) -> Task:
-        """Return a task by name.
-
-        Raises:
-            KeyError: no such task.
-        """
+        """Return a task by name."""
         tasks = self.session.tasks
         if name not in tasks:
             raise unknown_name("task", name, tuple(tasks))

@@ -22,7 +22,6 @@ from ...robot import Robot
 from ...solvers import Status
 from ._compiler import Compiler
 from ._obstacles import moved
-from ._push import Push
 from ._snapshot import Recorder, Recording, Snapshot
 from ._step import Controller, Program, State, targets_here, with_targets
 from ._timing import CONTROL, Stopwatch, Timing, be_nice
@@ -35,6 +34,10 @@ _HALF_A_MICROSECOND = 5e-7
 """Offset [s] added to the switch interval, which Python truncates to whole microseconds."""
 _loops: set[int] = set()
 """Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
+_FADES = 0.15
+"""Time in which a push falls to 1/e [s]."""
+_OVER = 1e-4
+"""Push below which it ends [m/s or rad/s]."""
 
 
 class _Job(NamedTuple):
@@ -362,3 +365,30 @@ class ControlLoop:
         own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
         each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
         return jax.tree.map(lambda *rows: np.stack(rows), *each)
+
+
+class Push:
+    """Fading velocity added to that of the controller."""
+
+    def __init__(self, still: Float[np.ndarray, "*batch nv"], dt: float) -> None:
+        """Take velocities of 0 (nv,) and the period [s]."""
+        self._share, self._velocity = float(np.exp(-dt / _FADES)), still.copy()
+        self._none = jnp.asarray(still)
+
+    def start(self, velocity: Float[np.ndarray, "*batch nv"]) -> None:
+        """Start a push."""
+        self._velocity = np.asarray(velocity, float).copy()
+
+    def stop(self) -> None:
+        """End the push."""
+        self._velocity[:] = 0.0
+
+    def now(self) -> Float[Array, "*batch nv"]:
+        """Return the velocity of this step [m/s or rad/s], and reduce it for the next. (nv,)."""
+        if not self._velocity.any():
+            return self._none
+        pushed = jnp.asarray(self._velocity, self._none.dtype)
+        self._velocity *= self._share
+        if np.abs(self._velocity).max() < _OVER:
+            self.stop()
+        return pushed

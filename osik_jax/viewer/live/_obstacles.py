@@ -37,21 +37,13 @@ _ROWS = 12
 
 
 class Obstacle(NamedTuple):
-    """Draggable shape of the world.
+    """Draggable shape of the world."""
 
-    Attributes:
-        name: in its limit.
-        kind: ball or box.
-        position: of its middle [m]. (3,)
-        rotation: from its axes to the world's. (3, 3)
-        size: of a ball, the radius first; of a box, half its edges [m]. (3,)
-    """
-
-    name: str
-    kind: str
-    position: Float[np.ndarray, "3"]
-    rotation: Float[np.ndarray, "3 3"]
-    size: Float[np.ndarray, "3"]
+    name: str  # in its limit
+    kind: str  # ball or box
+    position: Float[np.ndarray, "3"]  # of its middle [m]
+    rotation: Float[np.ndarray, "3 3"]  # from its axes to the world's
+    size: Float[np.ndarray, "3"]  # of a ball, the radius first; of a box, half its edges [m]
 
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
@@ -124,11 +116,7 @@ def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."
 
 
 def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float) -> CollisionAvoidanceLimit:
-    """Return the limit between links and obstacles, with all obstacles out of use; ``size`` is the robot's [m].
-
-    Raises:
-        ValueError: no link moves.
-    """
+    """Return the limit between links and obstacles, with all obstacles out of use; ``size`` is the robot's [m]."""
     edge = 0.06 * size
     slots = {f"ball {number + 1}": CollisionShape.sphere(edge, PARKED) for number in range(SLOTS["ball"])}
     slots |= {f"box {number + 1}": CollisionShape.box((edge, edge, edge), PARKED) for number in range(SLOTS["box"])}
@@ -141,11 +129,7 @@ def world_limit(robot: Robot, covers: Mapping[str, CollisionShape], size: float)
 def own_limit(
     robot: Robot, covers: Mapping[str, CollisionShape], q: Float[np.ndarray, " nq"]
 ) -> CollisionAvoidanceLimit:
-    """Return the limit of self-collision, without pairs that are too near at q, such as links two joints apart.
-
-    Raises:
-        ValueError: no two links can meet.
-    """
+    """Return the limit of self-collision, without pairs that are too near at q, such as links two joints apart."""
     found = members(robot, covers)[len(robot.tree.geom_names) :]
     model, data = _as_model(robot, covers, q)
     kept = [

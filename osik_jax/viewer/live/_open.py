@@ -1,23 +1,44 @@
-"""Pages of ``osik view`` for a robot and for a map."""
+"""Pages of ``osik view`` for a robot, with its default tasks and stance, and for a map."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..._errors import OsikValueError, warn
 from ..._npz import open_npz
+from ...kinematics import forward_kinematics
 from ...reachability import load_map
 from ...robot import Robot
-from .._parts import robot_parts
-from ._default import default_session
+from ...robot._hands import find_hands
+from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
+from ...schemes import WeightedQP
+from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
+from ...tasks._background import angle_scale
+from .._crouch import crouched
+from .._outline import lowest_points
+from .._parts import RobotParts, robot_parts
 from ._page import LiveView, serve
 from ._reach import ReachView, check_map, serve_reach
-from ._source import RobotSource
-from ._stance import sole_polygon, standing
+from ._session import RobotSource, Session
+from ._surfaces import part_triangles
+
+# gain of the default tasks [1/s]
+_GAIN = 15.0
+WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
+"""Weights of the default tasks in the weighted scheme; the other schemes use priorities."""
+_SOLE = 0.006
+"""Height above a foot's lowest point up to which its points count as sole [m]."""
+# margin of the support polygon inside the soles' edge [m]
+_MARGIN = 0.01
+_CORNERS = 8
+"""Number of polygon corners for each sole; corners are points of the sole, so the polygon is never larger than the
+soles.
+"""
 
 
 def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:
@@ -50,3 +71,101 @@ def open_map(path: Path, robot: Robot, *, host: str, port: int) -> ReachView:
     except ValueError as error:
         raise OsikValueError(f"{path}: {error}; say which with --robot") from None
     return serve_reach(robot, found, host=host, port=port)
+
+
+def default_session(
+    robot: Robot,
+    *,
+    q: Float[Array, " nq"] | None = None,
+    feet: Sequence[str] = (),
+    polygon: SupportPolygon | None = None,
+    source: RobotSource | None = None,
+    dt: float = 0.005,
+) -> Session:
+    """Return the default session of a robot; waist and centre of mass are offered but switched off.
+
+    It starts at ``q`` (default: ``robot.q0``) with ``feet`` on the ground and its centre of mass over ``polygon``.
+    """
+    start = robot.q0 if q is None else q
+    poses = forward_kinematics(robot, start)
+    flat = "pose" if len(feet) <= 2 else "position"
+    tasks: dict[str, Task] = {
+        foot: FrameTask(robot, foot, target=pose, rows=flat, weight=WEIGHTS["foot"], orientation_weight=1.0)
+        for foot, pose in ((foot, poses.frame_pose(robot, foot)) for foot in feet)
+    }
+    if polygon is not None:
+        tasks["balance"] = ComTask(robot, polygon=polygon, weight=WEIGHTS["balance"], gain=_GAIN, priority=2)
+    for name in find_hands(robot):
+        pose = poses.frame_pose(robot, name)
+        rows = "position" if feet else "pose"
+        tasks[name] = FrameTask(robot, name, target=pose, rows=rows, weight=WEIGHTS["hand"], gain=_GAIN, priority=3)
+    led: Mapping[str, Task] = _led_later(robot, start) if robot.floating_base else {}
+    tasks |= led
+    tasks["posture"] = PostureTask(
+        robot, target=start, weight=WEIGHTS["posture"] * angle_scale(robot), gain=1.0, priority=4
+    )
+    return Session(
+        robot=robot,
+        tasks=tasks,
+        scheme=WeightedQP(),
+        limits=(),
+        dt=dt,
+        q=np.asarray(start),
+        off=frozenset(led),
+        source=source,
+    )
+
+
+def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
+    """Return the tasks offered (switched off) for a floating-base robot: waist pose and centre of mass."""
+    waist = robot.tree.body_names[robot.tree.root]
+    task = FrameTask(robot, waist, weight=WEIGHTS["waist"], gain=_GAIN, priority=3).at(robot, q)
+    com = ComTask(robot, weight=WEIGHTS["com"], gain=_GAIN, priority=3).at(robot, q)
+    return {waist: task, "centre of mass": com}
+
+
+def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:
+    """Return home with the waist slightly lowered over the feet and the robot on the ground. (nq,).
+
+    A robot that has a keyframe is where that says.
+    """
+    q = np.array(robot.q0)
+    if robot.mj_model.nkey:
+        return q
+    q = np.array(crouched(robot, feet)) if feet else q
+    data = next(mujoco_poses(robot, q))
+    q[robot.tree.qpos_address[robot.tree.free_bases[0]] + 2] -= lowest_points(shapes, data).min()
+    return q
+
+
+def sole_polygon(
+    robot: Robot, shapes: RobotParts, q: Float[np.ndarray, " nq"], feet: Sequence[str]
+) -> SupportPolygon | None:
+    """Return the support polygon of feet; without named corners, soles are the feet's lowest points.
+
+    None where they span no area.
+    """
+    named = [foot for foot in feet if f"{foot}_corner_0" in robot.frame_names]
+    data = next(mujoco_poses(robot, q))
+    corners = {foot: _sole(robot, shapes, data, foot) for foot in feet if foot not in named}
+    try:
+        return support_polygon(robot, jnp.asarray(q), tuple(feet), margin=_MARGIN, corners=corners)
+    except ValueError:  # points, a line, or feet too small for the margin
+        return None
+
+
+def _sole(robot: Robot, shapes: RobotParts, data: object, foot: str) -> Float[np.ndarray, "k 3"]:
+    """Return the lowest points of a foot, in its frame [m]."""
+    body = model_bodies(robot)[robot.tree.frame_bodies[robot.tree.frame(foot)]]
+    weld = shapes.model.body_weldid
+    position, rotation = mujoco_frame_pose(robot, data, foot)
+    clouds = [
+        part_triangles(part).vertices @ turn.T + place
+        for part, own, place, turn in zip(shapes.parts, shapes.bodies, *shapes.poses(data), strict=True)
+        if weld[own] == weld[body]
+    ]
+    points = np.concatenate(clouds) if clouds else position[None]
+    lowest = points[points[:, 2] < points[:, 2].min() + _SOLE]
+    angle = np.arange(_CORNERS) * 2.0 * np.pi / _CORNERS
+    outermost = np.argmax(lowest[:, :2] @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+    return (lowest[np.unique(outermost)] - position) @ rotation

@@ -1,4 +1,4 @@
-"""Page of a session: scene and panel, updated by a thread that only reads."""
+"""Page of a session: scene, marks of balance and panel, updated by a thread that only reads."""
 
 from __future__ import annotations
 
@@ -20,18 +20,20 @@ from ...tasks import ComTask, SupportPolygon, Task
 from .._outline import floor_height
 from .._parts import robot_parts
 from ._desk import Desk
-from ._gizmos import Gizmos, Pose, gizmo_target
-from ._marks import BalanceMarks
-from ._obstacle_nodes import ObstacleNodes
+from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
 from ._server import FRAME, WORDS, Driving
-from ._session import Session
-from ._source import RobotSource
+from ._session import RobotSource, Session
 from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
-    from viser import ClientHandle
+    from viser import ClientHandle, SceneApi
+_IN, _OUT, _EDGE = (42, 157, 98), (215, 38, 61), (28, 111, 184)
+_LIFT = 0.002
+"""Height of flat marks above the floor [m]."""
+_TOUCHING = 1e-3
+"""Distance beyond a polygon's edge up to which a point counts as inside [m]."""
 
 
 class LiveView(Driving):
@@ -201,3 +203,56 @@ def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:
     """Return the polygon of the first task that keeps the centre of mass inside one; None if there is none."""
     found = (task.polygon for task in tasks.values() if isinstance(task, ComTask) and task.polygon is not None)
     return next(found, None)
+
+
+class BalanceMarks:
+    """Support polygon, and the centre of mass as a ball with a disc on the floor; green inside, red outside."""
+
+    def __init__(self, scene: SceneApi, floor: float, size: float) -> None:
+        """Take the height of the floor and the size of the robot [m]."""
+        self._scene, self._floor, self._size = scene, floor, size
+        self._polygon: SupportPolygon | None = None
+        self._color: tuple[int, int, int] | None = None
+        self._at = np.full(3, np.inf)
+
+    def show_polygon(self, polygon: SupportPolygon | None) -> None:
+        """Draw the polygon; None removes it."""
+        self._polygon, self._color = polygon, None
+        self._scene.remove_by_name("/balance/area")
+        self._scene.remove_by_name("/balance/edge")
+        if polygon is None:
+            return
+        corners = np.c_[np.asarray(polygon.vertices), np.full(len(polygon.vertices), self._floor + _LIFT)]
+        fan = np.array([[0, k, k + 1] for k in range(1, len(corners) - 1)])
+        self._scene.add_mesh_simple(
+            "/balance/area", corners, fan, color=_EDGE, opacity=0.22, cast_shadow=False, side="double"
+        )
+        ring = np.stack([corners, np.roll(corners, -1, 0)], 1)
+        self._scene.add_line_segments("/balance/edge", ring, _EDGE, thickness=2.5, thickness_units="screen")
+
+    def place(self, com: Float[np.ndarray, "3"]) -> None:
+        """Move the centre of mass [m]."""
+        inside = self._polygon is None or float(self._polygon.distance(com[:2])) > -_TOUCHING
+        color = _IN if inside else _OUT
+        if color != self._color:
+            self._color = color
+            self._draw(com, color)
+        # smaller motions are invisible and need no message to the page
+        elif np.abs(com - self._at).max() > 1e-5:
+            self._ball.position = com
+            self._disc.position = (com[0], com[1], self._floor + 2.0 * _LIFT)
+        self._at = np.array(com)
+
+    def _draw(self, com: np.ndarray, color: tuple[int, int, int]) -> None:
+        radius = 0.016 * self._size
+        self._ball = self._scene.add_icosphere(
+            "/balance/com", radius=radius, color=color, opacity=0.75, cast_shadow=False, position=com
+        )
+        self._disc = self._scene.add_cylinder(
+            "/balance/below",
+            radius=radius,
+            height=_LIFT,
+            color=color,
+            cast_shadow=False,
+            position=(com[0], com[1], self._floor + 2.0 * _LIFT),
+        )

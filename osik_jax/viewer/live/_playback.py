@@ -61,10 +61,6 @@ def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
     Runs are arrays (T, nq) called ``q`` or ``q_NAME``; times are ``time_NAME`` or ``time``, one fewer where they are
     those of the steps; without any, there are 200 configurations a second. What ``osik retarget`` writes is ``qpos``
     with ``joint_names`` and ``fps``; its person is shown too.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: no motion, or one of another robot.
     """
     try:
         with open_npz(path) as file:

@@ -18,11 +18,7 @@ _COLLISIONS = "CollisionAvoidanceLimit"
 
 
 def python(part: Any, robot: Robot, where: str = "it") -> str:
-    """Return the expression that makes an object, without arguments that have their defaults.
-
-    Raises:
-        ValueError: an object that a file cannot hold (``encode``), or a convex hull, whose points are not kept.
-    """
+    """Return the expression that makes an object, without arguments that have their defaults."""
     data = encode(part, robot, where)
     short = _shortened(data) if data["kind"] == _COLLISIONS else data
     data = short if makes(short, robot, part) else data
@@ -66,11 +62,7 @@ def _made(data: Mapping[str, Any]) -> str:
 
 
 def _shape(name: str, data: Mapping[str, Any]) -> str:
-    """Return the expression that makes a shape, with its numbers rounded.
-
-    Raises:
-        ValueError: a convex hull.
-    """
+    """Return the expression that makes a shape, with its numbers rounded."""
     position, turn, size = (np.asarray(data[k]) for k in ("position", "rotation", "size"))
     kind, frame = data["shape"], f"frame={data['frame']!r}"
     if kind == "hull":

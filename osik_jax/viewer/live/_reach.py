@@ -31,19 +31,12 @@ _SOLID, _FAINT = 210, 90
 
 
 class Slice(NamedTuple):
-    """Slice as a picture in space; rows go along its second axis, columns along its first.
+    """Slice as a picture in space; rows go along its second axis, columns along its first."""
 
-    Attributes:
-        image: red, green, blue, alpha. (h, w, 4)
-        center: of the picture, world axes [m]. (3,)
-        size: along the first axis and the second [m]. (2,)
-        wxyz: from the picture's axes to world axes. (4,)
-    """
-
-    image: UInt8[np.ndarray, "h w 4"]
-    center: Float[np.ndarray, "3"]
-    size: tuple[float, float]
-    wxyz: Float[np.ndarray, "4"]
+    image: UInt8[np.ndarray, "h w 4"]  # red, green, blue, alpha
+    center: Float[np.ndarray, "3"]  # of the picture, world axes [m]
+    size: tuple[float, float]  # along the first axis and the second [m]. (2,)
+    wxyz: Float[np.ndarray, "4"]  # from the picture's axes to world axes
 
 
 class ReachView(Served):

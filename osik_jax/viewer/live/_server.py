@@ -131,11 +131,7 @@ def close_server(server: ViserServer) -> None:
 
 
 def check_port(host: str, port: int) -> int:
-    """Return the port, or a free one for 0; raise an error if it is in use.
-
-    Raises:
-        OSError: it is in use, or the address is none of this machine's.
-    """
+    """Return the port, or a free one for 0; raise an error if it is in use."""
     if not 0 <= port < 2**16:
         raise OSError(f"there is no port {port}: ports are 1 to 65535, 0 is any that is free")
     try:

@@ -1,4 +1,4 @@
-"""Session: a robot, its controller and its switched-off parts, as a file and as Python."""
+"""Session: a robot by its source, its controller and its switched-off parts, as a file and as Python."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from ..._errors import OsikValueError
 from ..._whole_file import write_text
 from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
+from ...robot._load_robot import is_file, read_robot
+from ...robot.loading import is_mjcf
 from ...saving._parts import decode_parts, encode_parts
 from ...schemes import Scheme
 from ...tasks import Task
 from ._python import python
-from ._source import RobotSource
 from ._step import Controller
 
 _FORMAT = "osik-jax session 1"
@@ -154,11 +155,7 @@ def load_session(path: str | os.PathLike[str]) -> Session:
 
 
 def session_from_json(text: str, where: str = "this") -> Session:
-    """Return the session of a ``Session.to_json`` text; ``where`` names its source in messages.
-
-    Raises:
-        ValueError: as in ``load_session``.
-    """
+    """Return the session of a ``Session.to_json`` text; ``where`` names its source in messages."""
     try:
         content = json.loads(text)
         known = isinstance(content, dict) and content.get("format") == _FORMAT
@@ -189,3 +186,22 @@ def _loose(limit: Limit) -> Limit | None:
     if type(limit) is VelocityLimit:
         return limit.replace(velocity=np.full(limit.velocity.shape, np.inf))
     return None
+
+
+@dataclasses.dataclass(frozen=True)
+class RobotSource:
+    """Robot given by name or file."""
+
+    robot: str  # a name that ``load_robot`` takes, or the path of a URDF or MJCF file
+    floating_base: bool | None = None  # as in ``Robot.from_urdf``; None: as the file says
+
+    def load(self) -> Robot:
+        """Return the robot."""
+        return read_robot(self.robot, floating_base=self.floating_base)
+
+    def python(self) -> str:
+        """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
+        base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
+        if not is_file(self.robot):
+            return f"osik.load_robot({self.robot!r}{base})"
+        return f"osik.Robot.{'from_mjcf' if is_mjcf(self.robot) else 'from_urdf'}({self.robot!r}{base})"

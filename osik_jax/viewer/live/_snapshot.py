@@ -49,15 +49,10 @@ class Snapshot:
 
 
 class Recording(NamedTuple):
-    """Recorded motion.
+    """Recorded motion."""
 
-    Attributes:
-        time: of each configuration [s]. (T,)
-        q: configurations. (T, nq), of a batch (T, B, nq)
-    """
-
-    time: Float[np.ndarray, " T"]
-    q: Float[np.ndarray, "T *batch nq"]
+    time: Float[np.ndarray, " T"]  # of each configuration [s]
+    q: Float[np.ndarray, "T *batch nq"]  # configurations. (T, nq), of a batch
 
     def to_npz(self, **runs: Float[np.ndarray, "T nq"]) -> bytes:
         """Return a file of configurations by name (``q_NAME``) at the recording's times, as ``osik demo`` writes it."""

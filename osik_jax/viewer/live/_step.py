@@ -79,15 +79,11 @@ def _aimed(task: Any, target: Any) -> Task:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Compiled control step.
+    """Compiled control step."""
 
-    Attributes:
-        run: from the controller's numbers, the state and a push (nv,) to the next state, status and task errors.
-        cold: the warm start of a first step.
-    """
-
+    # from the controller's numbers, the state and a push (nv,) to the next state, status and task errors
     run: Callable[[list[Array], State, Array], tuple[State, Array, dict[str, Array]]]
-    cold: Any
+    cold: Any  # the warm start of a first step
 
 
 def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
@@ -116,11 +112,7 @@ def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | N
 
 
 def stacked(controllers: Sequence[Controller]) -> Controller:
-    """Return one controller for a batch; each number has a leading axis.
-
-    Raises:
-        ValueError: they differ in more than numbers.
-    """
+    """Return one controller for a batch; each number has a leading axis."""
     first = controllers[0]
     if any(one.structure() != first.structure() for one in controllers):
         raise OsikValueError(

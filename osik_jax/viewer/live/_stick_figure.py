@@ -21,19 +21,12 @@ _THICK, _BALL = 0.012, 0.022
 
 
 class StickFigure(NamedTuple):
-    """Joints of a person over time.
+    """Joints of a person over time."""
 
-    Attributes:
-        points: positions [m]. (F, J, 3)
-        bones: pairs of joints.
-        standing: the points that may touch the floor. (4,) or ()
-        contact: whether each of these stands. (F, 4)
-    """
-
-    points: Float[np.ndarray, "F J 3"]
-    bones: tuple[tuple[int, int], ...]
-    standing: tuple[int, ...]
-    contact: Bool[np.ndarray, "F 4"]
+    points: Float[np.ndarray, "F J 3"]  # positions [m]
+    bones: tuple[tuple[int, int], ...]  # pairs of joints
+    standing: tuple[int, ...]  # the points that may touch the floor. (4,) or ()
+    contact: Bool[np.ndarray, "F 4"]  # whether each of these stands
 
     @classmethod
     def of(cls, arrays: Mapping[str, np.ndarray]) -> StickFigure | None:
@@ -47,12 +40,8 @@ class StickFigure(NamedTuple):
     def sized(self, like: Float[np.ndarray, "k 3"], path: Float[np.ndarray, "T 3"], floor: float) -> StickFigure:
         """Return the figure as large as a robot, standing on a floor.
 
-        The last point is the root. Its path is scaled with the figure, if it is not the robot's already.
-
-        Args:
-            like: points of the robot in its first frame [m].
-            path: path of the robot's base [m].
-            floor: height of the floor [m].
+        The last point is the root. Its path is scaled with the figure, if it is not the robot's already. ``like`` are
+        points of the robot in its first frame, ``path`` is that of its base, ``floor`` a height, all in metres.
         """
         size, own = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (like, self.points[0]))
         scale, root = size / max(own, 1e-9), self.points[:, -1:]

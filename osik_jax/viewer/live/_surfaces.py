@@ -25,15 +25,10 @@ _CELLS = (160, 120, 96, 80, 64, 48, 40, 32, 24, 16, 12, 8)
 
 
 class Surface(NamedTuple):
-    """Triangle surface.
+    """Triangle surface."""
 
-    Attributes:
-        vertices: [m]. (k, 3)
-        faces: indices of vertices, counter-clockwise seen from outside. (m, 3)
-    """
-
-    vertices: Float[np.ndarray, "k 3"]
-    faces: Int[np.ndarray, "m 3"]
+    vertices: Float[np.ndarray, "k 3"]  # [m]
+    faces: Int[np.ndarray, "m 3"]  # indices of vertices, counter-clockwise seen from outside
 
 
 def part_triangles(part: Part) -> Surface:

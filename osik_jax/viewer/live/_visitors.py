@@ -18,9 +18,6 @@ def guard(server: Any) -> None:
     """Refuse connections of pages of other sites, and drop bad messages with one line on stderr each.
 
     viser has no option for either. Its websocket server awaits these callbacks before it reads the first message.
-
-    Args:
-        server: a ``viser.ViserServer``.
     """
     sockets = server._websock_server
 
@@ -49,11 +46,9 @@ def server_url(server: Any) -> str:
 def is_own_page(origin: str | None, host: str, listens_at: str) -> bool:
     """Return whether a connection comes from the server's own page, or from a program that is no browser.
 
-    Args:
-        origin: header ``Origin`` of the request; browsers always send it.
-        host: header ``Host`` of the request: the address that was opened.
-        listens_at: the server's host. One that listens at this machine alone is opened by no other name, so that a
-            foreign name that resolves to this machine (DNS rebinding) is refused.
+    ``origin`` and ``host`` are headers of the request: browsers always send the first, the second is the address that
+    was opened. A server that listens at this machine alone is opened by no other name, so that a foreign name that
+    resolves to this machine (DNS rebinding) is refused.
     """
     if origin is None:
         return True
