@@ -17,7 +17,7 @@ from ..control._checks import checked_start
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..tasks._pose import RADIAN
 from ._joint_path import Free, PathSearch
 from ._motion import Motion, sample_times
@@ -135,9 +135,8 @@ def follow(
             poses in a row, or no continuous path through poses that are in reach one by one.
         OsikError: a scene without the compiled core, or not on a CPU.
     """
+    check_scalar_joints(robot, "following poses")
     read, free = read_poses(robot, poses), _checked_free(poses, free)
-    if robot.nq != robot.nv:
-        raise OsikValueError("poses are followed by hinges and slides alone: lock the other joints, or fix the base")
     limits, wanted = checked_limits(robot, velocity, acceleration, jerk), checked_speed(speed)
     along = lengths(read)
     start = None if q0 is None else checked_start(robot, q0)

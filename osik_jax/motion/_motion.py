@@ -18,7 +18,7 @@ from .._npz import open_npz
 from .._whole_file import whole_file, write_text
 from ..control import Trajectory
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 
 _KINDS = "position", "velocity", "acceleration"
 _LEROBOT = "observation.state", "action", "timestamp"
@@ -48,8 +48,7 @@ class Motion(eqx.Module):
         Raises:
             ValueError: the robot has joints that are no hinges or slides.
         """
-        if robot.nq != robot.nv:
-            raise OsikValueError("a motion has one number a joint: hinges and slides alone; lock the other joints")
+        check_scalar_joints(robot, "a motion")
         velocity, time = trajectory.solution.velocity, trajectory.time
         pulls = jnp.diff(velocity, axis=0) / jnp.diff(time)[:, None]
         acceleration = jnp.concatenate([pulls, jnp.zeros_like(velocity[:1])])
