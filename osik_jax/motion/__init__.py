@@ -13,5 +13,6 @@ from ._move import Move as Move
 from ._move import move as move
 from ._pose_filter import PoseFilter as PoseFilter
 from ._retime import retime as retime
+from ._stream import Stream as Stream
 from ._timing import SlowPart as SlowPart
 from ._timing import Timing as Timing
