@@ -202,32 +202,3 @@ def _pyarrow(part: str | None = None) -> Any:
         return importlib.import_module("pyarrow" if part is None else f"pyarrow.{part}")
     except ModuleNotFoundError as error:
         raise missing_extra("a .parquet file", "pyarrow", "motion") from error
-
-
-def draw_motion(motion: Motion, path: str | os.PathLike[str], limits: Float[np.ndarray, "3 n"] | None = None) -> None:
-    """Write a picture of the joints' speeds and accelerations, by their limits where these are finite.
-
-    Args:
-        motion: the motion.
-        path: file of the picture, such as ``motion.png``.
-        limits: of speed, acceleration and jerk, such as ``Timing.limits``. Default: none.
-    """
-    from matplotlib.figure import Figure
-
-    time = np.asarray(motion.time)
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-    rows: Any = figure.subplots(2, 1, sharex=True)
-    for axes, kind, row in zip(rows, _KINDS[1:], (0, 1), strict=True):
-        limit = np.full(motion.position.shape[1], np.inf) if limits is None else np.asarray(limits)[row]
-        known = np.isfinite(limit)
-        values = np.asarray(getattr(motion, kind)) / np.where(known, limit, 1.0)
-        for joint, name in enumerate(motion._names()):
-            axes.plot(time, values[:, joint], label=name, linestyle="-" if known[joint] else ":")
-        if known.any():
-            axes.axhline(1.0, color="black", linewidth=0.8)
-            axes.axhline(-1.0, color="black", linewidth=0.8)
-        axes.set_ylabel(f"{kind} / limit" if known.all() else kind)
-    rows[1].set_xlabel("time [s]")
-    rows[0].legend(fontsize="small", ncols=4)
-    with whole_file(path) as file:
-        figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=120)
