@@ -1,6 +1,6 @@
 """A raster on a cylinder by ``follow`` at wanted speeds of the tool, beside the largest speeds that a bisection finds.
 
-python -m benchmarks.raster [--speeds 0.05 0.1 0.3 1.0]
+python -m benchmarks.raster [--speeds 0.05 0.1 0.3 1.0] [--cells 1600]
 
 The judge is NumPy and MuJoCo's kinematics alone. By the length l of the tool's path, joints move with ``q' v``,
 ``q'' v^2 + q' a`` and ``q''' v^3 + 3 q'' v a + q' j`` for the tool's speed v, acceleration a and jerk j. From each
@@ -218,10 +218,10 @@ def judge(robot: osik.Robot, motion: Followed, wanted: float) -> str:
     )
 
 
-def follow_raster(speed: float) -> None:
+def follow_raster(speed: float, cells: int | None) -> None:
     """Print how well a Panda follows the raster at a wanted speed."""
     arm = osik.load_robot("arm7")
-    motion = follow(arm, {"hand": raster()}, speed=speed, **LIMITS)
+    motion = follow(arm, {"hand": raster()}, speed=speed, cells=cells, **LIMITS)
     times = np.arange(0.0, motion.duration, 1e-3)
     used = [float((np.abs(a) / limit).max()) for a, limit in zip(motion.at(times)[1:], LIMITS.values(), strict=True)]
     slow = sum(part.end - part.start for part in motion.slow_parts())
@@ -236,9 +236,11 @@ def main() -> None:
     """Follow the raster at each wanted speed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--speeds", type=float, nargs="*", default=[0.05, 0.1, 0.3, 1.0])
+    parser.add_argument("--cells", type=int)
     jax.config.update("jax_enable_x64", True)
-    for speed in parser.parse_args().speeds:
-        follow_raster(speed)
+    given = parser.parse_args()
+    for speed in given.speeds:
+        follow_raster(speed, given.cells)
 
 
 if __name__ == "__main__":

@@ -92,11 +92,17 @@ def _count(points: Array | np.ndarray) -> int:
 
 
 def retimed_pieces(
-    pieces: Float[np.ndarray, "k P n"], limits: Array, robot: Robot, wanted: Array | None, frame: str
+    pieces: Float[np.ndarray, "k P n"],
+    limits: Array,
+    robot: Robot,
+    wanted: Array | None,
+    frame: str,
+    cells: int | None = None,
 ) -> list[Timing]:
     """Return the timings of pieces of a path, from rest to rest each, in one call."""
     own = {"frame": None if wanted is None else frame, "smooth": bool(np.isfinite(np.asarray(limits[2])).any())}
-    run = partial(_retimed, limits=limits, robot=robot, wanted=wanted, count=_count(pieces[0]), uniform=True, **own)
+    own |= {"count": _count(pieces[0]) if cells is None else cells, "uniform": True}
+    run = partial(_retimed, limits=limits, robot=robot, wanted=wanted, **own)
     path, progress, stretch, duration = jax.vmap(lambda points: run(points))(jnp.asarray(pieces))  # pyright: ignore
     found = jax.tree.map(np.asarray, (duration, path, progress, stretch))
     joints = tuple(dof_names(robot))
