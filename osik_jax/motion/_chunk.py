@@ -24,7 +24,7 @@ from ..numerics._arguments import as_floats, check_count, concrete
 from ..numerics._dense import full_precision
 from ..numerics._guarded import positive_root
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..solvers import Status, solve_least_squares_qp
 from ._jerk import CUBIC
 from ._motion import Motion, at_rest_outside, sample_times
@@ -33,7 +33,7 @@ from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
 from ._start import State, checked_state, rounding
 
-_FEWEST = 16
+FEWEST = 16
 _HELD = 4
 """Times after the last waypoint, while the motion comes to rest, at which it is to be there."""
 _ROOM = 1.5
@@ -149,8 +149,7 @@ def chunk(
     Warns:
         OsikWarning: the start cannot be stopped within the limits.
     """
-    if robot.nq != robot.nv:
-        raise OsikValueError("a chunk is for hinges and slides alone: lock the other joints, or fix the base")
+    check_scalar_joints(robot, "a chunk")
     limits = checked_limits(robot, velocity, acceleration, jerk, least_time=False)
     begin = None if begin is None else as_floats(begin)
     time = _checked_times(as_floats(times), begin)
@@ -163,7 +162,7 @@ def chunk(
         raise OsikValueError(f"waypoint {int(np.argmin(np.isfinite(seen).all(axis=1)))} is not finite")
     if state is None:
         state = jnp.stack([points[0], *jnp.zeros((2, robot.nv), points.dtype)])
-    count = max(_FEWEST, len(time)) if cells is None else cells
+    count = max(FEWEST, len(time)) if cells is None else cells
     check_count("cells", count, least=8)
     bounds = jnp.stack([jnp.asarray(end, points.dtype) for end in joint_box(robot, None)])
     given = (

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision import Scene
@@ -19,9 +19,9 @@ from ..collision._robot_shapes import Given
 from ..numerics._arguments import check_count
 from ..numerics._host import is_traced
 from ..robot import Robot
-from ..robot._joint_selection import dof_names, dofs_of, select_all
+from ..robot._joint_selection import check_scalar_joints, dof_names, dofs_of, select_all
 from ._obstacles import Obstacles
-from ._retime import Limit, check_scalar_joints, retime
+from ._retime import Limit, retime
 from ._spline import Spline
 from ._timing import Timing
 
@@ -129,7 +129,7 @@ def connect(
     if is_traced((robot, q_from, q_to, scene, clearance)):
         raise OsikTypeError("connect makes paths of any length: call it outside jit, vmap and grad")
     obstacles = Obstacles.read(robot, scene, clearance, srdf, "connect")
-    check_scalar_joints(robot)
+    check_scalar_joints(robot, "a way")
     starts, goals, many = _read(robot, q_from, q_to)
     if scene.is_stack and not many:
         raise OsikValueError("a stack of scenes goes with as many starts: give q_from as (scenes, n)")
@@ -137,13 +137,15 @@ def connect(
     _check_held(robot, starts, goals, moving)
     check_count("states", states)
     check_length(obstacles.around, len(starts), "starts")
+    outside = [_outside(robot, start, own) for start, own in zip(starts, goals, strict=True)]
+    goals, numbers = _usable(robot, starts, goals, np.array([bool(text) for text in outside]))
     ranges = [*_ranges(robot, starts, goals, moving), np.array([_STEP])]
     given = obstacles.for_core(robot, moving, ranges, states, key)
     vertices, radii, labels = map(np.asarray, _ways(starts, goals, *given, longest=_LONGEST))
     names = obstacles.shapes.names, scene.names
     found = []
     for lane, (status, goal, count, tried, *pair) in enumerate(labels.tolist()):
-        problem = _outside(robot, starts[lane], goals[lane])
+        problem = outside[lane]
         if status != _FOUND and not problem:
             pair = shape_names(*names, np.array(pair), lane)
             problem = _REASONS[status].format(states=states) + (
@@ -152,7 +154,8 @@ def connect(
         corners = np.repeat(starts[lane][None], 0 if problem else count, axis=0)
         corners[:, moving] = vertices[lane, : len(corners)]
         path = _rounded(corners, radii[lane], robot) if len(corners) > 1 else None
-        found.append(Way(corners, path, goal, problem, tried, robot))
+        reached = goal if problem else int(numbers[lane, goal])
+        found.append(Way(corners, path, reached, problem, tried, robot))
     return found if many else found[0]
 
 
@@ -195,12 +198,29 @@ def _ranges(robot: Robot, starts: np.ndarray, goals: np.ndarray, moving: np.ndar
     return lower[moving], np.where(np.isfinite(upper), upper, ends.max(axis=0) + np.pi)[moving]
 
 
+def _beyond(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return by how much each joint (..., n) is outside of its range [rad or m], 0 or less inside."""
+    return np.maximum(np.asarray(robot.position_lower, float) - q, q - np.asarray(robot.position_upper, float))
+
+
+def _usable(
+    robot: Robot, starts: np.ndarray, goals: np.ndarray, is_refused: np.ndarray
+) -> tuple[Float[np.ndarray, "b g n"], Int[np.ndarray, "b g"]]:
+    """Return goals to search for, and the number of each: the first usable goal in place of ones out of range.
+
+    In lanes that are refused the goal is the start, so the search ends at once.
+    """
+    inside = (_beyond(robot, goals) <= _OUTSIDE).all(axis=-1)
+    numbers = np.where(inside, np.arange(goals.shape[1]), inside.argmax(axis=1)[:, None])
+    usable = np.take_along_axis(goals, numbers[..., None], axis=1)
+    return np.where(is_refused[:, None, None], starts[:, None], usable), numbers
+
+
 def _outside(robot: Robot, start: np.ndarray, goals: np.ndarray) -> str:
     """Return which joint of the start, or of all goals, is outside of its range; empty if none is."""
-    lower, upper = np.asarray(robot.position_lower, float), np.asarray(robot.position_upper, float)
 
     def text(q: np.ndarray, what: str) -> str:
-        beyond = np.maximum(lower - q, q - upper)
+        beyond = _beyond(robot, q)
         worst = int(beyond.argmax())
         if beyond[worst] <= _OUTSIDE:
             return ""

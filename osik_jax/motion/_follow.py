@@ -16,8 +16,9 @@ from ..collision._robot_shapes import Given
 from ..control._checks import checked_start
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
+from ..numerics._arguments import check_count
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..tasks._pose import RADIAN
 from ._joint_path import Free, PathSearch
 from ._motion import Motion, sample_times
@@ -101,6 +102,7 @@ def follow(
     scene: Scene | None = None,
     clearance: float = 0.0,
     srdf: Given = None,
+    cells: int | None = None,
 ) -> Followed:
     """Return a continuous, timed motion that leads frames along poses (outside jit).
 
@@ -124,6 +126,8 @@ def follow(
         scene: obstacles, and what the robot holds. The whole path is proven free, not only samples.
         clearance: with a scene, the distance that all pairs of shapes keep [m].
         srdf: with a scene, pairs that may touch, as for ``inverse_kinematics``.
+        cells: number of cells of the timing of each piece (static), as in ``retime``. With limits of jerk cells are
+            equal times; a slow, long piece needs more to reach the wanted speed as soon as joints allow.
 
     Returns:
         The motion: ``at(time)``, ``sample(dt)``, ``slow_parts()``.
@@ -135,10 +139,11 @@ def follow(
             poses in a row, or no continuous path through poses that are in reach one by one.
         OsikError: a scene without the compiled core, or not on a CPU.
     """
+    check_scalar_joints(robot, "following poses")
     read, free = read_poses(robot, poses), _checked_free(poses, free)
-    if robot.nq != robot.nv:
-        raise OsikValueError("poses are followed by hinges and slides alone: lock the other joints, or fix the base")
     limits, wanted = checked_limits(robot, velocity, acceleration, jerk), checked_speed(speed)
+    if cells is not None:
+        check_count("cells", cells, least=8)
     along = lengths(read)
     start = None if q0 is None else checked_start(robot, q0)
     lower, upper = (np.asarray(end) for end in joint_box(robot, None))
@@ -146,7 +151,7 @@ def follow(
     search = PathSearch(robot, free, lower, upper, start, key, obstacles)
     path, errors = _within_tolerance(search, read, along, (position_tolerance, orientation_tolerance))
     frame = next(iter(read))
-    timings = retimed_pieces(path, limits, robot, wanted, frame)
+    timings = retimed_pieces(path, limits, robot, wanted, frame, cells)
     if obstacles is not None:
         _check_clear(robot, obstacles, timings)
     starts = np.append(0.0, np.cumsum([float(one.duration) for one in timings]))

@@ -18,7 +18,7 @@ from .._npz import open_npz
 from .._whole_file import whole_file, write_text
 from ..control import Trajectory
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 
 _KINDS = "position", "velocity", "acceleration"
 _LEROBOT = "observation.state", "action", "timestamp"
@@ -48,8 +48,7 @@ class Motion(eqx.Module):
         Raises:
             ValueError: the robot has joints that are no hinges or slides.
         """
-        if robot.nq != robot.nv:
-            raise OsikValueError("a motion has one number a joint: hinges and slides alone; lock the other joints")
+        check_scalar_joints(robot, "a motion")
         velocity, time = trajectory.solution.velocity, trajectory.time
         pulls = jnp.diff(velocity, axis=0) / jnp.diff(time)[:, None]
         acceleration = jnp.concatenate([pulls, jnp.zeros_like(velocity[:1])])
@@ -203,32 +202,3 @@ def _pyarrow(part: str | None = None) -> Any:
         return importlib.import_module("pyarrow" if part is None else f"pyarrow.{part}")
     except ModuleNotFoundError as error:
         raise missing_extra("a .parquet file", "pyarrow", "motion") from error
-
-
-def draw_motion(motion: Motion, path: str | os.PathLike[str], limits: Float[np.ndarray, "3 n"] | None = None) -> None:
-    """Write a picture of the joints' speeds and accelerations, by their limits where these are finite.
-
-    Args:
-        motion: the motion.
-        path: file of the picture, such as ``motion.png``.
-        limits: of speed, acceleration and jerk, such as ``Timing.limits``. Default: none.
-    """
-    from matplotlib.figure import Figure
-
-    time = np.asarray(motion.time)
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
-    rows: Any = figure.subplots(2, 1, sharex=True)
-    for axes, kind, row in zip(rows, _KINDS[1:], (0, 1), strict=True):
-        limit = np.full(motion.position.shape[1], np.inf) if limits is None else np.asarray(limits)[row]
-        known = np.isfinite(limit)
-        values = np.asarray(getattr(motion, kind)) / np.where(known, limit, 1.0)
-        for joint, name in enumerate(motion._names()):
-            axes.plot(time, values[:, joint], label=name, linestyle="-" if known[joint] else ":")
-        if known.any():
-            axes.axhline(1.0, color="black", linewidth=0.8)
-            axes.axhline(-1.0, color="black", linewidth=0.8)
-        axes.set_ylabel(f"{kind} / limit" if known.all() else kind)
-    rows[1].set_xlabel("time [s]")
-    rows[0].legend(fontsize="small", ncols=4)
-    with whole_file(path) as file:
-        figure.savefig(file, format=Path(path).suffix[1:] or "png", dpi=120)

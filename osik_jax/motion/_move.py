@@ -14,7 +14,7 @@ from .._errors import OsikTypeError, OsikValueError, missing_extra
 from ..inverse._inverse_kinematics import joint_box
 from ..numerics._arguments import as_floats, concrete
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import check_scalar_joints, dof_names
 from ._motion import Motion, at_rest_outside, sample_times
 from ._retime import Limit, checked_limits
 from ._start import State, checked_state, rounding
@@ -98,8 +98,7 @@ def move(
             the end of their ranges.
         ModuleNotFoundError: the extra ``planning`` is missing.
     """
-    if robot.nq != robot.nv:
-        raise OsikValueError("a move is for hinges and slides alone: lock the other joints, or fix the base")
+    check_scalar_joints(robot, "a move")
     limits = checked_limits(robot, velocity, acceleration, jerk)
     rest = np.zeros(robot.nv)
     first = checked_state(robot, start if _is_state(start) else (start, rest, rest), limits)

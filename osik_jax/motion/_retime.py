@@ -17,7 +17,7 @@ from ..kinematics import forward_kinematics
 from ..numerics._arguments import as_floats, concrete
 from ..numerics._dense import full_precision
 from ..robot import Robot
-from ..robot._joint_selection import dof_names, dof_values
+from ..robot._joint_selection import check_scalar_joints, dof_names, dof_values
 from ._cells import Cells
 from ._jerk import PLACES, reference, rows_of, stretched
 from ._least_time import largest_square, least_time
@@ -92,11 +92,17 @@ def _count(points: Array | np.ndarray) -> int:
 
 
 def retimed_pieces(
-    pieces: Float[np.ndarray, "k P n"], limits: Array, robot: Robot, wanted: Array | None, frame: str
+    pieces: Float[np.ndarray, "k P n"],
+    limits: Array,
+    robot: Robot,
+    wanted: Array | None,
+    frame: str,
+    cells: int | None = None,
 ) -> list[Timing]:
     """Return the timings of pieces of a path, from rest to rest each, in one call."""
     own = {"frame": None if wanted is None else frame, "smooth": bool(np.isfinite(np.asarray(limits[2])).any())}
-    run = partial(_retimed, limits=limits, robot=robot, wanted=wanted, count=_count(pieces[0]), uniform=True, **own)
+    own |= {"count": _count(pieces[0]) if cells is None else cells, "uniform": True}
+    run = partial(_retimed, limits=limits, robot=robot, wanted=wanted, **own)
     path, progress, stretch, duration = jax.vmap(lambda points: run(points))(jnp.asarray(pieces))  # pyright: ignore
     found = jax.tree.map(np.asarray, (duration, path, progress, stretch))
     joints = tuple(dof_names(robot))
@@ -182,7 +188,7 @@ def _check_points(points: Array, robot: Robot | None) -> None:
     if points.ndim != 2 or len(points) < 2:
         raise OsikValueError(f"waypoints have shape {points.shape}; they are two or more configurations, (N, n)")
     if robot is not None:
-        check_scalar_joints(robot)
+        check_scalar_joints(robot, "a path")
         if robot.nq != points.shape[1]:
             raise OsikValueError(f"waypoints have {points.shape[1]} columns, and the robot {robot.nq} joints")
     seen = concrete(points)
@@ -196,15 +202,6 @@ def _check_points(points: Array, robot: Robot | None) -> None:
     if equal.any():
         first = int(equal.argmax())
         raise OsikValueError(f"waypoints {first} and {first + 1} are equal; a path has none twice in a row: remove one")
-
-
-def check_scalar_joints(robot: Robot) -> None:
-    """Raise ValueError unless all joints are hinges and slides."""
-    if robot.nq != robot.nv:
-        raise OsikValueError(
-            f"the robot has {robot.nq} configuration entries and {robot.nv} velocities; a path is one of hinges "
-            "and slides alone: lock the other joints (locked_joints=)"
-        )
 
 
 def _check_ranges(robot: Robot, points: np.ndarray) -> None:

@@ -102,7 +102,7 @@ def base_clearances(
 def shape_clearances(
     robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
 ) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, "n 2"]]:
-    """Return the distance of the nearest pair of shapes at each base [m], and its numbers; q is the same at all."""
+    """Return the distance of the nearest pair of shapes at each base [m], and its numbers; q is (n, nq) or (nq,)."""
     q = np.broadcast_to(q, (len(bases), robot.nq))
     near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
     return np.asarray(near.distance), np.asarray(near.pair)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, unknown_name
 from ..collision import Scene
 from ..collision._convex import ConvexShape, table_shapes
 from ..collision._robot_shapes import robot_shapes
@@ -19,6 +20,9 @@ from ..kinematics._rigid import compose_poses
 from ._bases import base_poses, grid_bases, shape_clearances
 from ._placement import Placement
 from ._score import Task, score_bases
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _STARTS = 8
 """Bases of the first robot from which the choice of all bases starts."""
@@ -35,6 +39,7 @@ class Team:
         q: of each robot, its configuration for each pose, while the others stand at their homes; NaN where there is
             none. Each (poses, nq)
         margin: smallest distance of a joint from its limits over its range, of these. (robots, poses)
+        members: the robots with their homes, poses and scenes.
     """
 
     names: tuple[str, ...]
@@ -42,6 +47,7 @@ class Team:
     robot: Int[np.ndarray, " poses"]
     q: tuple[np.ndarray, ...]
     margin: Float[np.ndarray, "robots poses"]
+    members: tuple[Member, ...]
 
     def __repr__(self) -> str:
         return f"Team, {self.explain()}"
@@ -50,6 +56,35 @@ class Team:
     def is_reached(self) -> Bool[np.ndarray, " poses"]:
         """Return whether a robot reaches each pose."""
         return self.robot >= 0
+
+    def distances(self, first: str, second: str) -> Float[np.ndarray, "poses poses"]:
+        """Return the distance of two robots [m] while the first works at one pose and the second at another one.
+
+        Row k is for pose k of the first robot, column l for pose l of the second; NaN where one of them does not reach
+        its pose. Where shapes overlap the distance is negative. It tells which poses can be worked at once:
+        ``team.distances("left", "right") >= 0.02``.
+
+        Raises:
+            KeyError: no such robot.
+        """
+        i, j = (self._number(name) for name in (first, second))
+        rows, columns = (np.flatnonzero(np.isfinite(self.q[k]).all(1)) for k in (i, j))
+        found, bases = np.full((len(self.robot),) * 2, np.nan), np.tile(self.bases[i], (len(rows), 1))
+        for column in columns if len(rows) else ():
+            other = self.members[j].shapes_at(self.bases[j], self.q[j][column])
+            found[rows, column] = self.members[i].distances(bases, other, self.q[i][rows])
+        return found
+
+    def _number(self, name: str) -> int:
+        if name not in self.names:
+            raise unknown_name("robot", name, self.names)
+        return self.names.index(name)
+
+    def figure(self) -> Figure:
+        """Return a matplotlib figure from above: the robots at home, the scene, and the poses that each takes."""
+        from ._picture import draw_team  # matplotlib, an extra
+
+        return draw_team(self)
 
     def explain(self) -> str:
         """Return where each robot stands, and how many poses it takes, in words."""
@@ -86,7 +121,7 @@ def place_robots(found: Mapping[str, Placement]) -> Team:
         raise OsikValueError(
             "a placement has no scene, so nothing collides: place each robot with scene=Scene() or more"
         )
-    members = [_Member.of(part) for part in parts]
+    members = [Member.of(part) for part in parts]
     if not all(len(member.bases) for member in members):
         raise OsikValueError("a placement reaches no pose from any base: its robot has no place among the others")
     chosen = [list(zip(members, _chosen(members, start), strict=True)) for start in members[0].starts(members[1])]
@@ -95,11 +130,11 @@ def place_robots(found: Mapping[str, Placement]) -> Team:
     scores = [score_bases(_among(members, numbers, k), bases[k : k + 1], every=True) for k in range(len(members))]
     margin = np.concatenate([score.margin for score in scores])
     robot = np.where(np.isfinite(margin).any(0), np.nan_to_num(margin, nan=-1.0).argmax(0), -1)
-    return Team(tuple(found), bases, robot, tuple(score.q[0] for score in scores), margin)
+    return Team(tuple(found), bases, robot, tuple(score.q[0] for score in scores), margin, tuple(members))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Member:
+class Member:
     """A robot that is placed among others.
 
     Attributes:
@@ -115,7 +150,7 @@ class _Member:
     reaches: np.ndarray
 
     @classmethod
-    def of(cls, found: Placement) -> _Member:
+    def of(cls, found: Placement) -> Member:
         """Return the robot of a placement."""
         reaches, grid = found.reaches.reshape(-1, len(found.q)), grid_bases((found.x, found.y, found.yaw, found.height))
         some = reaches.any(1)
@@ -126,30 +161,37 @@ class _Member:
         """Return the robot's shapes."""
         return robot_shapes(self.task.robot, self.task.settings["srdf"])
 
-    def starts(self, other: _Member) -> list[int]:
+    def starts(self, other: Member) -> list[int]:
         """Return the numbers of the bases that reach most poses together with any one base of another robot."""
         own, more = (member.reaches.astype(np.int32) for member in (self, other))
         together = own.sum(1)[:, None] + more.sum(1) - own @ more.T
         return np.argsort(-together.max(1), kind="stable")[:_STARTS].tolist()
 
-    def shapes_at(self, at: int) -> list[ConvexShape]:
-        """Return the robot's shapes at home on one of its bases, in world axes."""
-        shapes, placed = self.shapes, forward_kinematics(self.task.robot, self.home)
-        position, rotation = base_poses(self.bases[at : at + 1])
+    def shapes_at(self, base: np.ndarray, q: np.ndarray) -> list[ConvexShape]:
+        """Return the robot's shapes in a configuration (nq,) on a base (4,), in world axes."""
+        shapes, placed = self.shapes, forward_kinematics(self.task.robot, q)
+        position, rotation = base_poses(base[None])
         bodies = np.asarray(placed.body_position)[shapes.bodies], np.asarray(placed.body_rotation)[shapes.bodies]
         bodies = compose_poses((position, rotation), bodies)
         moved = zip(*compose_poses(bodies, (shapes.table.position, shapes.table.rotation)), strict=True)
         parts = zip(table_shapes(shapes.table), moved, strict=True)
         return [shape._replace(position=place, rotation=turn) for shape, (place, turn) in parts]
 
+    def home_at(self, at: int) -> list[ConvexShape]:
+        """Return the robot's shapes at home on one of its bases, in world axes."""
+        return self.shapes_at(self.bases[at], self.home)
+
+    def distances(self, bases: np.ndarray, others: Sequence[ConvexShape], q: np.ndarray) -> Float[np.ndarray, " n"]:
+        """Return the distance [m] to some shapes on bases (n, 4), in configurations (n, nq) or one (nq,)."""
+        alone = self.shapes._replace(pairs=np.zeros((0, 2), np.int32), world=np.ones(len(self.shapes.names), bool))
+        return shape_clearances(self.task.robot, bases, Scene({"others": others}), alone, q)[0]
+
     def clear_of(self, others: Sequence[ConvexShape]) -> np.ndarray:
         """Return whether the robot at home keeps the clearance to some shapes, at each of its bases."""
-        alone = self.shapes._replace(pairs=np.zeros((0, 2), np.int32), world=np.ones(len(self.shapes.names), bool))
-        gap = shape_clearances(self.task.robot, self.bases, Scene({"others": others}), alone, self.home)[0]
-        return gap >= self.task.settings["clearance"]
+        return self.distances(self.bases, others, self.home) >= self.task.settings["clearance"]
 
 
-def _chosen(members: Sequence[_Member], start: int) -> list[int]:
+def _chosen(members: Sequence[Member], start: int) -> list[int]:
     """Return the number of each robot's base, from one of the first robot.
 
     Raises:
@@ -161,7 +203,7 @@ def _chosen(members: Sequence[_Member], start: int) -> list[int]:
             (member, at) for j, (member, at) in enumerate(zip(members, chosen, strict=True)) if j != k and at >= 0
         ]
         gain = (members[k].reaches & ~_covered(others)).sum(1)
-        gain[~members[k].clear_of([shape for member, at in others for shape in member.shapes_at(at)])] = -1
+        gain[~members[k].clear_of([shape for member, at in others for shape in member.home_at(at)])] = -1
         if gain.max() < 0:
             raise OsikValueError(f"robot {k} stands nowhere clear of the others: give grids that are wider apart")
         if gain[chosen[k]] < gain.max() or chosen[k] < 0:
@@ -169,14 +211,14 @@ def _chosen(members: Sequence[_Member], start: int) -> list[int]:
     return chosen
 
 
-def _covered(stands: Sequence[tuple[_Member, int]]) -> np.ndarray:
+def _covered(stands: Sequence[tuple[Member, int]]) -> np.ndarray:
     """Return whether each pose is reached by a robot on its base."""
     return np.any([member.reaches[at] for member, at in stands], 0)
 
 
-def _among(members: Sequence[_Member], chosen: Sequence[int], k: int) -> Task:
+def _among(members: Sequence[Member], chosen: Sequence[int], k: int) -> Task:
     """Return the poses and the scene of a robot, with the others at home as obstacles."""
     task = members[k].task
     assert task.scene is not None
-    others = {f"robot {j}": members[j].shapes_at(at) for j, at in enumerate(chosen) if j != k}
+    others = {f"robot {j}": members[j].home_at(at) for j, at in enumerate(chosen) if j != k}
     return task._replace(scene=with_objects(task.scene, others))

@@ -59,6 +59,16 @@ def is_scalar(robot: Robot, joint: int) -> bool:
     return robot.tree.joint_types[joint] in (HINGE, SLIDE)
 
 
+def check_scalar_joints(robot: Robot, what: str) -> None:
+    """Raise ValueError if the robot has ball or free joints; ``what`` begins the message, such as "a move"."""
+    others = [robot.tree.joint_names[j] for j in robot.tree.independent if not is_scalar(robot, j)]
+    if others:
+        raise OsikValueError(
+            f"{what} is for hinges and slides alone, and the robot has other joints: {', '.join(others)}; lock them "
+            "(locked_joints=), or fix the base (floating_base=False)"
+        )
+
+
 def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Return which dofs are hinges or slides, and the index of each in q (0 for other dofs). (nv,) each."""
     mask, index = np.zeros(robot.nv, bool), np.zeros(robot.nv, int)

@@ -151,6 +151,16 @@ def test_starts_and_goals_that_are_wrong_are_named_and_harm_no_neighbour(crane):
     np.testing.assert_array_equal(ways[0].vertices, alone.vertices)
 
 
+def test_ends_out_of_range_are_refused_before_a_search_and_are_no_goals(crane):
+    """Without the wall, the goal out of range is the nearer one."""
+    beyond, fine = START + np.array([0.0, 0.0, 9.0]), GOAL + np.array([0.2, 0.1, 0.0])
+    way = connect(crane, START, [beyond, fine], Scene({}, capacity=2))
+    assert way.found and way.goal == 1 and np.array_equal(way.vertices[-1], fine)
+    for ends, name in (((beyond, GOAL), "q_from"), ((START, [beyond, beyond]), "q_to")):
+        way = connect(crane, *ends, wall())
+        assert not way.found and way.states < 10 and way.problem.startswith(f"{name}: joint drop is ")
+
+
 def test_scenes_of_many_starts_are_their_own(crane):
     scenes = Scene.stack([wall(), Scene({}, capacity=2)])
     first, second = connect(crane, np.stack([START] * 2), np.stack([GOAL] * 2), scenes)
@@ -198,4 +208,4 @@ def test_it_is_for_plain_calls_and_joints_with_one_number(crane):
     scene = wall()
     refuses(TypeError, "outside jit", jax.jit(lambda q: connect(crane, q, GOAL, scene)), jnp.asarray(START))
     nao = osik.load_robot("nao")
-    refuses(ValueError, "lock the other joints", connect, nao, nao.q0, nao.q0, Scene({}))
+    refuses(ValueError, "other joints: floating_base; lock them", connect, nao, nao.q0, nao.q0, Scene({}))

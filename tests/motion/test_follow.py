@@ -88,6 +88,21 @@ def test_the_wanted_speed_is_kept_on_rows(followed) -> None:
     assert slow and all(part.limit in ("speed", "acceleration", "jerk") for part in slow)
 
 
+@pytest.mark.slow
+def test_more_cells_reach_a_low_speed_sooner() -> None:
+    """A row of 4 s, where joints need 12 ms; the ends are what is slow."""
+    slow = {}
+    for cells in (400, 1600):
+        found = follow(ARM, {"hand": raster(1, 8)}, speed=0.05, cells=cells, **LIMITS)
+        time = np.arange(0.0, found.duration, 1e-3)
+        q, *rates = found.at(time)
+        for seen, kind in zip(rates, LIMITS.values(), strict=True):
+            assert (np.abs(seen) <= 1.0001 * kind).all()
+        speed = np.linalg.norm(np.diff(placed(q)[0], axis=0), axis=1) / 1e-3
+        slow[cells] = 1e-3 * (speed < 0.99 * 0.05).sum()
+    assert slow[1600] < 0.6 * slow[400] and slow[1600] < 0.04
+
+
 def test_a_tool_may_spin_about_a_free_axis() -> None:
     poses = raster(2, 8)
     fast = follow(ARM, {"hand": poses}, free={"hand": "z"}, velocity=LIMITS["velocity"], acceleration=5.0)
@@ -105,7 +120,9 @@ def test_a_command_follows_a_file(tmp_path, capsys) -> None:
     rows = np.column_stack([POSES[0], quaternion])
     np.savetxt(tmp_path / "path.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
     given = ["follow", str(tmp_path / "path.csv"), "--robot", "arm7", "--frame", "hand", "--dt", "0.01"]
-    assert cli.main([*given, "--out", str(tmp_path / "motion.npz")]) == 0
+    pictures = ["--film", str(tmp_path / "m.gif"), "--picture", str(tmp_path / "m.png")]
+    assert cli.main([*given, "--out", str(tmp_path / "motion.npz"), *pictures]) == 0
+    assert (tmp_path / "m.gif").stat().st_size > 1000 and (tmp_path / "m.png").stat().st_size > 1000
     assert "off the path" in capsys.readouterr().out
     place, _ = placed(np.asarray(load_motion(tmp_path / "motion.npz").position))
     np.testing.assert_allclose(place[[0, -1]], POSES[0][[0, -1]], atol=1e-4)
@@ -133,6 +150,7 @@ def test_a_command_follows_a_file(tmp_path, capsys) -> None:
         ({"hnd": POSES}, {}, "did you mean 'hand'"),
         ({"hand": POSES}, {"free": {"hand": "w"}}, "axis"),
         ({"hand": POSES}, {"speed": 0.0}, "speed is"),
+        ({"hand": POSES}, {"cells": 3}, "cells is 3"),
         ({"hand": POSES}, {"jerk": 0.0}, "limits of jerk are positive"),
     ],
 )
