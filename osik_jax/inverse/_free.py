@@ -123,6 +123,7 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
+    assert results.gaps is not None
     names = _pair_fields(np.asarray(results.gaps.pair), obstacles.shapes, obstacles.scene)
     return with_fields(results.answer, **names, obstruction=results.reason)
 
@@ -200,6 +201,7 @@ def _traced(
     results = _in_one_call(how, dofs, joints)(fixed, there, counts, jnp.int32(steps), around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
     own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
+    assert found.gaps is not None
     gap = differentiable(robot, obstacles.shapes, own.q, obstacles.scene, found.gaps)
     is_free = own.converged & (gap >= around.clearance[0])
     return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)

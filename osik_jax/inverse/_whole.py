@@ -215,7 +215,7 @@ def by_core(
         given = goals, most[:, None], *shared, jnp.append(options, members), lists, *more
         return call_here(method, outputs, *given, sizes=sizes, members=members)
 
-    lanes = goals, most, *(() if around is None else around.scene)
+    lanes = goals, most, *(() if around is None else map(jnp.asarray, around.scene))
     return in_stages(call, *lanes) if cuda_is_default() else call(1, *lanes)
 
 
