@@ -106,11 +106,12 @@ ROBOTS = {
     "looking": (lambda: osik.load_robot("nao"), looking),
     "closing": (lambda: quietly(osik.Robot.from_mjcf, LOOP), closing),
 }
-FAST = {"looking-weighted", "closing-hierarchy"}
-CASES = [f"{case}-{scheme}" for case in ROBOTS for scheme in SCHEMES]
+ORDINARY = {"looking-weighted", "closing-hierarchy"}
+IN_THE_GATE = {"classes-weighted", "classes-hierarchy", "looking-saturated", "closing-null-space"}
+AT_NIGHT = {f"{case}-{scheme}" for case in ROBOTS for scheme in SCHEMES} - ORDINARY - IN_THE_GATE
 
 
-@pytest.mark.variants(slow=[case for case in CASES if case not in FAST])
+@pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("case", ROBOTS)
 def test_the_step_with_rows_of_jax_is_that_of_plain_jax(case, scheme):
@@ -152,7 +153,8 @@ def spoiled(a: Array, number: Array) -> Array:
 
 
 @pytest.mark.variants(
-    slow=[f"{flag}-{scheme}" for flag in (False, True) for scheme in SCHEMES if (flag, scheme) != (True, "hierarchy")]
+    slow=["False-weighted", "True-null-space"],
+    release=["True-weighted", "False-hierarchy", "False-null-space", "False-saturated", "True-saturated"],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("bounded", [False, True])
@@ -167,7 +169,7 @@ def test_rows_that_are_not_finite_fail_as_in_plain_jax_in_their_lane_alone(bound
     assert_alike(eqx.tree_at(lambda lanes: lanes[2]["bad"].added, lanes, jnp.array(cases)), scheme)
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["weighted"], release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(scheme):
     robot = osik.load_robot("arm7")
