@@ -64,12 +64,19 @@ collect_ignore = list(NOT_INSTALLED)
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Marks single variants of a test as slow or for releases: ``@pytest.mark.variants(slow=[...], release=[...])``."""
+    named, found = set(), set()
     for item in items:
+        test, variant = item.nodeid.removesuffix("]").partition("[")[::2]
         for tier, ids in ((t, i) for m in item.iter_markers("variants") for t, i in m.kwargs.items()):
-            if item.name.partition("[")[2].removesuffix("]") in ids:
+            named |= {(test, name) for name in ids}
+            if variant in ids:
                 item.add_marker(tier)
+                found.add((test, variant))
+    if named > found and not any("::" in argument for argument in config.args):  # there only some are collected
+        raise pytest.UsageError(f"no test has these variants: {sorted(named - found)}")
+    gc.freeze()  # what was imported stays: looking for garbage among it again and again is some percent of the time
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -90,7 +90,7 @@ def test_rows_are_those_of_the_nearest_pairs(arm, scene, limit):
     assert apart.sum() > 80 and (near < 0.0).any() and (near > 0.3).any()
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["exact"], release=["side"])
 @pytest.mark.parametrize(
     ("post", "h", "atol"), [("capsule", 1e-6, 2e-4), ("cylinder", 1e-4, 0.05)], ids=["exact", "side"]
 )
@@ -137,6 +137,7 @@ def _steps_of(arm, limit, tasks, scheme):
     return steps
 
 
+@pytest.mark.slow
 def test_the_step_in_one_call_is_that_of_plain_jax(arm, limit, tasks):
     """Velocities and statuses, also where rows contradict each other or the box: as little violation as possible."""
     rng = np.random.default_rng(5)

@@ -106,9 +106,8 @@ ROBOTS = {
     "looking": (lambda: osik.load_robot("nao"), looking),
     "closing": (lambda: quietly(osik.Robot.from_mjcf, LOOP), closing),
 }
-ORDINARY = {"looking-weighted", "closing-hierarchy"}
-IN_THE_GATE = {"classes-weighted", "classes-hierarchy", "looking-saturated", "closing-null-space"}
-AT_NIGHT = {f"{case}-{scheme}" for case in ROBOTS for scheme in SCHEMES} - ORDINARY - IN_THE_GATE
+IN_THE_GATE = {"classes-weighted", "classes-hierarchy", "looking-weighted", "closing-null-space"}
+AT_NIGHT = {f"{case}-{scheme}" for case in ROBOTS for scheme in SCHEMES} - IN_THE_GATE - {"closing-hierarchy"}
 
 
 @pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
@@ -153,7 +152,7 @@ def spoiled(a: Array, number: Array) -> Array:
 
 
 @pytest.mark.variants(
-    slow=["False-weighted", "True-null-space"],
+    slow=["False-weighted", "True-hierarchy", "True-null-space"],
     release=["True-weighted", "False-hierarchy", "False-null-space", "False-saturated", "True-saturated"],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
