@@ -93,7 +93,7 @@ def test_without_the_core_a_warning_says_what_to_do():
     assert ran.stderr.count("OsikWarning") == 1 and "install a C++ compiler" in ran.stderr
 
 
-@pytest.mark.variants(slow=["clang++"])
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["g++", "clang++"])
 def test_each_compiler_takes_all_of_the_core_without_a_warning(name):
     texts = [*_build.FOLDER.glob("*.cpp"), *_build.FOLDER.glob("c/*.cpp")]

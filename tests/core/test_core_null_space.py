@@ -247,7 +247,7 @@ def test_memory_that_was_used_before_says_nothing(method, in_used_memory):
     jax.tree.map(np.testing.assert_array_equal, *found)
 
 
-@pytest.mark.variants(release=["float64"])
+@pytest.mark.variants(slow=["float32"], release=["float64"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkeypatch, precision):
     """There both are branches of one program, and with JAX's default precision what is computed in double is a part."""

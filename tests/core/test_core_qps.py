@@ -162,6 +162,7 @@ def test_problems_before_say_nothing():
         jax.tree.map(np.testing.assert_array_equal, first, after)
 
 
+@pytest.mark.slow
 def test_derivatives_against_central_differences():
     """Along one direction of all data, forward and reverse."""
     p = problems(seed=6, weakest=1e-1)

@@ -138,6 +138,7 @@ def test_nearest_is_the_nearest_of_the_closed_form(planar):
         np.testing.assert_allclose(found.q, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 def test_nearest_finds_what_the_plain_call_finds(rng):
     """From a configuration outside of its limits, where searches near home stay; by numbers and while tracing."""
@@ -204,6 +205,7 @@ def test_a_start_that_is_right_is_kept(arm, rng):
     assert found.seed == 0
 
 
+@pytest.mark.slow
 def test_pure_form_is_differentiable_and_batched(arm, rng):
     """Against central differences of the same search from its own solution, and MuJoCo's Jacobian."""
     _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
