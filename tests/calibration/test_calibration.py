@@ -130,6 +130,7 @@ def test_errors_are_as_large_as_sigma_says(name: str):
     assert inside > 0.99 and deviation == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_outliers_cost_little(ur5: osik.Robot):
     """20 % of the readings are off by 100 times the noise; with least squares the errors are 20 times as large."""
     q, truth = RNG(4).uniform(-2.0, 2.0, (60, 40, 6)), np.array([0.01, -0.02, 0.03])
@@ -177,6 +178,7 @@ def test_the_same_optimum_as_scipy(name: str):
     assert studies.beside_scipy(studies.STUDIES[name])[0] < 1e-3  # of a deviation
 
 
+@pytest.mark.slow
 def test_next_poses_tell_more_than_random_ones(ur5: osik.Robot):
     unknowns = [cal.Unknown("joint_offset", ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint"))]
     drawn = RNG(8).uniform(-2.0, 2.0, (200, 6))

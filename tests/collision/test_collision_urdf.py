@@ -239,7 +239,7 @@ def test_a_large_hull_is_covered_by_a_smaller_one():
     assert (ours >= theirs).all() and (ours - theirs).max() < 0.004
 
 
-@pytest.mark.variants(release=["0.1", "0.16"])
+@pytest.mark.variants(slow=["0.25"], release=["0.1", "0.16"])
 @pytest.mark.parametrize("apart", [0.25, 0.16, 0.1])
 def test_distances_of_large_hulls_are_those_of_coal(apart):
     """Apart, just apart and overlapping; the hulls are replaced by smaller ones that cover them."""
@@ -273,7 +273,7 @@ ROBOTS = {
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.variants(release=["tiago", "talos", "g1", "solo", "panda"])
+@pytest.mark.variants(slow=["ur5"], release=["tiago", "talos", "g1", "solo", "panda"])
 def test_the_default_call_works_on_known_robots(name):
     """With shapes of all links that have some; distances at home are MuJoCo's, or up to 4 mm less."""
     path, floats, (one, other) = ROBOTS[name]

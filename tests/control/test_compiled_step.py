@@ -208,7 +208,7 @@ def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
 
 
 @pytest.mark.variants(
-    slow=["mixed-hierarchy", "bounded-null-space"],
+    slow=["mixed-weighted", "mixed-hierarchy", "bounded-null-space"],
     release=["bounded-weighted", "bounded-hierarchy", "mixed-null-space", "mixed-saturated", "bounded-saturated"],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)

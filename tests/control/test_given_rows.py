@@ -177,6 +177,7 @@ def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(scheme):
     assert_alike_where_numbers_are_not_valid(given, scheme)
 
 
+@pytest.mark.slow
 def test_a_limit_of_ones_own_without_rows_is_the_box_of_the_one_call():
     robot = osik.load_robot("arm7")
     chosen = {name: looking(robot)[name] for name in ("hand", "all")}

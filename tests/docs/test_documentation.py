@@ -62,7 +62,16 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
-IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration", "motion", "placement"]
+IN_THE_GATE += [
+    "collision_free",
+    "reinforcement_learning",
+    "porting",
+    "jogging",
+    "own_task",
+    "calibration",
+    "motion",
+    "placement",
+]
 AT_NIGHT = [
     "batches",
     "inverse_kinematics",

@@ -66,6 +66,7 @@ def test_a_heavy_preference_gives_way_inside_jit_too(planar):
     np.testing.assert_allclose(where, REACH - [0.1, 0, 0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_frozen_joints_stay_as_in_q0(planar):
     q0 = jnp.array([0.7, 1.0, -0.3])
     held = found(planar, {"tip": tip(planar), "still": osik.FreezeTask(planar, ("b",))}, q0=q0)
@@ -157,7 +158,7 @@ def test_samples_of_a_continuum_are_not_isolated(planar):
     assert straight.isolated.tolist() == [True] * 2 + [False] * 14
 
 
-@pytest.mark.variants(slow=["0.5"])
+@pytest.mark.variants(slow=["5.0"], release=["0.5"])
 @pytest.mark.parametrize("x", [5.0, 0.5])
 def test_reach_with_slides_is_that_of_their_ends(x):
     robot = osik.Robot.from_mjcf(GANTRY.format(x=x))

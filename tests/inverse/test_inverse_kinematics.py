@@ -205,7 +205,6 @@ def test_a_start_that_is_right_is_kept(arm, rng):
     assert found.seed == 0
 
 
-@pytest.mark.slow
 def test_pure_form_is_differentiable_and_batched(arm, rng):
     """Against central differences of the same search from its own solution, and MuJoCo's Jacobian."""
     _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
@@ -324,7 +323,7 @@ GIMBAL = (
 )
 
 
-@pytest.mark.variants(slow=["place1-float32"])
+@pytest.mark.variants(slow=["place0-float64"], release=["place1-float32"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("place, kind", [((0, 0, 0), "float64"), ((0.3, -2.0, 1.0), "float32")])
 def test_joints_whose_axes_meet_in_the_frame(place, kind):

@@ -161,6 +161,7 @@ def test_derivatives_are_those_of_central_differences(rng) -> None:
         np.testing.assert_allclose(jnp.sum(gradient * change), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_many_chunks_in_one_call(rng) -> None:
     points = np.stack([walk(rng) for _ in range(3)])
     run = partial(planned, start=(HOME, REST, REST), begin=0.0, limits=LIMITS)

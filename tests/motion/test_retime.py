@@ -131,6 +131,7 @@ def test_both_modes_give_the_same_derivative_with_jerk() -> None:
     np.testing.assert_allclose(moved, (gradient(True, *ARGUMENTS)[0] * ARGUMENTS[0] ** 2).sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_a_limit_of_speed_gradients_are_finite() -> None:
     def duration(points, acceleration):
         return retime(points, acceleration=acceleration, cells=40).duration

@@ -139,6 +139,7 @@ def test_a_yaw_of_a_whole_turn_has_no_ends(arm, points):
     assert found.best_margin.min() > bounded.best_margin.min() + 0.01
 
 
+@pytest.mark.slow
 def test_poses_too_far_are_counted_and_searched_for_nowhere(arm, scene):
     far = np.array([[0.3, 0.0, 0.4], [5.0, 0.0, 0.4]])
     found = place_base(arm, {"tip": far}, x=[0.0, 0.1, 4.5], y=0.0, yaw=[0.0], scene=scene, refine=1)
