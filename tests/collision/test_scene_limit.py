@@ -90,7 +90,7 @@ def test_rows_are_those_of_the_nearest_pairs(arm, scene, limit):
     assert apart.sum() > 80 and (near < 0.0).any() and (near > 0.3).any()
 
 
-@pytest.mark.variants(slow=["exact"], release=["side"])
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("post", "h", "atol"), [("capsule", 1e-6, 2e-4), ("cylinder", 1e-4, 0.05)], ids=["exact", "side"]
 )

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
-from jax.flatten_util import ravel_pytree
 from mujoco_states import mujoco_at
 from step_checks import (
     DT,
@@ -19,6 +18,7 @@ from step_checks import (
     arguments,
     assert_alike_where_numbers_are_not_valid,
     assert_close,
+    assert_slopes_are_differences,
     by_core,
     frames_of,
     lanes_of,
@@ -82,7 +82,7 @@ def standing(robot: osik.Robot) -> dict[str, osik.Task]:
 SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
 CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
 ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy"]
-IN_THE_GATE = ["arm7-bounded-hierarchy", "arm7-bounded-null-space", "nao-mixed-weighted", "nao-mixed-saturated"]
+IN_THE_GATE = ["arm7-bounded-hierarchy", "arm7-bounded-null-space", "nao-mixed-saturated"]
 AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
@@ -112,7 +112,7 @@ def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
         assert float(jnp.abs(found.kkt_residual).max()) <= 1e-9
 
 
-@pytest.mark.variants(slow=["weighted", "hierarchy"], release=["null-space", "saturated"])
+@pytest.mark.variants(slow=["weighted"], release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     with jax.enable_x64(False):
@@ -127,7 +127,7 @@ def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
 
 
-@pytest.mark.variants(slow=["weighted", "hierarchy", "null-space"], release=["saturated"])
+@pytest.mark.variants(slow=["weighted", "hierarchy"], release=["null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_derivatives_are_central_differences(scheme):
     robot = osik.load_robot("arm7")
@@ -140,15 +140,10 @@ def test_derivatives_are_central_differences(scheme):
         tasks |= {"rest": osik.PostureTask(robot, weight=0.1, priority=2)}
         return jnp.sum(osik.solve(robot, q, tasks, scheme=SCHEMES[scheme](), dt=DT).velocity ** 2)
 
-    given = q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0)
-    found = jax.jit(jax.grad(cost, argnums=(0, 1, 2)))(*given)
-    flat, tree = ravel_pytree(given)
-    wanted = [float(cost(*tree(flat + h)) - cost(*tree(flat - h))) / 2e-6 for h in 1e-6 * np.eye(len(flat))]
-    assert np.abs(wanted).max() > 1e-3
-    np.testing.assert_allclose(ravel_pytree(found)[0], wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
+    assert_slopes_are_differences(cost, q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0))
 
 
-@pytest.mark.variants(slow=["hierarchy"], release=["null-space", "saturated"])
+@pytest.mark.variants(release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_share(scheme):
     robot = osik.load_robot("arm7")
@@ -208,8 +203,11 @@ def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
 
 
 @pytest.mark.variants(
-    slow=["mixed-weighted", "mixed-hierarchy", "bounded-null-space"],
-    release=["bounded-weighted", "bounded-hierarchy", "mixed-null-space", "mixed-saturated", "bounded-saturated"],
+    slow=["mixed-weighted", "bounded-null-space"],
+    release=[
+        *("bounded-weighted", "bounded-hierarchy", "mixed-hierarchy"),
+        *("mixed-null-space", "mixed-saturated", "bounded-saturated"),
+    ],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("tasks", [mixed, bounded])
@@ -258,10 +256,10 @@ def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
 
 
 @pytest.mark.variants(
-    slow=["ball-weighted", "mimic-hierarchy", "ball-null-space"],
+    slow=["mimic-hierarchy", "ball-null-space"],
     release=[
-        *("mimic-weighted", "locked-weighted", "ball-hierarchy", "locked-hierarchy", "mimic-null-space"),
-        *("locked-null-space", "mimic-saturated", "ball-saturated", "locked-saturated"),
+        *("ball-weighted", "mimic-weighted", "locked-weighted", "ball-hierarchy", "locked-hierarchy"),
+        *("mimic-null-space", "locked-null-space", "mimic-saturated", "ball-saturated", "locked-saturated"),
     ],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)

@@ -102,7 +102,7 @@ def test_each_compiler_takes_all_of_the_core_without_a_warning(name):
     assert len(texts) > 8 and done.returncode == 0, done.stderr[-4000:]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_core_by_clang_solves_as_plain_jax_does(tmp_path):
     own, library = core().path, tmp_path / "core.so"
     flags = _build.levels().get(own.stem.removeprefix("_core_"), []) if own else []

@@ -232,12 +232,7 @@ def in_used_memory(request):
     return found
 
 
-@pytest.mark.variants(
-    slow=["saturated-dependent and damped"],
-    release=[
-        f"{m}-{name}" for name in IN_USED_MEMORY for m in METHODS if (m, name) != ("saturated", IN_USED_MEMORY[0])
-    ],
-)
+@pytest.mark.release
 @pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
 @pytest.mark.parametrize("method", METHODS)
 def test_memory_that_was_used_before_says_nothing(method, in_used_memory):

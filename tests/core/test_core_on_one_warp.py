@@ -70,7 +70,7 @@ def off(given, x, expected):
     return np.abs(rows).max(1) / np.abs(root * b).max(1)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_hard_family_in_single_precision(tmp_path, rng):
     """Weights of six decades, factors that lose most digits, so that corrections are slow and a bound pulls little."""
     p = whole_body(rng, 200)
@@ -98,7 +98,7 @@ def test_recorded_problems_in_single_precision(robot, tmp_path):
     assert (found.report[:, 1:] == (0, 1)).all()
 
 
-@pytest.mark.variants(slow=["g1"], release=["nao"])
+@pytest.mark.release
 @pytest.mark.parametrize("robot", ["g1", "nao"])
 def test_weights_far_apart_stay_in_the_kernel(robot, tmp_path, rng):
     """Recorded tasks with weights from 1e-4 to 1e5, three rows each, and speed limits that stop some joints."""
