@@ -73,6 +73,7 @@ def test_known_equalities_are_kept_whatever_their_upper_bounds_round_to(rng, sol
             np.testing.assert_array_equal(s.warm_start.own[:, 0, :3], 2)
 
 
+@pytest.mark.slow
 def test_residual_tells_what_lower_levels_took():
     """Two rows nearer to parallel than the rank tolerance: the first level is one of them alone, for all below."""
     levels = [Level([[1.0, 0.0], [1.0, 1e-4]], [0.0, 0.0]), Level([[0.0, 1.0]], [1.0])]
@@ -116,6 +117,7 @@ def test_shapes_that_do_not_fit_are_named():
         Level(jnp.ones((2, 4)), jnp.zeros(2), jnp.zeros(2), equalities=[True])
 
 
+@pytest.mark.slow
 def test_integers_are_floats():
     whole, box = [Level([[1, 1]], [0.5]), Level([[1, -1]], [0], [0], [2])], (np.full(2, -1.0), np.full(2, 1.0))
     assert whole[0].lower[0] == 0.5
