@@ -257,12 +257,7 @@ def test_fewer_pairs_than_rows_and_none(arm):
     assert (np.asarray(_rows(far, arm, arm.q0).lower) == -np.inf).all()
 
 
-def test_wrong_arguments_are_named(arm, scene, limit):
-    kind = osik.CollisionAvoidanceLimit
-    refuses(TypeError, "make an osik_jax.Scene", kind, arm, scene={"a": CollisionShape.sphere(0.1)})
-    refuses(ValueError, "a stack of scenes", kind, arm, scene=osik.Scene.stack([scene, scene]))
-    refuses(TypeError, "scene goes without pairs", kind, arm, scene=scene, pairs=[("hand", "upper")])
-    refuses(TypeError, "srdf goes with a scene", kind, arm, srdf="<robot name='r'/>")
+def test_wrong_arguments_are_named(limit):
     refuses(TypeError, "limit.replace", limit.moved, "table", position=np.zeros(3))
     refuses(TypeError, "make an osik_jax.Scene", limit.replace, scene=3)
 

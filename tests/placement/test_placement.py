@@ -303,22 +303,6 @@ def test_a_longer_tool_is_compared_with_a_shorter_one(found, scene, points):
     assert lines[1].split()[1:] != lines[2].split()[1:]
 
 
-def test_what_is_wrong_is_told(arm, points):
-    refuses(
-        ValueError,
-        r"x is \[1.0, 0.0\]",
-        place_base,
-        arm,
-        {"tip": points},
-        x=[1.0, 0.0],
-        y=0.0,
-    )
-    refuses(TypeError, "y is str", place_base, arm, {"tip": points}, x=0.0, y="wide")
-    refuses(KeyError, "tap", place_base, arm, {"tap": points}, x=0.0, y=0.0)
-    refuses(TypeError, "scene is a dict", place_base, arm, {"tip": points}, x=0.0, y=0.0, scene={})
-    refuses(ValueError, "poses is list", place_base, arm, [points], x=0.0, y=0.0)
-
-
 def test_the_command_writes_the_base(tmp_path, monkeypatch, capsys, points):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "arm.xml").write_text(mjcf())

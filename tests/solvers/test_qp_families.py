@@ -45,7 +45,7 @@ def solved(p: QPs):
     return s, x
 
 
-@pytest.mark.variants(slow=["mixed-1"])
+@pytest.mark.variants(slow=["mixed-2"], release=["mixed-1"])
 @pytest.mark.parametrize("seed", [1, 2, *(pytest.param(k, marks=pytest.mark.release) for k in (0, *range(3, 8)))])
 @pytest.mark.parametrize("family", PLANTED)
 def test_planted_solutions(family, seed):
