@@ -61,6 +61,7 @@ class TestTargetsOfSolve:
 
 
 class TestBuildProblem:
+    @pytest.mark.slow
     def test_its_answer_is_that_of_solve(self, arm, tasks, pose):
         wanted = osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP(), targets={"hand": pose}, dt=0.01)
         problem = osik.build_problem(arm, arm.q0, tasks, targets={"hand": pose}, dt=0.01)

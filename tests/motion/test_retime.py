@@ -165,6 +165,7 @@ def test_many_paths_in_one_call() -> None:
     np.testing.assert_allclose(jax.vmap(lambda points: run(points).duration)(paths)[2:], many[2:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     arm = osik.load_robot("arm7")
     points = np.asarray(arm.q0) + np.linspace(0.0, 1.0, 5)[:, None] * np.array([0.8, 0.3, 0.2, 0.4, 0.0, 0.2, 0.0])

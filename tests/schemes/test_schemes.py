@@ -335,6 +335,7 @@ class TestNullSpace:
         assert room[2.0][-1] > 1.5 * room[2.0][0]
         assert np.abs(run[2.0].solution.error["position"]).max() < 1e-3
 
+    @pytest.mark.slow
     def test_says_by_how_much_it_leaves_the_box(self, arm, rng):
         q = configurations(arm, rng)
         ours = solve_lanes(arm, q, undamped())

@@ -141,7 +141,7 @@ def weighted_answer(p: Problem, damping: float) -> np.ndarray:
 class TestAgainstOthers:
     """In each lane some rows of the limit bind."""
 
-    @pytest.mark.variants(slow=["inequality"])
+    @pytest.mark.variants(slow=["equality"], release=["inequality"])
     @pytest.mark.parametrize("hard", [("elbow",), ("elbow", "side")], ids=["equality", "inequality"])
     def test_weighted(self, arm, lanes, hard):
         some = cases(arm, lanes, hard=hard)

@@ -31,6 +31,7 @@ def test_recorded_hierarchies_by_plain_jax(precision):
     assert np.abs(norms - r.residual_norm).max() < (1e-7 if precision == "float64" else 1e-6)
 
 
+@pytest.mark.slow
 def test_inequalities_at_any_level_and_weights_inside_a_level():
     box = jnp.full(2, 5.0)
     inequality_first = [Level([[1.0, 1.0]], [-jnp.inf], [1.0]), Level(jnp.eye(2), [2.0, 2.0], [2.0, 2.0])]
@@ -86,6 +87,7 @@ def test_residual_tells_what_lower_levels_took():
     assert lost.kkt_residual >= np.linalg.norm(lost.slacks[0]) - 1e-12
 
 
+@pytest.mark.slow
 def test_level_without_rows_and_pinned_variables():
     levels = [Level(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0)), Level(jnp.ones((1, 3)), [6.0], [6.0])]
     s = solve_hqp(levels, jnp.array([1.0, -jnp.inf, -10.0]), jnp.array([1.0, jnp.inf, 2.0]))

@@ -83,7 +83,7 @@ class TestAgainstMuJoCo:
         assert np.linalg.norm(rows.error[3:]) == pytest.approx(np.sin((2 * np.pi - 3.5) / 2.0), abs=1e-12)
 
 
-@pytest.mark.variants(release=["locked1"])
+@pytest.mark.variants(slow=["locked0"], release=["locked1"])
 @pytest.mark.parametrize("locked", [{}, {"b1": 0.4, "b3": -0.7}])
 def test_written_and_read_again_they_are_the_same(locked):
     """Ends on fused bodies, on the world and on sites; rows of welds may be in other axes, which have the same norm."""
