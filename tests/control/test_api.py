@@ -155,7 +155,7 @@ class TestDefaultScheme:
             osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP())
             osik.solve(arm, arm.q0, {**tasks, "other": hand})
 
-    @pytest.mark.variants(slow=["LowAccelerationTask"])
+    @pytest.mark.variants(release=["LowAccelerationTask"])
     @pytest.mark.parametrize("task", [osik.LowAccelerationTask, osik.DampingTask])
     def test_a_calming_task_beneath_tasks_that_leave_no_freedom_is_named_once(self, arm, task):
         hand = osik.FrameTask(arm, "hand", priority=1)

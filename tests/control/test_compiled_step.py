@@ -82,7 +82,7 @@ def standing(robot: osik.Robot) -> dict[str, osik.Task]:
 SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
 CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
 ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy"]
-IN_THE_GATE = ["arm7-bounded-hierarchy", "arm7-bounded-null-space", "nao-mixed-saturated"]
+IN_THE_GATE = ["arm7-bounded-null-space", "nao-mixed-saturated"]
 AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
@@ -163,7 +163,7 @@ def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_sha
     assert_close(found, wanted, 1e-12 * float(jnp.abs(wanted).max()))
 
 
-@pytest.mark.variants(slow=["weighted", "saturated"], release=["null-space"])
+@pytest.mark.variants(slow=["weighted"], release=["null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     robot = osik.load_robot("arm7")

@@ -81,7 +81,7 @@ def test_as_numpy(name):
         np.testing.assert_allclose(found[lane], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
 
 
-@pytest.mark.variants(slow=["a humanoid's"])
+@pytest.mark.variants(slow=["level without rows"], release=["a humanoid's"])
 @pytest.mark.parametrize("name", ["damped inequalities", "a humanoid's", "level without rows"])
 def test_single_precision_is_double_inside(name):
     """As near to the answer in double precision as rounded data can be, and nearer than single arithmetic."""

@@ -62,7 +62,7 @@ def heading_anchors(page: Path) -> set[str]:
 
 
 WITH_CODE = {relative(page): page for page in PAGES if BLOCK.search(page.read_text())}
-IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "choosing_a_scheme", "deploying", "own_task"]
+IN_THE_GATE = ["the_loop", "conventions", "robots", "choosing_a_scheme", "deploying", "own_task"]
 IN_THE_GATE += ["reinforcement_learning", "porting"]
 IN_THE_GATE = [f"docs/{page}.md" for page in IN_THE_GATE]
 QUICK = ["README.md", "docs/index.md", "docs/installation.md", "docs/physics.md", "docs/traced_vs_static.md"]

@@ -83,7 +83,7 @@ def test_results_stay_on_their_devices(eight):
     assert eight["two"][0] < 1e-12 and eight["two"][1] == 2
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_explicit_mesh_axes_are_refused_and_what_the_message_advises_works(arm):
     tasks = {"hand": osik.FrameTask(arm, "hand", target=arm.q0[:3], rows="position")}
     scheme = osik.NullSpace()  # compiles soonest

@@ -184,7 +184,7 @@ def wrong_multipliers(p, rows, s):
 
 
 @pytest.mark.variants(
-    slow=["core-1e10", "jax-1e10"], release=["jax-inf", "jax-1e3", "jax-1e12", "core-inf", "core-1e3", "core-1e12"]
+    slow=["core-1e10"], release=["jax-1e10", "jax-inf", "jax-1e3", "jax-1e12", "core-inf", "core-1e3", "core-1e12"]
 )
 @pytest.mark.parametrize("far", ["inf", "1e3", "1e10", "1e12"])
 @pytest.mark.parametrize("backend", ["jax", "core"])
