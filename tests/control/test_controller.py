@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 from core_checks import needs_core
+from jax.core import Tracer
 from refusals import refuses
 
 import osik_jax as osik
@@ -223,7 +224,7 @@ def test_numbers_changed_in_place_and_traced_ones_are_not_kept(arm: osik.Robot) 
     gc.freeze()  # what was there before is not looked at
     jax.eval_shape(jax.vmap(velocity), np.ones((2, 3)))
     gc.collect()
-    assert not any(isinstance(thing, jax.core.Tracer) for thing in gc.get_objects())
+    assert not any(isinstance(thing, Tracer) for thing in gc.get_objects())
     gc.unfreeze()
 
 
