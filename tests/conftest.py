@@ -57,6 +57,8 @@ MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
 WITH_TORCH = "kinematics/test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "viewer/test_live_browser.py"
+UNKNOWN_VARIANTS: list[tuple[str, str]] = []
+"""Tests and variants that are marked and do not exist."""
 NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
 if not (shutil.which("chromium") and find_spec("playwright")):
     NOT_INSTALLED[WITH_BROWSER] = "chromium or playwright"
@@ -74,9 +76,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             if variant in ids:
                 item.add_marker(tier)
                 found.add((test, variant))
-    some_alone = config.getoption("lf", False) or any("::" in argument for argument in config.args)
-    if named > found and not some_alone:
-        raise pytest.UsageError(f"no test has these variants: {sorted(named - found)}")
+    if not config.getoption("lf", False) and not any("::" in argument for argument in config.args):
+        UNKNOWN_VARIANTS.extend(sorted(named - found))  # otherwise only some are collected
     gc.freeze()  # what was imported stays: looking for garbage among it again and again is some percent of the time
 
 
@@ -97,6 +98,11 @@ def pytest_report_header() -> list[str]:
 def pytest_sessionfinish() -> None:
     """Has nobody look for garbage among all that there is when it goes anyway."""
     gc.freeze()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def marked_variants_exist() -> None:
+    assert UNKNOWN_VARIANTS == []
 
 
 @pytest.fixture
