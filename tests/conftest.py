@@ -57,6 +57,8 @@ MOST_MEMORY = 4 * 2**30
 """What a process may hold after a file of tests, in bytes, before it drops its compiled programs."""
 WITH_TORCH = "kinematics/test_beside_pytorch_kinematics.py"
 WITH_BROWSER = "viewer/test_live_browser.py"
+UNKNOWN_VARIANTS: list[tuple[str, str]] = []
+"""Tests and variants that are marked and do not exist."""
 NOT_INSTALLED = {} if find_spec("pytorch_kinematics") else {WITH_TORCH: "pytorch-kinematics"}
 if not (shutil.which("chromium") and find_spec("playwright")):
     NOT_INSTALLED[WITH_BROWSER] = "chromium or playwright"
@@ -64,12 +66,19 @@ collect_ignore = list(NOT_INSTALLED)
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Marks single variants of a test as slow or for releases: ``@pytest.mark.variants(slow=[...], release=[...])``."""
+    named, found = set(), set()
     for item in items:
+        test, variant = item.nodeid.removesuffix("]").partition("[")[::2]
         for tier, ids in ((t, i) for m in item.iter_markers("variants") for t, i in m.kwargs.items()):
-            if item.name.partition("[")[2].removesuffix("]") in ids:
+            named |= {(test, name) for name in ids}
+            if variant in ids:
                 item.add_marker(tier)
+                found.add((test, variant))
+    if not config.getoption("lf", False) and not any("::" in argument for argument in config.args):
+        UNKNOWN_VARIANTS.extend(sorted(named - found))  # otherwise only some are collected
+    gc.freeze()  # what was imported stays: looking for garbage among it again and again is some percent of the time
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -89,6 +98,11 @@ def pytest_report_header() -> list[str]:
 def pytest_sessionfinish() -> None:
     """Has nobody look for garbage among all that there is when it goes anyway."""
     gc.freeze()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def marked_variants_exist() -> None:
+    assert UNKNOWN_VARIANTS == []
 
 
 @pytest.fixture

@@ -123,6 +123,7 @@ class TestBatchesOfNone:
 
     box = -np.ones(3), np.ones(3)
 
+    @pytest.mark.variants(slow=["saturated", "reverse"])
     @pytest.mark.parametrize("solver", SOLVERS)
     def test_solvers(self, solver):
         def solve(A, b):
@@ -136,6 +137,7 @@ class TestBatchesOfNone:
             assert answer.x.shape == (*batch, 3)
             assert all(leaf.shape[:2] == batch for leaf in jax.tree.leaves(answer))
 
+    @pytest.mark.variants(slow=["saturated", "reverse"])
     @pytest.mark.parametrize(
         "scheme",
         [
@@ -143,7 +145,7 @@ class TestBatchesOfNone:
             osik.HierarchicalQP(),
             *(osik.NullSpace(method=method) for method in ("classical", "reverse", "saturated")),
         ],
-        ids=repr,
+        ids=["weighted", "hierarchy", "classical", "reverse", "saturated"],
     )
     def test_schemes(self, arm, tasks, limits, start, scheme):
         def solve(q):

@@ -7,7 +7,7 @@ from osik_jax.core import _library
 
 pytestmark = [
     pytest.mark.skipif(not _library.installed(), reason="no compiled core"),
-    pytest.mark.variants(slow=["Panda*"], release=["TIAGo*"]),
+    pytest.mark.variants(slow=[name for name in CASES if "Panda" in name], release=[n for n in CASES if "TIAGo" in n]),
 ]
 
 

@@ -130,6 +130,7 @@ def test_errors_are_as_large_as_sigma_says(name: str):
     assert inside > 0.99 and deviation == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow
 def test_outliers_cost_little(ur5: osik.Robot):
     """20 % of the readings are off by 100 times the noise; with least squares the errors are 20 times as large."""
     q, truth = RNG(4).uniform(-2.0, 2.0, (60, 40, 6)), np.array([0.01, -0.02, 0.03])
@@ -177,6 +178,7 @@ def test_the_same_optimum_as_scipy(name: str):
     assert studies.beside_scipy(studies.STUDIES[name])[0] < 1e-3  # of a deviation
 
 
+@pytest.mark.slow
 def test_next_poses_tell_more_than_random_ones(ur5: osik.Robot):
     unknowns = [cal.Unknown("joint_offset", ("shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint"))]
     drawn = RNG(8).uniform(-2.0, 2.0, (200, 6))
@@ -256,13 +258,10 @@ def test_files_and_command(ur5: osik.Robot, tmp_path, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("error", "message", "unknowns", "options"),
     [
-        (ValueError, "nothing is unknown", [], {}),
         (TypeError, "unknowns is a sequence", ["joint_offset"], {}),
-        (KeyError, "no joint 'elbow'", [("joint_offset", "elbow")], {}),
         (KeyError, "no body 'tool0'", [("body_position", "tool0")], {}),
         (KeyError, "no frame 'camera'", [("frame_position", "camera")], {}),
         (ValueError, "is unknown twice", [("joint_offset", "*"), ("joint_offset", "elbow_joint")], {}),
-        (ValueError, "loss is 'l1'; it is one of squared", [("joint_offset", "*")], dict(loss="l1")),
         (
             ValueError,
             "called 'tool0', as a frame of the robot",
@@ -276,20 +275,3 @@ def test_wrong_arguments_are_told(ur5: osik.Robot, error, message: str, unknowns
     reading = cal.Points("tool0", np.zeros((2, 6)), np.zeros((2, 3)))
     unknowns = [cal.Unknown(*one) if isinstance(one, tuple) else one for one in unknowns]
     refuses(error, message, cal.calibrate, ur5, reading, unknowns, **options)
-
-
-def test_wrong_measurements_are_told(ur5: osik.Robot):
-    refuses(
-        ValueError, r"q has shape \(3, 6\), expected \(2, n\)", cal.Points, "tool0", np.zeros((3, 6)), np.zeros((2, 3))
-    )
-    refuses(ValueError, "sigma is .* positive", cal.Points, "tool0", np.zeros((2, 6)), np.zeros((2, 3)), sigma=0.0)
-    refuses(ValueError, "has to be finite", cal.Points, "tool0", np.zeros((1, 6)), np.full((1, 3), np.nan))
-    refuses(KeyError, "no quantity 'length'", cal.Unknown, "length")
-    refuses(ValueError, "axes is 'w'", cal.Unknown, "frame_position", axes="w")
-    refuses(ValueError, "prior is 0", cal.Unknown, "frame_position", prior=0)
-    offset, short = [cal.Unknown("joint_offset")], cal.Points("tool0", np.zeros((2, 5)), np.zeros((2, 3)))
-    refuses(ValueError, r"q of shape \(2, 5\), expected \(n, 6\)", cal.calibrate, ur5, short, offset)
-    refuses(
-        KeyError, "no frame 'tip'", cal.calibrate, ur5, cal.Points("tip", np.zeros((2, 6)), np.zeros((2, 3))), offset
-    )
-    refuses(ValueError, "there are no measurements", cal.calibrate, ur5, [], offset)

@@ -234,6 +234,7 @@ def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):
     assert "j[left]" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     picture = tmp_path / "spheres.png"

@@ -654,7 +654,7 @@ def test_capsules_side_by_side_are_nearest_in_the_middle():
       <geom name="a" type="capsule" size="0.05" fromto="-0.3 0 0 0.3 0 0"/>
       <body><joint type="slide"/><geom name="b" type="capsule" size="0.04" fromto="0.1 0 0.2 0.9 0 0.2"/></body>
       </worldbody></mujoco>""")
-    limit = osik.CollisionAvoidanceLimit(robot)
+    limit = osik.CollisionAvoidanceLimit(robot, q0_distance=-np.inf)
     near = jax.jit(lambda q: limit._nearest(robot, osik.forward_kinematics(robot, q)))(robot.q0)
     np.testing.assert_allclose(near.distance, [0.11], atol=1e-15)
     np.testing.assert_allclose(near.point_a, [[0.2, 0.0, 0.05]], atol=1e-15)

@@ -176,6 +176,7 @@ def test_gradients_of_clearances_are_central_differences(panda, problems):
     assert np.abs(lift).max() > 0.1
 
 
+@pytest.mark.slow
 def test_gradients_through_the_search_and_inside_jit(panda, problems):
     scene, place, turn = problems[2]
 

@@ -90,7 +90,7 @@ def test_rows_are_those_of_the_nearest_pairs(arm, scene, limit):
     assert apart.sum() > 80 and (near < 0.0).any() and (near > 0.3).any()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("post", "h", "atol"), [("capsule", 1e-6, 2e-4), ("cylinder", 1e-4, 0.05)], ids=["exact", "side"]
 )
@@ -137,6 +137,7 @@ def _steps_of(arm, limit, tasks, scheme):
     return steps
 
 
+@pytest.mark.slow
 def test_the_step_in_one_call_is_that_of_plain_jax(arm, limit, tasks):
     """Velocities and statuses, also where rows contradict each other or the box: as little violation as possible."""
     rng = np.random.default_rng(5)
@@ -256,12 +257,7 @@ def test_fewer_pairs_than_rows_and_none(arm):
     assert (np.asarray(_rows(far, arm, arm.q0).lower) == -np.inf).all()
 
 
-def test_wrong_arguments_are_named(arm, scene, limit):
-    kind = osik.CollisionAvoidanceLimit
-    refuses(TypeError, "make an osik_jax.Scene", kind, arm, scene={"a": CollisionShape.sphere(0.1)})
-    refuses(ValueError, "a stack of scenes", kind, arm, scene=osik.Scene.stack([scene, scene]))
-    refuses(TypeError, "scene goes without pairs", kind, arm, scene=scene, pairs=[("hand", "upper")])
-    refuses(TypeError, "srdf goes with a scene", kind, arm, srdf="<robot name='r'/>")
+def test_wrong_arguments_are_named(limit):
     refuses(TypeError, "limit.replace", limit.moved, "table", position=np.zeros(3))
     refuses(TypeError, "make an osik_jax.Scene", limit.replace, scene=3)
 

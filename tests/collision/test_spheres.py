@@ -162,6 +162,7 @@ def as_collision(ball: dict) -> str:
     return f'<collision><origin xyz="{place}"/><geometry><sphere radius="{radius}"/></geometry></collision>'
 
 
+@pytest.mark.slow
 def test_given_spheres_cover_after_they_are_grown(tmp_path):
     """Those of cuRobo's files, of spherized URDFs and of dictionaries."""
     ur5 = osik.load_robot("ur5")

@@ -61,6 +61,7 @@ class TestTargetsOfSolve:
 
 
 class TestBuildProblem:
+    @pytest.mark.slow
     def test_its_answer_is_that_of_solve(self, arm, tasks, pose):
         wanted = osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP(), targets={"hand": pose}, dt=0.01)
         problem = osik.build_problem(arm, arm.q0, tasks, targets={"hand": pose}, dt=0.01)
@@ -154,6 +155,7 @@ class TestDefaultScheme:
             osik.solve(arm, arm.q0, tasks, scheme=osik.WeightedQP())
             osik.solve(arm, arm.q0, {**tasks, "other": hand})
 
+    @pytest.mark.variants(release=["LowAccelerationTask"])
     @pytest.mark.parametrize("task", [osik.LowAccelerationTask, osik.DampingTask])
     def test_a_calming_task_beneath_tasks_that_leave_no_freedom_is_named_once(self, arm, task):
         hand = osik.FrameTask(arm, "hand", priority=1)
@@ -173,6 +175,7 @@ class TestDefaultScheme:
                 2.0
             )
 
+    @pytest.mark.slow
     @pytest.mark.filterwarnings("ignore:the LowAccelerationTask")
     def test_a_task_of_which_it_is_said_that_it_does_nothing_does_nothing(self, arm):
         above = {"hand": osik.FrameTask(arm, "hand", priority=1), "rest": osik.PostureTask(arm, priority=2)}

@@ -18,6 +18,7 @@ from step_checks import (
     arguments,
     assert_alike_where_numbers_are_not_valid,
     assert_close,
+    assert_slopes_are_differences,
     by_core,
     frames_of,
     lanes_of,
@@ -80,9 +81,8 @@ def standing(robot: osik.Robot) -> dict[str, osik.Task]:
 
 SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
 CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
-ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy", "arm7-bounded-null-space"]
-IN_THE_GATE = ["nao-standing-weighted", "arm7-bounded-hierarchy", "nao-mixed-weighted", "g1-mixed-hierarchy"]
-IN_THE_GATE += ["nao-mixed-saturated", "g1-bounded-saturated", "nao-standing-null-space"]
+ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy"]
+IN_THE_GATE = ["arm7-bounded-null-space", "nao-mixed-saturated"]
 AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
@@ -112,7 +112,7 @@ def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
         assert float(jnp.abs(found.kkt_residual).max()) <= 1e-9
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["weighted"], release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     with jax.enable_x64(False):
@@ -127,28 +127,23 @@ def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
     np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
 
 
-@pytest.mark.variants(slow=SCHEMES)
+@pytest.mark.variants(slow=["weighted", "hierarchy"], release=["null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_derivatives_are_those_of_plain_jax(scheme):
+def test_derivatives_are_central_differences(scheme):
     robot = osik.load_robot("arm7")
     q = lanes_of(robot)[0]
 
-    def cost(q: Any, point: Any, gain: Any, backend: Any) -> Any:
+    @jax.jit
+    def cost(q: Any, point: Any, gain: Any) -> Any:
         hand, _ = frames_of(robot)
         tasks = {"hand": osik.FrameTask(robot, hand, rows="position", gain=gain).replace(target=point)}
         tasks |= {"rest": osik.PostureTask(robot, weight=0.1, priority=2)}
-        chosen = SCHEMES[scheme](backend=backend)
-        return jnp.sum(osik.solve(robot, q, tasks, scheme=chosen, dt=DT).velocity ** 2)
+        return jnp.sum(osik.solve(robot, q, tasks, scheme=SCHEMES[scheme](), dt=DT).velocity ** 2)
 
-    given = q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0)
-    found, wanted = (
-        jax.jit(jax.grad(cost, argnums=(0, 1, 2)), static_argnums=3)(*given, backend) for backend in ("core", "jax")
-    )
-    assert float(jnp.abs(wanted[0]).max()) > 1e-3
-    assert_close(found, wanted, 1e-9 * (1.0 + max(float(jnp.abs(a).max()) for a in wanted)))
+    assert_slopes_are_differences(cost, q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0))
 
 
-@pytest.mark.variants(slow=["weighted", "hierarchy", "saturated"])
+@pytest.mark.variants(release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_share(scheme):
     robot = osik.load_robot("arm7")
@@ -168,7 +163,7 @@ def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_sha
     assert_close(found, wanted, 1e-12 * float(jnp.abs(wanted).max()))
 
 
-@pytest.mark.variants(slow=["weighted", "null-space", "saturated"])
+@pytest.mark.variants(slow=["weighted"], release=["null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
     robot = osik.load_robot("arm7")
@@ -208,8 +203,11 @@ def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
 
 
 @pytest.mark.variants(
-    slow=["mixed-hierarchy", "bounded-null-space", "bounded-saturated"],
-    release=["bounded-weighted", "bounded-hierarchy", "mixed-null-space", "mixed-saturated"],
+    slow=["mixed-weighted", "bounded-null-space"],
+    release=[
+        *("bounded-weighted", "bounded-hierarchy", "mixed-hierarchy"),
+        *("mixed-null-space", "mixed-saturated", "bounded-saturated"),
+    ],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("tasks", [mixed, bounded])
@@ -258,10 +256,10 @@ def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
 
 
 @pytest.mark.variants(
-    slow=["ball-weighted", "locked-weighted", "mimic-hierarchy", "mimic-saturated", "ball-null-space"],
+    slow=["mimic-hierarchy", "ball-null-space"],
     release=[
-        *("mimic-weighted", "ball-hierarchy", "locked-hierarchy"),
-        *("mimic-null-space", "locked-null-space", "ball-saturated", "locked-saturated"),
+        *("ball-weighted", "mimic-weighted", "locked-weighted", "ball-hierarchy", "locked-hierarchy"),
+        *("mimic-null-space", "locked-null-space", "mimic-saturated", "ball-saturated", "locked-saturated"),
     ],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
@@ -286,7 +284,7 @@ def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):
             assert_close(getattr(found, field), getattr(wanted, field), 1e-11)
 
 
-@pytest.mark.variants(slow=["saturated"])
+@pytest.mark.variants(release=["saturated"])
 @pytest.mark.parametrize("scheme", ["hierarchy", "saturated"])
 def test_a_step_is_one_call_with_few_operations_around_it(scheme):
     robot = osik.load_robot("nao")
@@ -307,6 +305,7 @@ def test_a_step_is_one_call_with_few_operations_around_it(scheme):
     assert "conditional" not in text and "while" not in text and len(text.splitlines()) < 300
 
 
+@pytest.mark.slow
 def test_rows_of_limits_are_answered_as_by_plain_jax(rng):
     """Beside soft rows; with walls that are tight, contradict each other, or are not finite."""
     robot = osik.load_robot("arm7")

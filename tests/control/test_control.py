@@ -231,6 +231,7 @@ class TestBatches:
             np.testing.assert_array_equal(bad.velocity[4], np.zeros(arm.nv), err_msg=what)
             assert float(bad.box_violation[4]) == 0.0
 
+    @pytest.mark.variants(slow=["hierarchical"])
     @all_schemes
     def test_a_failed_lane_outside_its_range_still_moves_into_its_box(self, arm, home, name):
         """The box wins: a joint above its range comes back at the speed that the limits ask for."""

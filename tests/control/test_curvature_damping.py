@@ -90,7 +90,7 @@ def test_met_and_linear_tasks_bend_nothing(arm):
     assert linear == 0.0 and met < 1e-14  # the target's rotation is normalised, which changes it by roundoff
 
 
-@pytest.mark.variants(slow=["weighted", "null-space", "reverse"])
+@pytest.mark.variants(slow=["weighted", "hierarchical"], release=["null-space", "reverse"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_inside_it_is_as_exact_as_without(scheme, arm):
     """A hand that follows a circle, the whole error asked for in one step."""

@@ -12,6 +12,7 @@ from osik_jax.solvers import solve_least_squares_qp
 STEPS, AT_REST = 400, 1e-12
 
 
+@pytest.mark.variants(slow=["scheme0", "scheme1"])
 @pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])
 def test_steps_are_solved_at_rest(nao, scheme):
     """A hand near its target, and a posture that pulls back."""

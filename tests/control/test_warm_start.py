@@ -47,6 +47,7 @@ def test_random_active_sets_with_rows(family, rng):
     np.testing.assert_allclose((warm.x - p.x) / p.unit, 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):
     """A robot at rest: the answer is of the size of rounding, the bounds that a warm start leads through are not."""
     n, lanes = 8, 20
@@ -68,7 +69,7 @@ def test_bounds_that_levels_were_at_and_left_are_part_of_the_scale(rng):
     np.testing.assert_allclose(warm.x, cold.x, atol=1e-14)
 
 
-@pytest.mark.variants(slow=["jax"])
+@pytest.mark.variants(slow=["auto"], release=["jax"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_working_sets_of_other_problems_beside_bounds_of_1e10(backend, rng):
     """A guess at a bound of 1e10 has tolerances and roundoff of that size; nothing of them may be in the answer."""

@@ -162,6 +162,7 @@ def test_wrong_candidates_are_not(batch, wrong):
         assert not judged(batch, candidate).any()
 
 
+@pytest.mark.slow
 def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
     """Wrong in 25 of 40 lanes, 4 lanes a block; the others stay as the kernel has them."""
     monkeypatch.setattr(_dispatch, "_MIN_BLOCK", 4)

@@ -73,7 +73,7 @@ def test_every_level_is_certified_and_nothing_is_left_to_the_search(families, no
         assert max(certificate(families, i, x[i]).max() for i in range(0, len(x), 3)) < 1e-10
 
 
-@pytest.mark.variants(release=["False"])
+@pytest.mark.variants(slow=["True"], release=["False"])
 @pytest.mark.parametrize("damped", [False, True])
 def test_answers_are_those_of_the_search(families, damped):
     mine, search = (solved(*given(families), backend=b, damped=damped) for b in ("core", "jax"))
@@ -124,6 +124,7 @@ def test_programs_for_other_machines(solver, call):
     assert call in text("core", "cpu") and call not in text("core", "cuda") and call not in text("jax", "cpu")
 
 
+@pytest.mark.slow
 def test_a_short_row_that_is_met_leaves_the_levels_below_their_room():
     """Random problems of ``benchmarks.agreement``: roundoff of long rows is more than a short one seems to miss."""
     stored = np.load(Path(__file__).parents[1] / "data" / "hqp_short_rows.npz")

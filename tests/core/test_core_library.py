@@ -93,7 +93,7 @@ def test_without_the_core_a_warning_says_what_to_do():
     assert ran.stderr.count("OsikWarning") == 1 and "install a C++ compiler" in ran.stderr
 
 
-@pytest.mark.variants(slow=["clang++"])
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["g++", "clang++"])
 def test_each_compiler_takes_all_of_the_core_without_a_warning(name):
     texts = [*_build.FOLDER.glob("*.cpp"), *_build.FOLDER.glob("c/*.cpp")]
@@ -102,7 +102,7 @@ def test_each_compiler_takes_all_of_the_core_without_a_warning(name):
     assert len(texts) > 8 and done.returncode == 0, done.stderr[-4000:]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_core_by_clang_solves_as_plain_jax_does(tmp_path):
     own, library = core().path, tmp_path / "core.so"
     flags = _build.levels().get(own.stem.removeprefix("_core_"), []) if own else []

@@ -81,7 +81,7 @@ def test_as_numpy(name):
         np.testing.assert_allclose(found[lane], expected, rtol=0, atol=1e-9 * (1.0 + np.abs(expected).max()))
 
 
-@pytest.mark.variants(slow=["a humanoid's"])
+@pytest.mark.variants(slow=["level without rows"], release=["a humanoid's"])
 @pytest.mark.parametrize("name", ["damped inequalities", "a humanoid's", "level without rows"])
 def test_single_precision_is_double_inside(name):
     """As near to the answer in double precision as rounded data can be, and nearer than single arithmetic."""
@@ -232,12 +232,7 @@ def in_used_memory(request):
     return found
 
 
-@pytest.mark.variants(
-    slow=["saturated-dependent and damped"],
-    release=[
-        f"{m}-{name}" for name in IN_USED_MEMORY for m in METHODS if (m, name) != ("saturated", IN_USED_MEMORY[0])
-    ],
-)
+@pytest.mark.release
 @pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
 @pytest.mark.parametrize("method", METHODS)
 def test_memory_that_was_used_before_says_nothing(method, in_used_memory):
@@ -247,7 +242,7 @@ def test_memory_that_was_used_before_says_nothing(method, in_used_memory):
     jax.tree.map(np.testing.assert_array_equal, *found)
 
 
-@pytest.mark.variants(release=["float64"])
+@pytest.mark.variants(slow=["float32"], release=["float64"])
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkeypatch, precision):
     """There both are branches of one program, and with JAX's default precision what is computed in double is a part."""

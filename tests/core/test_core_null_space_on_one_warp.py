@@ -39,10 +39,11 @@ def assert_near(found, expected):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * (1.0 + np.abs(b).max()))
 
 
-@pytest.mark.variants(
-    slow=["independent", "damped", "one variable", "tiny", "huge", "zeros", "repeated", "dependent and damped"],
-    release=["inequalities", "damped inequalities", "dependent", "as many zero rows as are left"],
-)
+IN_EVERY_RUN = ("more than 32 of each", "no rows", "repeated and damped")
+IN_THE_GATE = ("a humanoid's", "more than 64 rows", "more than 64 variables", "dependent and damped", "tiny", "zeros")
+
+
+@pytest.mark.variants(slow=IN_THE_GATE, release=set(CASES) - {*IN_EVERY_RUN, *IN_THE_GATE})
 @pytest.mark.parametrize("p", CASES.values(), ids=CASES)
 def test_the_classical_projection(p, on_one_warp):
     levels = [jax.vmap(lambda *of: Level(*of).scaled())(*level) for level in p.levels]
@@ -76,15 +77,10 @@ def of_family(name):
 IN_BOXES = {name: partial(in_a_box, p) for name, p in CASES.items()}
 IN_BOXES |= {name: partial(of_family, name) for name in saturation_families.FAMILIES}
 IN_BOXES |= {"recorded": partial(recorded_saturated, 1)}
-IN_EVERY_RUN = ("more than 32 of each", "no rows", "ties", "recorded")
-SLOW = ("a humanoid's", "more than 64 variables", "conflicting")
+SLOW = ("a humanoid's", "more than 32 of each", "no rows")
 
 
-# each shape is compiled for ten seconds
-@pytest.mark.variants(
-    slow=SLOW,
-    release=[name for name in IN_BOXES if name not in IN_EVERY_RUN + SLOW],
-)
+@pytest.mark.variants(slow=SLOW, release=set(IN_BOXES) - {"ties", "recorded", *SLOW})
 @pytest.mark.parametrize("name", IN_BOXES)
 def test_saturation(name, on_one_warp):
     p = IN_BOXES[name]()

@@ -22,7 +22,7 @@ def ran(folder: Path, *flags: str) -> int:
     return int(done.stdout)
 
 
-@pytest.mark.variants(slow=["wide"])
+@pytest.mark.variants(slow=["narrow"], release=["wide"])
 @pytest.mark.parametrize("packs", ["narrow", "wide"])
 def test_parts_are_right_and_sanitizers_find_nothing(packs, tmp_path):
     """Packs of columns are as wide as the instruction set has them."""

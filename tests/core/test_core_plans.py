@@ -47,8 +47,7 @@ def agree(kernel, plain):
     np.testing.assert_allclose(kernel.q, plain.q, rtol=1e-7, atol=1e-8)
 
 
-@pytest.mark.slow
-@pytest.mark.variants(slow=["settled"], release=["mended"])
+@pytest.mark.variants(slow=["ready"], release=["settled", "mended"])
 @pytest.mark.parametrize("until", ["ready", "settled", "mended"])
 def test_a_plan_is_improved_as_by_the_plain_method(until, nao, motion):
     clip, q = clip_of(nao, motion)
@@ -108,7 +107,7 @@ def test_a_batch_is_what_each_clip_is_alone(nao, motion):
         np.testing.assert_array_equal(together.cost[i], alone.cost)
 
 
-@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["kernel", "plain"])
+@pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.release)], ids=["kernel", "plain"])
 def test_what_cannot_be_solved_moves_nothing(nao, motion, number):
     clip, q = clip_of(nao, motion, 0.02)
     wrong = clip._replace(bounds=clip.bounds._replace(lower=jnp.full_like(clip.bounds.lower, jnp.nan)))

@@ -67,6 +67,7 @@ def test_lane_by_lane_as_the_plain_method(m):
     assert found.factorizations.max() > 3 and found.iterations.max() > 5
 
 
+@pytest.mark.slow
 def test_no_candidate_is_left_to_the_search_where_dampings_are_weak():
     """Dampings from 1e-6, fewer rows than variables: the rows' system has a condition of 1e9."""
     p = problems(10_000, seed=1)
@@ -162,6 +163,7 @@ def test_problems_before_say_nothing():
         jax.tree.map(np.testing.assert_array_equal, first, after)
 
 
+@pytest.mark.slow
 def test_derivatives_against_central_differences():
     """Along one direction of all data, forward and reverse."""
     p = problems(seed=6, weakest=1e-1)

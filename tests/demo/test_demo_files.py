@@ -83,7 +83,8 @@ def test_a_gantry_goes_left():
     np.testing.assert_allclose(goal.path.at(1.0)[0][0] - goal.path.position, [0.0, 0.05, 0.0], atol=1e-12)
 
 
-@pytest.mark.parametrize(("length", "scale"), [(100 / 7, 10.0), (0.01 / 7, 0.0345)])
+@pytest.mark.variants(slow=["huge"])
+@pytest.mark.parametrize(("length", "scale"), [(100 / 7, 10.0), (0.01 / 7, 0.0345)], ids=["huge", "tiny"])
 def test_huge_and_tiny_robots_move_in_proportion(length, scale):
     motion = motion_of(chain(length, (Z, Y, Y, X, Y, Z, Y)))
     assert motion.scale == pytest.approx(scale, rel=0.15)

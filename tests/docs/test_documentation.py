@@ -61,24 +61,15 @@ def heading_anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-IN_THE_GATE = ["tutorial", "the_loop", "conventions", "robots", "ros2", "choosing_a_scheme", "deploying", "pytorch"]
-IN_THE_GATE += ["reinforcement_learning", "porting", "jogging", "own_task", "calibration", "motion", "placement"]
-AT_NIGHT = [
-    "batches",
-    "inverse_kinematics",
-    "retargeting",
-    "scaling",
-    "solvers",
-    "tasks_and_limits",
-    "tuning",
-    "viewer",
-]
+WITH_CODE = {relative(page): page for page in PAGES if BLOCK.search(page.read_text())}
+IN_THE_GATE = ["the_loop", "conventions", "robots", "choosing_a_scheme", "deploying", "own_task"]
+IN_THE_GATE += ["reinforcement_learning", "porting"]
+IN_THE_GATE = [f"docs/{page}.md" for page in IN_THE_GATE]
+QUICK = ["README.md", "docs/index.md", "docs/installation.md", "docs/physics.md", "docs/traced_vs_static.md"]
 
 
-@pytest.mark.variants(**{t: [f"docs/{p}.md" for p in ps] for t, ps in (("slow", IN_THE_GATE), ("release", AT_NIGHT))})
-@pytest.mark.parametrize(
-    "page", [pytest.param(page, id=relative(page)) for page in PAGES if BLOCK.search(page.read_text())]
-)
+@pytest.mark.variants(slow=IN_THE_GATE, release=WITH_CODE.keys() - {*IN_THE_GATE, *QUICK})
+@pytest.mark.parametrize("page", WITH_CODE.values(), ids=WITH_CODE)
 def test_code_runs(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

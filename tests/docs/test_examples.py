@@ -186,7 +186,7 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
-IN_THE_GATE = [so101_teleoperation, allegro_grasp, retarget_a_person]
+IN_THE_GATE = [so101_teleoperation, retarget_a_person]
 AT_NIGHT = [check for check in CHECKS if check not in IN_THE_GATE]
 
 

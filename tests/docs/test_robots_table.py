@@ -49,6 +49,7 @@ def test_a_wrong_pose_is_seen():
     assert 1e-3 / np.sqrt(3.0) <= robots_table.pose_error("arm7", longer) <= 1.000001e-3
 
 
+@pytest.mark.slow
 def test_a_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(robots_table, "CALLS", 2)
     row = robots_table.row("ur5")

@@ -82,6 +82,7 @@ def test_cleared_caches_give_memory_maps_back():
     assert after - before < 0.2 * (grown - before)
 
 
+@pytest.mark.slow
 def test_solve_and_rollout_report_their_programs(monkeypatch):
     seen: dict[str, Any] = {}
     for module in ("_step", "_rollout"):

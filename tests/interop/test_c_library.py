@@ -128,7 +128,9 @@ def nao() -> tuple[osik.Robot, dict[str, osik.Task]]:
     return robot, {**feet, "com": com, "hand": hand, "rest": osik.PostureTask(robot, priority=3)}
 
 
-@pytest.mark.variants(release=["arm-hierarchy", "nao-weighted", "arm-null-space", "nao-saturated"])
+@pytest.mark.variants(
+    release=["arm-hierarchy", "arm-null-space", "arm-saturated", "nao-weighted", "nao-null-space", "nao-saturated"]
+)
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("make", [arm, nao], ids=["arm", "nao"])
 def test_ten_thousand_steps_are_those_of_python(built, tmp_path, make: Callable[[], Any], scheme):

@@ -159,7 +159,7 @@ def test_right_files_are_taken_and_wrong_ones_are_refused_or_finite(saved, tmp_p
     assert refused > 200 and taken > 20
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_sanitizers_find_nothing_in_wrong_files(saved, tmp_path):
     own = program(tmp_path, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=undefined")
     assert run(own, saved) == (0, len(saved))

@@ -296,6 +296,7 @@ class TestTargets:
         assert run.outputs[-1].level == 0
         np.testing.assert_array_equal(run.memory.targets["hand"][0], [0.4, 0.0, 0.5])
 
+    @pytest.mark.slow
     def test_in_the_frame_of_a_base_that_moves_freely(self, nao):
         run = started(nao, {"LKneePitch": 0.6, "LAnklePitch": -0.3, "LHipPitch": -0.3})
         body = mujoco_at(nao.robot, run.memory.q).body("torso")

@@ -23,6 +23,7 @@ def poses_of(robot, frames, q):
 
 
 @needs_core
+@pytest.mark.variants(slow=["tree"])
 @pytest.mark.parametrize("name", ["arm7", "tree"])
 def test_the_answer_of_the_core_is_that_of_the_definition(name, rng):
     """At the configuration that it found: residuals, errors, limits that stop it, and the bound on its reach."""
@@ -74,6 +75,7 @@ def test_one_target_is_answered_as_in_a_batch(rng):
 
 
 @needs_core
+@pytest.mark.slow
 def test_nearest_is_never_farther_than_the_plain_call(rng):
     """From a corner of the joint ranges, where the pull towards it keeps searches from solutions."""
     arm = osik.load_robot("ur5")

@@ -49,10 +49,11 @@ PREFERENCES = {
 }
 
 
-@pytest.mark.variants(slow=[name for name in PREFERENCES if name != "DampingTask"])
-@pytest.mark.parametrize("name", PREFERENCES)
+@pytest.mark.variants(slow=["all"], release=PREFERENCES)
+@pytest.mark.parametrize("name", ["all", *PREFERENCES])
 def test_tasks_on_velocities_are_preferences_that_give_way(planar, name):
-    answer = found(planar, {"tip": tip(planar), "soft": PREFERENCES[name](planar)})
+    chosen = {one: make(planar) for one, make in PREFERENCES.items() if name in ("all", one)}
+    answer = found(planar, {"tip": tip(planar), **chosen})
     assert answer.converged and set(answer.residual) == {"tip"}
 
 
@@ -65,6 +66,7 @@ def test_a_heavy_preference_gives_way_inside_jit_too(planar):
     np.testing.assert_allclose(where, REACH - [0.1, 0, 0], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_frozen_joints_stay_as_in_q0(planar):
     q0 = jnp.array([0.7, 1.0, -0.3])
     held = found(planar, {"tip": tip(planar), "still": osik.FreezeTask(planar, ("b",))}, q0=q0)
@@ -98,7 +100,8 @@ def test_frozen_joints_have_no_derivative(planar):
     np.testing.assert_allclose(place, np.eye(2), atol=1e-5)
 
 
-@pytest.mark.parametrize("top", [0.1, pytest.param(1.3, marks=pytest.mark.slow)])
+@pytest.mark.variants(slow=["0.1"], release=["1.3"])
+@pytest.mark.parametrize("top", [0.1, 1.3])
 def test_a_hard_limit_task_has_to_be_met(planar, top):
     limit = osik.LimitTask(planar, osik.ConfigurationLimit(planar, upper={"*": top}, lower={"*": -top}), hard=True)
     answer = found(planar, {"tip": tip(planar), "range": limit})
@@ -106,6 +109,7 @@ def test_a_hard_limit_task_has_to_be_met(planar, top):
     assert bool(answer.converged) == (top == 1.3) and worst < 1e-3
 
 
+@pytest.mark.slow
 def test_says_how_far_a_free_base_went():
     robot = osik.Robot.from_mjcf(PLANAR.format(free='<freejoint name="base"/>'))
     far = REACH + np.array([1.0, 0.0, 0.0])
@@ -135,7 +139,7 @@ TURNS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["posture"], release=["one joint"])
 @pytest.mark.parametrize("name", TURNS)
 def test_branches_are_counted_modulo_whole_turns_beside_a_posture(name):
     robot = osik.Robot.from_mjcf(TWO)
@@ -154,6 +158,7 @@ def test_samples_of_a_continuum_are_not_isolated(planar):
     assert straight.isolated.tolist() == [True] * 2 + [False] * 14
 
 
+@pytest.mark.variants(slow=["5.0"], release=["0.5"])
 @pytest.mark.parametrize("x", [5.0, 0.5])
 def test_reach_with_slides_is_that_of_their_ends(x):
     robot = osik.Robot.from_mjcf(GANTRY.format(x=x))

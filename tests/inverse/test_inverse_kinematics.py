@@ -138,6 +138,7 @@ def test_nearest_is_the_nearest_of_the_closed_form(planar):
         np.testing.assert_allclose(found.q, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 def test_nearest_finds_what_the_plain_call_finds(rng):
     """From a configuration outside of its limits, where searches near home stay; by numbers and while tracing."""
@@ -322,7 +323,7 @@ GIMBAL = (
 )
 
 
-@pytest.mark.variants(slow=["place1-float32"])
+@pytest.mark.variants(slow=["place0-float64"], release=["place1-float32"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize("place, kind", [((0, 0, 0), "float64"), ((0.3, -2.0, 1.0), "float32")])
 def test_joints_whose_axes_meet_in_the_frame(place, kind):

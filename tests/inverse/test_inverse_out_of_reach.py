@@ -149,7 +149,7 @@ def test_explain_counts_rows_and_names_those_to_leave_out(arm):
     assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["two"], release=["one"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize(
     "slide, ways", [("", 1), ('<joint name="slide" type="slide" axis="1 0 0"/>', 2)], ids=["one", "two"]
@@ -179,7 +179,7 @@ def test_explain_counts_the_motions_that_keep_closed_loops(slide, ways):
 
 
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
-@pytest.mark.variants(slow=["float32-1e+30"])
+@pytest.mark.variants(slow=["float64-1e+200"], release=["float32-1e+30"])
 @pytest.mark.parametrize("kind, far", [(jnp.float64, 1e200), (jnp.float32, 1e30)])
 def test_a_target_whose_square_is_not_finite_has_a_finite_answer(kind, far):
     """While tracing and from the host; the neighbour is found."""
@@ -215,7 +215,7 @@ def differences(function, at, step=1e-6):
     return np.stack([(function(*at + step * e) - function(*at - step * e)) / (2.0 * step) for e in np.eye(2)], -1)
 
 
-@pytest.mark.variants(slow=["a task", "a level", "hard"])
+@pytest.mark.variants(slow=["a pose"], release=["a task", "a level", "hard"])
 @pytest.mark.parametrize("by", ["a pose", "a task", "a level", "hard"])
 def test_derivative_out_of_reach_is_that_of_the_nearest_configuration(planar, by):
     """In closed form: stretched towards the target, and with the first joint at its limit; a posture gives way."""
@@ -248,7 +248,7 @@ def tip_of_two_links(q):
     return 0.5 * np.array([np.cos(q[0]), np.sin(q[0])]) + 0.4 * np.array([np.cos(q.sum()), np.sin(q.sum())])
 
 
-@pytest.mark.slow
+@pytest.mark.variants(slow=["pose"], release=["position"])
 @pytest.mark.parametrize("frames", ["position", "pose"])
 def test_errors_of_an_arm_out_of_reach_have_the_derivatives_of_the_answer(arm, frames):
     """Against central differences of the least error itself, which is unique where its configuration is not."""

@@ -123,6 +123,7 @@ class TestBarrier:
         steep = eqx.tree_at(lambda limit: limit.gain, wall, jnp.asarray(1e6))
         np.testing.assert_allclose(asked(flying, steep, q)[1].upper, (upper - value) / DT, rtol=1e-12, atol=1e-10)
 
+    @pytest.mark.slow
     def test_a_hand_that_wants_through(self, arm):
         """The hand slides along the walls, and does not pass them by more than the path curves in a step."""
         p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")

@@ -129,7 +129,7 @@ BEYOND = np.array([1.5, -0.5])
 """Joint a is 0.45 rad beyond its range; no other configuration brings the tip to this pose."""
 
 
-@pytest.mark.variants(release=["barrier"])
+@pytest.mark.variants(slow=["speed"], release=["barrier"])
 @pytest.mark.parametrize("name", ["speed", "barrier"])
 def test_inverse_kinematics_keeps_the_ranges_beside_other_limits(arm, name):
     limits = {"speed": osik.VelocityLimit(arm), "barrier": added(arm)["barrier"]}

@@ -143,22 +143,25 @@ def test_limits_that_are_too_low_make_it_lag() -> None:
     np.testing.assert_allclose(np.abs(found.at(np.linspace(0.1, 1.0, 500))[1, :, 0]).max(), 0.3, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_central_differences(rng) -> None:
     points, weights = walk(rng, 0.2), rng.normal(size=(4, 7))
     time = np.array([0.2, 0.5, 0.77, 0.9])
 
+    @jax.jit
+    @partial(jax.value_and_grad, argnums=(0, 1, 2))
     def value(points, velocity, acceleration):
         found = planned(points, (HOME, velocity, REST), 0.0, LIMITS | {"acceleration": acceleration}, rest=False)
         return jnp.sum(weights * found.at(time)[0])
 
     given = jnp.asarray(points), jnp.full(7, 0.1), jnp.asarray(4.0)
-    gradients = jax.grad(value, argnums=(0, 1, 2))(*given)
-    for place, gradient in enumerate(gradients):
+    for place, gradient in enumerate(value(*given)[1]):
         change = jnp.asarray(rng.normal(size=gradient.shape))
-        ends = [value(*(a + h * change if i == place else a for i, a in enumerate(given))) for h in (1e-6, -1e-6)]
+        ends = [value(*(a + h * change if i == place else a for i, a in enumerate(given)))[0] for h in (1e-6, -1e-6)]
         np.testing.assert_allclose(jnp.sum(gradient * change), (ends[0] - ends[1]) / 2e-6, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_many_chunks_in_one_call(rng) -> None:
     points = np.stack([walk(rng) for _ in range(3)])
     run = partial(planned, start=(HOME, REST, REST), begin=0.0, limits=LIMITS)
@@ -213,14 +216,10 @@ def test_a_start_that_cannot_be_stopped_is_named() -> None:
 @pytest.mark.parametrize(
     "more, message",
     [
-        ({"times": TIMES[::-1]}, "times have to increase; time 1 is 0.909091 after 1"),
         ({"waypoints": HOME[None], "times": TIMES[:1]}, "two waypoints or more"),
         ({"times": TIMES[:5]}, r"5 times need \(5, 7\)"),
         ({"waypoints": np.full((12, 7), np.nan)}, "waypoint 0 is not finite"),
-        ({"begin": 1.0}, "begin is 1; it is before the last waypoint"),
         ({"start": (HOME, REST)}, "start is .position, velocity, acceleration., of 7 joints each"),
-        ({"start": (HOME + 9.0, REST, REST)}, "start has the position .* of 'joint1', whose limit is -2.89"),
-        ({"start": (HOME, REST + 2.0, REST)}, "start has the velocity 2 of 'joint1', whose limit is at most 1.5"),
         ({"start": (HOME, REST, REST - 5.0)}, "start has the acceleration -5 of 'joint1', whose limit is at most 4"),
         ({"jerk": 0.0}, "limits of jerk are positive"),
         ({"cells": 4}, "cells is 4; it is an integer, at least 8"),

@@ -94,9 +94,10 @@ def test_the_time_is_least() -> None:
 ARGUMENTS = jnp.asarray(POINTS), jnp.asarray(VELOCITY), jnp.asarray(ACCELERATION), jnp.asarray(JERK)
 
 
-@partial(jax.jit, static_argnames=("kind", "smooth"))
-def gradient(kind: int, smooth: bool, *given):
-    return jax.grad(lambda *given: run(*given, smooth=smooth).duration, argnums=kind)(*given)
+@partial(jax.jit, static_argnames="smooth")
+def gradient(smooth: bool, *given):
+    """By all arguments at once: a program for each would take as long to compile."""
+    return jax.grad(lambda *given: run(*given, smooth=smooth).duration, argnums=(0, 1, 2, 3))(*given)
 
 
 def check_slope(kind: int, smooth: bool, seed: int = 0) -> None:
@@ -109,7 +110,7 @@ def check_slope(kind: int, smooth: bool, seed: int = 0) -> None:
         given = [a + sign * change if i == kind else a for i, a in enumerate(arguments)]
         ends.append(float(run(*given, smooth=smooth).duration))
     wanted = (ends[0] - ends[1]) / (2.0 * step)
-    np.testing.assert_allclose((gradient(kind, smooth, *arguments) * change).sum(), wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose((gradient(smooth, *arguments)[kind] * change).sum(), wanted, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2])
@@ -127,9 +128,10 @@ def test_with_jerk_too_stretch_and_grid_count(kind, seed) -> None:
 @pytest.mark.slow
 def test_both_modes_give_the_same_derivative_with_jerk() -> None:
     moved = jax.jvp(lambda points: run(points, smooth=True).duration, (ARGUMENTS[0],), (ARGUMENTS[0] ** 2,))[1]
-    np.testing.assert_allclose(moved, (gradient(0, True, *ARGUMENTS) * ARGUMENTS[0] ** 2).sum(), rtol=1e-9)
+    np.testing.assert_allclose(moved, (gradient(True, *ARGUMENTS)[0] * ARGUMENTS[0] ** 2).sum(), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_a_limit_of_speed_gradients_are_finite() -> None:
     def duration(points, acceleration):
         return retime(points, acceleration=acceleration, cells=40).duration
@@ -163,6 +165,7 @@ def test_many_paths_in_one_call() -> None:
     np.testing.assert_allclose(jax.vmap(lambda points: run(points).duration)(paths)[2:], many[2:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     arm = osik.load_robot("arm7")
     points = np.asarray(arm.q0) + np.linspace(0.0, 1.0, 5)[:, None] * np.array([0.8, 0.3, 0.2, 0.4, 0.0, 0.2, 0.0])
@@ -178,25 +181,12 @@ def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     assert parts[0].joint in timing.joints and parts[0].slowest < 0.05
 
 
-def test_a_waypoint_outside_of_its_range_is_named() -> None:
-    arm = osik.load_robot("arm7")
-    points = np.asarray(arm.q0) + np.linspace(0.0, 3.0, 4)[:, None] * np.eye(7)[0]
-    with pytest.raises(osik.OsikError, match="waypoint 3 has 3 of 'joint1', whose range is -2.8973 to 2.8973"):
-        retime(points, robot=arm, acceleration=5.0)
-
-
 @pytest.mark.parametrize(
     "points, more, message",
     [
-        (POINTS[:1], {}, "two or more"),
-        (POINTS[[0, 1, 1, 2]], {}, "waypoints 1 and 2 are equal"),
         (np.full((3, 3), np.nan), {}, "waypoint 0 is not finite"),
-        (POINTS, {"acceleration": [1.0, 0.0, 1.0]}, "limits of acceleration are positive; these are not: 1 0"),
         (POINTS, {"velocity": -1.0}, "limits of velocity are positive"),
-        (POINTS, {"jerk": 0.0}, "limits of jerk are positive"),
-        (POINTS, {"acceleration": None}, "no limit of acceleration"),
         (POINTS, {"velocity": [1.0, 2.0]}, "velocity has shape"),
-        (POINTS, {"speed": 0.1}, "robot=, frame= and speed="),
         (POINTS, {"velocity": {"a": 1.0}}, "names need robot="),
     ],
 )
@@ -205,9 +195,11 @@ def test_what_cannot_be_is_refused(points, more, message) -> None:
         retime(points, **(LIMITS | more))
 
 
-def test_single_precision_is_finite_and_hardly_slower():
-    """128 paths with limits of jerk, of which rounding spoils the exact matrix of some."""
-    paths = np.cumsum(np.random.default_rng(0).normal(0.0, 0.5, (128, 6, 7)), axis=1)
+@pytest.mark.variants(release=["all"])
+@pytest.mark.parametrize("some", [[14, 42, 54, 67, 72, 85, 90, 126], slice(None)], ids=["spoilt", "all"])
+def test_single_precision_is_finite_and_hardly_slower(some):
+    """128 paths with limits of jerk; rounding spoils the exact matrix of eight."""
+    paths = np.cumsum(np.random.default_rng(0).normal(0.0, 0.5, (128, 6, 7)), axis=1)[some]
 
     @partial(jax.jit, static_argnames="kind")
     def durations(kind):

@@ -156,7 +156,7 @@ SHADOW = dict(thumb="rh_TH", index="rh_FF", middle="rh_MF", ring="rh_RF", little
 WRIST = '<joint name="WRJ2" axis="0 1 0" range="-30 10"/><joint name="WRJ1" axis="1 0 0" range="-40 28"/>'
 
 
-@pytest.mark.variants(slow=["coupled"], release=["two letters and a wrist"])
+@pytest.mark.variants(slow=["coupled"], release=["unnamed", "two letters and a wrist"])
 @pytest.mark.parametrize(
     ("names", "options", "axes"),
     [

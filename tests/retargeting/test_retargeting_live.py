@@ -131,6 +131,7 @@ def lifted_until(motion, frame, count, aside):
     return positions, np.array([[f >= frame, f >= frame, True, True] for f in range(count)])
 
 
+@pytest.mark.slow
 def test_feet_hold_where_a_frame_has_hardly_any_time(nao, motion):
     """A plan that breaks bounds gets more than the least iterations: with those alone the foot is 0.2 mm off."""
     fast = motion.resampled(120.0)

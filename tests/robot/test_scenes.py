@@ -92,7 +92,7 @@ def test_the_cube_has_no_part_in_the_robots_mass_and_momentum(nao, scene):
     assert "5.3" in repr(nao) and repr(scene).split("mass ")[1][:5] == repr(nao).split("mass ")[1][:5]
 
 
-@pytest.mark.variants(release=["cube first"])
+@pytest.mark.variants(slow=["cube last"], release=["cube first"])
 def test_kernels_leave_the_cube_out_too(nao, scene):
     _, whole = posed(nao, scene, seed=1)
     plain = of_masses(scene, whole)[:2]

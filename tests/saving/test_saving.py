@@ -180,7 +180,7 @@ def shaped(robot, frame) -> list[osik.Limit]:
     return [osik.CollisionAvoidanceLimit(robot, shapes=shapes, pairs=[("own", "table")])]
 
 
-@pytest.mark.variants(release=["mass of a locked joint", "shapes of fused links"])
+@pytest.mark.variants(release=["shape on a locked link", "mass of a locked joint", "shapes of fused links"])
 @pytest.mark.parametrize(
     "case", ["shapes of fused links", "mass of a locked joint", "shape on a locked link", "gear of a locked joint"]
 )

@@ -335,6 +335,7 @@ class TestNullSpace:
         assert room[2.0][-1] > 1.5 * room[2.0][0]
         assert np.abs(run[2.0].solution.error["position"]).max() < 1e-3
 
+    @pytest.mark.slow
     def test_says_by_how_much_it_leaves_the_box(self, arm, rng):
         q = configurations(arm, rng)
         ours = solve_lanes(arm, q, undamped())
@@ -396,6 +397,7 @@ class TestHierarchicalQP:
         )
         np.testing.assert_allclose(hierarchical.velocity, weighted.velocity, rtol=0, atol=1e-8)
 
+    @pytest.mark.slow
     def test_growing_weights_tend_to_it(self, arm, rng):
         q = configurations(arm, rng)
         strict = solve_lanes(arm, q, osik.HierarchicalQP(curvature_damping=0.0)).velocity
@@ -453,6 +455,7 @@ HELD = tree(
 )
 
 
+@pytest.mark.variants(slow=["jax-saturated"])
 @pytest.mark.parametrize("method", ["classical", "reverse", "saturated"])
 @pytest.mark.parametrize("backend", ["auto", "jax"])
 def test_a_joint_that_its_limits_hold_leaves_the_null_space_to_the_others(method, backend):
@@ -464,6 +467,7 @@ def test_a_joint_that_its_limits_hold_leaves_the_null_space_to_the_others(method
     np.testing.assert_allclose(solution.velocity[1:], 1.0, rtol=1e-6)
 
 
+@pytest.mark.variants(slow=["classical"], release=["saturated"])
 @pytest.mark.parametrize("method", ["saturated", "classical"])
 def test_damping_alone_leaves_a_residual_of_the_first_priority(method):
     """Out of reach, SOLVED and as exact as in reach; ``kkt_residual`` is not relative for this scheme."""

@@ -141,7 +141,7 @@ def weighted_answer(p: Problem, damping: float) -> np.ndarray:
 class TestAgainstOthers:
     """In each lane some rows of the limit bind."""
 
-    @pytest.mark.variants(slow=["inequality"])
+    @pytest.mark.variants(slow=["equality"], release=["inequality"])
     @pytest.mark.parametrize("hard", [("elbow",), ("elbow", "side")], ids=["equality", "inequality"])
     def test_weighted(self, arm, lanes, hard):
         some = cases(arm, lanes, hard=hard)
@@ -197,7 +197,7 @@ class TestAgainstOthers:
             box = np.maximum(np.maximum(p.box[0] - x, x - p.box[1]), 0.0).max()
             np.testing.assert_allclose(ours.box_violation[i], max(np.abs(broken).max(), box), atol=1e-12)
 
-    @pytest.mark.variants(release=["saturated"])
+    @pytest.mark.variants(slow=["reverse"], release=["saturated"])
     @pytest.mark.parametrize("name", ["saturated", "reverse"])
     def test_other_projections(self, arm, lanes, name):
         some = cases(arm, lanes, hard=("elbow",))
@@ -221,7 +221,7 @@ def spoiled(lanes):
     return tuple(map(jnp.asarray, (q, place, matrix, lower, upper)))
 
 
-@pytest.mark.variants(release=["saturated"])
+@pytest.mark.variants(slow=["hierarchical"], release=["saturated"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_contradictions_stay_in_their_lane(arm, lanes, spoiled, name):
     clean = solve_lanes(cases(arm, lanes), SCHEMES[name])

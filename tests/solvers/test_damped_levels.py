@@ -40,6 +40,7 @@ def projected(levels, damping):
     return x
 
 
+@pytest.mark.slow
 def test_free_levels_reach_what_projections_do(levels):
     @jax.jit
     @jax.vmap
@@ -96,6 +97,7 @@ def test_a_level_that_rows_above_stop_is_damped_as_out_of_reach(backend):
     np.testing.assert_allclose(jax.jvp(change, (0.0,), (1.0,))[1], expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_a_level_can_meet_is_not_damped():
     """In one dimension: max(0, unmet - s^2) at a demand of the size of the goal."""
     unbounded = jnp.full(1, jnp.inf)

@@ -31,6 +31,7 @@ def test_recorded_hierarchies_by_plain_jax(precision):
     assert np.abs(norms - r.residual_norm).max() < (1e-7 if precision == "float64" else 1e-6)
 
 
+@pytest.mark.slow
 def test_inequalities_at_any_level_and_weights_inside_a_level():
     box = jnp.full(2, 5.0)
     inequality_first = [Level([[1.0, 1.0]], [-jnp.inf], [1.0]), Level(jnp.eye(2), [2.0, 2.0], [2.0, 2.0])]
@@ -73,6 +74,7 @@ def test_known_equalities_are_kept_whatever_their_upper_bounds_round_to(rng, sol
             np.testing.assert_array_equal(s.warm_start.own[:, 0, :3], 2)
 
 
+@pytest.mark.slow
 def test_residual_tells_what_lower_levels_took():
     """Two rows nearer to parallel than the rank tolerance: the first level is one of them alone, for all below."""
     levels = [Level([[1.0, 0.0], [1.0, 1e-4]], [0.0, 0.0]), Level([[0.0, 1.0]], [1.0])]
@@ -85,6 +87,7 @@ def test_residual_tells_what_lower_levels_took():
     assert lost.kkt_residual >= np.linalg.norm(lost.slacks[0]) - 1e-12
 
 
+@pytest.mark.slow
 def test_level_without_rows_and_pinned_variables():
     levels = [Level(jnp.zeros((0, 3)), jnp.zeros(0), jnp.zeros(0)), Level(jnp.ones((1, 3)), [6.0], [6.0])]
     s = solve_hqp(levels, jnp.array([1.0, -jnp.inf, -10.0]), jnp.array([1.0, jnp.inf, 2.0]))
@@ -116,6 +119,7 @@ def test_shapes_that_do_not_fit_are_named():
         Level(jnp.ones((2, 4)), jnp.zeros(2), jnp.zeros(2), equalities=[True])
 
 
+@pytest.mark.slow
 def test_integers_are_floats():
     whole, box = [Level([[1, 1]], [0.5]), Level([[1, -1]], [0], [0], [2])], (np.full(2, -1.0), np.full(2, 1.0))
     assert whole[0].lower[0] == 0.5

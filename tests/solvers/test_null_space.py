@@ -136,6 +136,7 @@ cost_and_slope = jax.jit(jax.value_and_grad(cost))
 cost_along = jax.jit(lambda t, *given: jax.jvp(lambda t: cost(t, *given), (t,), (1.0,))[1])
 
 
+@pytest.mark.slow
 @pytest.mark.variants(release=["0.0"])
 @pytest.mark.parametrize("damping", [0.0, 0.05])
 def test_gradients_are_central_differences_in_both_modes(rng, damping):

@@ -57,6 +57,7 @@ def test_a_long_batch_in_a_program_of_single_precision():
     assert (off / np.abs(b).max(1)).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_rows_that_hold_the_answer_at_nought_hold():
     """The answer is 0, so its rounding is that of the cost's pull; the second row says what the first does."""
     for rows, strength in (([[0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1.0), ([[0.0, 1.0], [0.0, 1.0]], 1e-9)):
@@ -149,6 +150,7 @@ def test_numbers_are_looked_at_alike_together_and_apart(monkeypatch, name, value
     assert all(np.isfinite(a).all() for a in (*jax.tree.leaves(apart.cost), apart.rows, apart.compliance))
 
 
+@pytest.mark.slow
 def test_integers_are_floats():
     box = np.array([-1.0, -1.0]), np.array([1.0, 0.25])
     direct = solve_qp(np.eye(2, dtype=int), np.array([-1, -1]), *box)

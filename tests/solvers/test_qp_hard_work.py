@@ -67,6 +67,7 @@ def by_bounded_least_squares(data, i):
     return lsq_linear(matrix, right, box, method="bvls", tol=1e-15, max_iter=1000).x[:N]
 
 
+@pytest.mark.slow
 def test_rows_that_give_way_beside_weights_over_eight_decades():
     data = wide_problems(soft=True)
     s = batched(*data)
@@ -98,7 +99,7 @@ def test_the_verdict_is_that_of_a_linear_program(rng):
     assert len(np.unique(s.status)) == 2
 
 
-@pytest.mark.variants(slow=["2"], release=["1"])
+@pytest.mark.variants(slow=["0"], release=["1", "2"])
 @pytest.mark.parametrize("most", [0, 1, 2])
 def test_a_failed_step_is_safe(rng, most):
     data = problems(rng, soft=True)

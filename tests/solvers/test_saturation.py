@@ -421,7 +421,7 @@ def one_row_with_its_derivative(wanted, lower, upper, *, backend):
     return answer, derivative
 
 
-@pytest.mark.variants(slow=["jax-1e-07"], release=["core-0.1", "jax-0.1"])
+@pytest.mark.variants(slow=["core-1e-07"], release=["jax-1e-07", "core-0.1", "jax-0.1"])
 @pytest.mark.parametrize("excess", [0.1, 1e-7])
 @pytest.mark.parametrize("backend", ["jax", pytest.param("core", marks=needs_core)])
 def test_joints_at_bounds_where_the_whole_motion_ends_do_not_stop_it(backend, excess):

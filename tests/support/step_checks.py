@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 import osik_jax as osik
 from osik_jax.control import _compiled_step, _step
@@ -72,6 +73,15 @@ def plain(robot: osik.Robot, q: Any, *rest: Any) -> osik.Solution:
 def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
     for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance)
+
+
+def assert_slopes_are_differences(cost: Any, *given: Any) -> None:
+    """Assert that the gradient of a jitted function by all its arguments is that of central differences."""
+    found, _ = ravel_pytree(jax.jit(jax.grad(cost, argnums=tuple(range(len(given)))))(*given))
+    flat, tree = ravel_pytree(given)
+    wanted = [float(cost(*tree(flat + h)) - cost(*tree(flat - h))) / 2e-6 for h in 1e-6 * np.eye(len(flat))]
+    assert np.abs(wanted).max() > 1e-3
+    np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-9 * np.abs(wanted).max())
 
 
 def assert_alike_where_numbers_are_not_valid(given: Any, scheme: str) -> None:

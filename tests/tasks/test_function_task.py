@@ -90,6 +90,7 @@ def found(robot, tasks, configurations):
     return at_each(robot, tasks, configurations)
 
 
+@pytest.mark.slow
 def test_how_kinematics_change_is_what_differentiating_them_gives():
     """A body with four joints, one with a slide and a ball joint, a follower: every field, along every entry of v."""
     robot = osik.Robot.from_mjcf(mjcf("joints_of_one_body"))

@@ -215,7 +215,7 @@ class Height(osik.Task):
 FORMS = {"one array": True, "two arrays": False, "said to be an equality": True, "said to be an interval": False}
 
 
-@pytest.mark.variants(release=["WeightedQP", "HierarchicalQP"])
+@pytest.mark.variants(slow=["NullSpace"], release=["WeightedQP", "HierarchicalQP"])
 @pytest.mark.parametrize(
     "scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace()], ids=lambda s: type(s).__name__
 )

@@ -62,6 +62,7 @@ class TestInequalities:
         np.testing.assert_array_equal(rows["joints"].upper, np.full(2, np.inf))
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_with_infinite_bounds(nao):
     tasks = {
         "com": osik.ComTask(nao, upper=[0.1, np.inf, np.inf], gain=osik.AdaptiveGain(5.0, 1.0, 2.0)),

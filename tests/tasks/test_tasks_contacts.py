@@ -112,6 +112,7 @@ class TestContacts:
         np.testing.assert_allclose(R, anchor[1], atol=1e-6)
         assert np.linalg.norm(path.q[-1] - path.q[60]) > 0.01
 
+    @pytest.mark.slow
     def test_a_point_slides_on_a_ramp(self, walker):
         """A toe pulled along and into a ramp stays on it, and goes where along it the pull is."""
         target = np.array([0.6, 0.5, -0.5]), np.eye(3)
@@ -210,6 +211,7 @@ class TestWheels:
         np.testing.assert_allclose(q[:, 2], 0.05 * (1.0 - 10.0 * dt) ** np.arange(steps + 1), atol=1e-9)
         assert (np.asarray(path.solution.status) == osik.Status.SOLVED).all()
 
+    @pytest.mark.slow
     def test_a_cart_follows_its_nose(self, cart):
         """Pulled to its side it cannot go there, pulled ahead its wheels turn."""
         tasks = {name: osik.WheelTask(cart, name, radius=RADIUS, hard=True) for name in ("left", "right")}

@@ -153,6 +153,7 @@ class TestKineticEnergy:
             cost = rows.weight[k] @ (rows.jacobian[k] @ v) ** 2 / 2.0
             assert cost == pytest.approx(0.5 * data.energy[1], rel=1e-11)
 
+    @pytest.mark.slow
     def test_of_all_motions_the_least_energy(self, robot, states, oracles):
         """Khatib's inertia-weighted inverse, from MuJoCo's mass matrix and Jacobian."""
         rate = np.array([0.3, -0.2, 0.1, 0.0, 0.0, 0.0])
@@ -210,6 +211,7 @@ def _index(robot, **options):
 
 
 class TestManipulability:
+    @pytest.mark.variants(slow=["position"], release=["orientation"])
     @pytest.mark.parametrize("rows", ["pose", "position", "orientation"])
     def test_index_and_slope_are_pinks(self, panda, rows):
         model = pin.buildModelFromUrdf(str(example_urdf("panda")))

@@ -324,6 +324,7 @@ class TestBatchesAndCompilation:
         moving = {k: task.replace(target_velocity=0.1) for k, task in tasks.items()}
         assert_every_number_counts(robot, moving, q, idle=("['mask']", "['position']", "['orientation']"))
 
+    @pytest.mark.slow
     def test_what_is_no_number_is_said(self, head):
         """A lane spoiled through any leaf stands still and has the status; its neighbours do not notice."""
         task = osik.LookAtTask(head, "head", axis=(1.0, 0.0, 0.0), target=(0.5, 1.0, 0.1), half_angle=0.2)

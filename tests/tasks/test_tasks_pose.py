@@ -238,6 +238,7 @@ class TestLengthOfARadian:
         for task in (osik.FrameTask(arm, "hand"), osik.RelativeFrameTask(arm, "hand", "link3")):
             np.testing.assert_allclose(task.orientation_weight / task.position_weight, length**2, rtol=1e-12)
 
+    @pytest.mark.slow
     def test_the_loop_rests_where_inverse_kinematics_finds_the_least_error(self, arm: osik.Robot) -> None:
         """Out of reach the loop trades position for orientation as ``inverse_kinematics`` does."""
         target = np.array([1.2, 0.3, 0.5]), np.array([0.0, 1.0, 0.0, 0.0])

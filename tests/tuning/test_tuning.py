@@ -427,6 +427,7 @@ def _steep(trajectory, loop):
     return jnp.sqrt(gain) * 1e-3
 
 
+@pytest.mark.slow
 def test_progress_shows_the_loss(loop, scenarios, capsys):
     tuned = run(loop, scenarios[:3], held_out=scenarios[3:], progress=True)
     shown = capsys.readouterr().err

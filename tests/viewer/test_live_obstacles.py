@@ -155,6 +155,7 @@ def test_a_hand_sent_into_its_own_arm(desk: Desk) -> None:
     assert 3.0 * MARGIN > nearest > MARGIN - 1e-3  # it came near, and no nearer
 
 
+@pytest.mark.slow
 def test_adding_moving_and_removing_compiles_nothing(desk: Desk) -> None:
     program = desk.loop._job
     assert desk.add_obstacle("box", np.array([0.0, 2.0, 0.5]), 1.0) == "box 1"
