@@ -72,7 +72,7 @@ def clearance(robot: Robot, q: Float[ArrayLike, "*n nq"], scene: Scene, *, srdf:
         srdf: pairs that may touch, as for ``inverse_kinematics``.
 
     Raises:
-        OsikError: no compiled core, or no CPU.
+        OsikError: no compiled core for this device.
         ValueError: numbers of scenes and configurations that do not go together; q of another length.
     """
     shapes, q, lead = _prepared(robot, q, scene, srdf, "clearance")

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
-from ..core import _cuda
-from ..execution._platform import cuda_is_default
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, scalar_layout
 from ..tasks import Task
@@ -18,7 +16,7 @@ from ._chain import Chain, Layout, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
 from ._fixed import at_solution
 from ._implicit import errors_at
-from ._pool import Errors, Pace
+from ._pool import Errors
 from ._reach import ROUNDOFF, Reach, beyond, norm, reaches
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
@@ -72,11 +70,6 @@ class ChainRoute(NamedTuple):
     def starts_anew(self) -> bool:
         """Return whether the search for the least error starts anew, and is part of traced programs."""
         return True
-
-    @property
-    def pace(self) -> Pace:
-        """Return the rhythm of its searches: a kernel on a GPU ends each by itself, and launching it takes longest."""
-        return Pace(16, 20) if self.by_core and cuda_is_default() and _cuda.installed() else Pace()
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
         """Return the search for these frames."""

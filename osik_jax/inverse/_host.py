@@ -20,13 +20,14 @@ to here, so that few programs are compiled.
 _MOST_LANES = {"cpu": 128}
 _OTHER_LANES = 131072
 """Searches that go on together: as many as a core's cache holds, or as keep a GPU busy."""
-_FEWEST_LANES = 16
+_FEWEST_LANES, _EACH = 16, 8
+"""The least; and searches for a target that a GPU goes on with together, where there are few."""
 
 
-def lanes_for(targets: int, each: int) -> int:
-    """Return the number of simultaneous searches for this number of targets; ``each``: of one on a GPU."""
+def lanes_for(targets: int) -> int:
+    """Return the number of simultaneous searches for this number of targets."""
     backend = jax.default_backend()
-    wanted = targets if backend == "cpu" else each * targets
+    wanted = targets if backend == "cpu" else _EACH * targets
     return min(max(_power_of_two(wanted), _FEWEST_LANES), _MOST_LANES.get(backend, _OTHER_LANES))
 
 

@@ -124,8 +124,8 @@ def inverse_kinematics(
             quicker where many targets are out of reach and only ``converged`` is wanted.
         scene: obstacles. Only a configuration in which nothing touches is a solution then: no shape of the robot
             comes nearer than ``clearance`` to the scene or to another shape of the robot. A scene with a leading axis
-            has one for each target, for poses of frames that hinges and slides carry. On a CPU, with the compiled core.
-            Default: none, and shapes of the robot may touch.
+            has one for each target, for poses of frames that hinges and slides carry. With the compiled core; tasks,
+            ``nearest`` and ``all`` on a CPU alone. Default: none, and shapes of the robot may touch.
         clearance: smallest distance of all pairs of shapes [m].
         srdf: pairs that may touch, besides those of neighbouring bodies: path or text of an SRDF; ``True``: the file
             beside the robot's URDF.

@@ -14,18 +14,8 @@ TRIAL = 8
 """Steps that every search may take before it has to make progress."""
 PROGRESS = 0.7
 """A search goes on where a few steps have brought the cost below this, relative to what it was."""
-
-
-class Pace(NamedTuple):
-    """Rhythm of a pool of searches.
-
-    Attributes:
-        lanes: searches for a target that a GPU goes on with together, where there are few targets.
-        check: steps between two looks at how the lanes are doing.
-    """
-
-    lanes: int = 8
-    check: int = 4
+CHECK = 4
+"""Steps between two looks at how the searches are doing."""
 
 
 class Errors(NamedTuple):

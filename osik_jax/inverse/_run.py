@@ -19,7 +19,7 @@ from ._closest import Closest, closest
 from ._fixed import LAST, Explored, Outcomes, Searches, choose, or_far, or_plain, search_all, with_placeholders
 from ._host import in_chunks, lanes_for, only
 from ._packed import Packed, packed, unpacked
-from ._pool import Errors, run_pool
+from ._pool import CHECK, Errors, run_pool
 from ._solution import InverseKinematicsSolution
 from ._whole import whole, whole_is_possible
 
@@ -48,7 +48,7 @@ def searched(
     ``go_on``: to the configuration with the least error, for targets that are not met. ``wanted``: the targets that are
     searched for; default: all.
     """
-    lanes = lanes_for(len(jax.tree.leaves(goals)[0]), route.pace.lanes)
+    lanes = lanes_for(len(jax.tree.leaves(goals)[0]))
     run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
     hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route, every=False)
 
@@ -205,7 +205,7 @@ def _pooled(robot: Robot, given: Packed, *, route: Any, warm: bool, lanes: int) 
     search = route.search(robot, settings, warm=warm, near=False)
     most = jnp.where(route.beyond(search, goals) > 0.0, jnp.minimum(seeds, hopeless), seeds)
     limits = dict(seeds=most, longest=longest, enough=search.enough)
-    found = run_pool(search, goals, wanted, lanes=lanes, check=route.pace.check, **limits)
+    found = run_pool(search, goals, wanted, lanes=lanes, check=CHECK, **limits)
     return packed(or_far(route.answer(robot, search, goals, found.x, found.seed, found.steps), valid))
 
 

@@ -23,7 +23,7 @@ from ..schemes import Scheme
 from ..tasks import FrameTask, Task
 from ._chain_problem import Settings, allowed
 from ._fixed import at_solution
-from ._pool import Errors, Pace
+from ._pool import Errors
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_minimum import AT_LIMIT
@@ -62,11 +62,6 @@ class TaskRoute(NamedTuple):
     def starts_anew(self) -> bool:
         """Return False, because each copy of a scheme's step in a program takes long to compile."""
         return False
-
-    @property
-    def pace(self) -> Pace:
-        """Return the rhythm of its searches."""
-        return Pace()
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
         """Return the search for these tasks."""

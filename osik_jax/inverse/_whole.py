@@ -26,7 +26,7 @@ from ._chain_problem import STOPPED, ChainRoute, Settings, carried, dof_of_entri
 from ._chain_search import DAMPING, LEAST_DAMPING, ChainSearch, Goal
 from ._fixed import LAST, SETTLED, Searches, or_far, with_placeholders
 from ._linear import ISOLATED
-from ._pool import PROGRESS, TRIAL, Pace
+from ._pool import CHECK, PROGRESS, TRIAL
 from ._seeds import increments, shift_of
 from ._solution import InverseKinematicsSolution
 
@@ -197,7 +197,7 @@ def by_core(
     numbers = [*numbers_of(search, (DAMPING, LEAST_DAMPING)), search.low, search.high, search.home, tuned]
     flags = [how.warm, how.near, how.every, kind == jnp.float32]
     bits = [jax.lax.bitcast_convert_type(search.shift, jnp.int32), increments(n).view(np.int32)]
-    options = jnp.stack([jnp.int32(a) for a in (steps, Pace().check, TRIAL, LAST, how.seeds, nq, nv, *flags)])
+    options = jnp.stack([jnp.int32(a) for a in (steps, CHECK, TRIAL, LAST, how.seeds, nq, nv, *flags)])
     lists = jnp.stack([jnp.asarray(a, jnp.int32) for a in (*bits, search.turns, search.chain.layout.dofs, dofs)])
     shapes: list[Any] = [((targets, nq), float), ((targets, 3 + 6 * frames), float), ((targets, 3 + nv), int)]
     shapes += [((targets, how.seeds, n + 2), float)] * how.every
