@@ -10,6 +10,7 @@ import numpy as np
 
 from ._messages import told, writing
 from ._robots import read_robot
+from ._scene import InScene
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reach:
+class Reach(InScene):
     """Maps what a frame gets to: for each position of a grid, the share of orientations that it reaches.
 
     Writes the map and, beside it, a picture. What is finished is kept in a folder until then: the name of the map with
@@ -74,6 +75,7 @@ class Reach:
                 position_tolerance=self.position_tolerance,
                 orientation_tolerance=self.orientation_tolerance,
                 out=chunks,
+                **self.obstacles(),
             )
             found.save(self.out)
         written, picture = [str(self.out)], self.out.with_suffix(".png")

@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from .._progress import Progress
+from ..collision import Scene
+from ..collision._core import check_scene
+from ..collision._robot_shapes import Given, robot_shapes
 from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerance
@@ -40,6 +43,9 @@ def reachability_map(
     key: int = 0,
     position_tolerance: float = 1e-3,
     orientation_tolerance: float = 1e-2,
+    scene: Scene | None = None,
+    clearance: float = 0.0,
+    srdf: Given = None,
     out: str | os.PathLike[str] | None = None,
     progress: Progress = True,
 ) -> ReachabilityMap:
@@ -56,12 +62,14 @@ def reachability_map(
             put around all that the frame gets to, with one spacing and a margin.
         orientations: how many, spread evenly; or which: matrices (m, 3, 3), frame axes to world
             axes, or quaternions w x y z (m, 4).
-        limits: as in ``inverse_kinematics``; with a ``CollisionAvoidanceLimit`` a pose is reached where the robot keeps
-            clear, and takes much longer.
+        limits: as in ``inverse_kinematics``.
         seeds: searches for a pose, at most.
         key: an integer: other starts of the searches.
         position_tolerance: largest distance from a position [m].
         orientation_tolerance: largest angle to an orientation [rad].
+        scene: obstacles: a pose is reached where the robot touches neither them nor itself, as in
+            ``inverse_kinematics``.
+        clearance, srdf: with a scene, likewise.
         out: folder for what is finished, as in ``run_in_chunks``: called again with the same arguments, a job that was
             killed goes on where it was. Default: none.
         progress: whether to show a bar; or a function of the number of positions that are done and of all. Those that
@@ -97,6 +105,8 @@ def reachability_map(
     check_count("key", key, least=0)
     for tolerance in (position_tolerance, orientation_tolerance):
         checked_tolerance(tolerance, robot.q0.dtype)
+    if scene is not None:
+        check_scene(scene)
     limits = checked_limits(robot, limits)
     own = read_frame(robot, frame, limits, key)
     axes = around(own, grid) if isinstance(grid, int | np.integer) else checked_grid(grid)
@@ -105,8 +115,10 @@ def reachability_map(
     beyond = np.asarray(own.beyond_reach(jnp.asarray(positions, robot.q0.dtype)))
     near = np.flatnonzero(beyond <= 0.0)
     tolerances = dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
-    settings = dict(limits=limits, seeds=seeds, key=key, **tolerances)
-    found = _run(own, positions[near], rotations, settings, out, progress)
+    settings = dict(limits=limits, seeds=seeds, key=key, scene=scene, clearance=clearance, **tolerances)
+    # the pairs take part in what tells one job from another
+    pairs = None if scene is None else np.array(robot_shapes(robot, srdf).pairs)
+    found = _run(own, positions[near], rotations, settings, (srdf, pairs), out, progress)
     shape = tuple(len(axis) for axis in axes)
 
     def spread(values: np.ndarray, elsewhere: Any) -> np.ndarray:
@@ -144,6 +156,7 @@ def _run(
     positions: Float[np.ndarray, "n 3"],
     rotations: Float[np.ndarray, "m 3 3"],
     settings: dict[str, Any],
+    kept_apart: tuple[Given, Any],
     out: Any,
     progress: Progress,
 ) -> dict[str, np.ndarray]:
@@ -153,16 +166,19 @@ def _run(
     if not len(positions):
         return {name: np.zeros((0, *shape), kind) for name, (kind, shape) in like.items()}
 
-    def run(positions: Any, robot: Robot, rotations: Any, settings: dict[str, Any]) -> dict[str, Any]:
+    srdf, pairs = kept_apart
+
+    def run(positions: Any, robot: Robot, rotations: Any, settings: dict[str, Any], pairs: Any) -> dict[str, Any]:
+        del pairs
         if isinstance(positions, Tracer):  # only the shapes are asked for
             return {name: jnp.zeros((len(positions), *shape), kind) for name, (kind, shape) in like.items()}
-        return _reached(frame, positions, rotations, settings)
+        return _reached(frame, positions, rotations, dict(settings, srdf=srdf))
 
     found = run_in_chunks(
         run,
         positions,
         chunk=max(min(_POSES // count, len(positions)), 1),
-        shared=(frame.robot, rotations, settings),
+        shared=(frame.robot, rotations, settings, pairs),
         out=out,
         label=f"reachability of {frame.name}",
         progress=progress,

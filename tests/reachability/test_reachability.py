@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 import pytest
+from core_checks import needs_core
 from mujoco_states import mujoco_at
 from refusals import refuses
 
@@ -118,18 +119,13 @@ def test_configurations_are_where_the_map_says():
         assert ((q >= arm.position_lower) & (q <= arm.position_upper)).all()
 
 
-@pytest.mark.release
+@needs_core
 def test_an_obstacle_keeps_poses_from_being_reached(planar, planar_map):
     """A ball at the tip keeps clear of another, in the plane: what is nearer to that is not reached, what is far is."""
     ball, apart = np.array([0.43, 0.6, 0.0]), 0.2 + 0.05
-    shapes = {
-        "ball": osik.CollisionShape.sphere(0.2, ball),
-        "tip": osik.CollisionShape.sphere(0.05, frame="tip"),
-    }
-    clear = osik.CollisionAvoidanceLimit(
-        planar, pairs=[("ball", "tip")], shapes=shapes, minimum_distance=0.01, q0_distance=-np.inf
-    )
-    found = mapped(planar, limits=(osik.ConfigurationLimit(planar), clear), seeds=64)
+    shapes = {"ball": osik.CollisionShape.sphere(0.2, ball), "tip": osik.CollisionShape.sphere(0.05)}
+    scene = osik.Scene(shapes).attach("tip", planar, "tip")
+    found = mapped(planar, scene=scene, clearance=0.01, seeds=64)
     away = np.linalg.norm(found.positions - ball, axis=-1) - apart
     near = (away < 0.01 - 2e-3) & planar_map.reached.any(-1)
     assert near.sum() >= 2 and not found.reached[near].any()
