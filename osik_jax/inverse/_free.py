@@ -130,6 +130,8 @@ def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
 
 def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
     """Return the fields of an answer that name its nearest pairs."""
+    if pairs.ndim == 1:
+        return dict(nearest_pair=np.zeros((), np.int32), pairs=(shape_names(shapes.names, scene.names, pairs, 0),))
     flat, own_names = pairs.reshape(-1, 2), bool(scene.names) and isinstance(scene.names[0], tuple)
     of_scene = np.arange(len(flat)) * (own_names & (flat.max(-1, initial=-1) >= len(shapes.names)))
     codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))

@@ -77,8 +77,7 @@ def _nearest_rotation(given: Float[Numbers, "*B 3 3"]) -> tuple[Float[Numbers, "
     xp = module_of(given)
     eye = np.eye(3, dtype=given.dtype)
     residual = abs(_product(given, given.swapaxes(-1, -2)) - eye).max((-1, -2), keepdims=True)
-    first, second, third = (given[..., k, :] for k in range(3))
-    right_handed = (xp.cross(first, second) * third).sum(-1)[..., None, None] > 0.0
+    right_handed = _determinant(given)[..., None, None] > 0.0
     valid = (residual <= (1.0 + ROUNDED) ** 2 - 1.0) & right_handed
     exact = residual <= _EXACT * float(jnp.finfo(given.dtype).eps)
     safe = xp.where(valid, given, eye)
@@ -87,6 +86,13 @@ def _nearest_rotation(given: Float[Numbers, "*B 3 3"]) -> tuple[Float[Numbers, "
     else:
         rotation = jax.lax.cond(exact.all(), lambda matrix: matrix, _nearest, safe)
     return xp.where(valid, xp.where(exact, safe, rotation), np.nan), valid[..., 0, 0]
+
+
+def _determinant(given: Float[Numbers, "*B 3 3"]) -> Float[Numbers, "*B"]:
+    if module_of(given) is np:
+        return np.linalg.det(given)
+    first, second, third = (given[..., k, :] for k in range(3))
+    return (jnp.cross(first, second) * third).sum(-1)
 
 
 def _nearest(matrix: Float[Numbers, "*B 3 3"]) -> Float[Numbers, "*B 3 3"]:
