@@ -272,6 +272,8 @@ class Scene(eqx.Module):
 
     def contacts(self, shapes: RobotShapes) -> Bool[Numbers, "*n k r"]:
         """Return whether each shape of the scene may touch each shape of a robot, as ``allow`` and ``attach`` say."""
+        if not self.partners:
+            return np.zeros((*self.contact.shape[:-1], len(shapes.names)), bool)
         own = [*zip(shapes.names, shapes.links, strict=True)]
         found = [[any(_matches(name, partner) for name in names) for names in own] for partner in self.partners]
         matches = np.array(found, bool).reshape(len(self.partners), len(own))
