@@ -1,19 +1,19 @@
-"""Searches in scenes by the text of a GPU: on a CPU by one thread, and on a GPU where there is one."""
+"""Searches in scenes by the text of a GPU: by the threads of a warp on a CPU, and on a GPU where there is one."""
 
-import ctypes
-import os
-import subprocess
-from pathlib import Path
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import one_warp
 import pytest
 from core_checks import needs_core
 
 import osik_jax as osik
 from osik_jax.collision import _core
-from osik_jax.core import _build, _cuda
+from osik_jax.collision._core import are_free, core_robot, core_scene, gaps_at
+from osik_jax.collision._robot_shapes import robot_shapes
+from osik_jax.core import _cuda
 from osik_jax.execution._backends import cuda_is_default
 from osik_jax.inverse import _whole
 
@@ -45,54 +45,44 @@ def problems(robot: osik.Robot, count: int) -> tuple[tuple[np.ndarray, np.ndarra
     return (np.asarray(place), np.asarray(turn)), osik.Scene.stack(scenes)
 
 
-@pytest.fixture
-def by_the_gpus_text(tmp_path, monkeypatch):
-    """From here on, the calls of the core are those of groups of one thread."""
-    source = Path(__file__).parents[1] / "support" / "groups_on_one_thread.cpp"
-    built = tmp_path / "groups.so"
-    options = ["-std=c++20", "-O1", "-fPIC", "-shared", f"-I{_build.FOLDER}", str(source), "-o", str(built)]
-    subprocess.run([os.environ.get("CXX") or "c++", *options], check=True)
-    library = ctypes.CDLL(str(built))
-    for method in ("chain_find", "free_find", "clearances", "are_free"):
-        handler = jax.ffi.pycapsule(getattr(library, f"osik_{method}"))
-        jax.ffi.register_ffi_target(f"osik_group_{method}", handler, platform="cpu")
-
-    def call(method, shapes, *given, **_):
-        name = f"osik_group_{method}"
-        results = [jax.ShapeDtypeStruct(shape, np.float64 if kind is float else np.int32) for shape, kind in shapes]
-        arrays = [a.astype(np.float64 if np.issubdtype(a.dtype, np.floating) else np.int32) for a in given]
-        return jax.ffi.ffi_call(name, results)(*arrays)
-
-    _whole._program.cache_clear()
-    for module in (_core, _whole):
-        monkeypatch.setattr(module, "call_here", call)
-    jax.clear_caches()
-    yield
-    _whole._program.cache_clear()
-    jax.clear_caches()
-
-
 @pytest.mark.slow
-def test_one_thread_finds_free_configurations_as_the_core_measures_them(panda, request):
-    poses, scenes = problems(panda, 40)
-    q = np.random.default_rng(6).uniform(panda.position_lower, panda.position_upper, (40, panda.nq))
-    expected = osik.clearance(panda, q, scenes)
-    request.getfixturevalue("by_the_gpus_text")
-    own = osik.clearance(panda, q, scenes)
-    np.testing.assert_allclose(own.distance, expected.distance, atol=1e-9)
-    np.testing.assert_array_equal(own.pair, expected.pair)
-    assert (expected.distance < 0).sum() > 5  # depths too
-    np.testing.assert_array_equal(osik.is_free(panda, q, scenes), expected.distance >= 0)
-    found = osik.inverse_kinematics(panda, {HAND: poses}, scene=scenes, clearance=0.002)
-    anywhere = osik.inverse_kinematics(panda, {HAND: poses})
-    request.getfixturevalue("monkeypatch").undo()
-    _whole._program.cache_clear()
-    jax.clear_caches()
+def test_threads_of_a_warp_find_free_configurations(panda, tmp_path, monkeypatch):
+    """The GPU's text on a CPU: distances are the core's, and answers the same however many threads a target has."""
+    poses, scenes = problems(panda, 9)
+    rng = np.random.default_rng(6)
+    q = jnp.asarray(rng.uniform(panda.position_lower, panda.position_upper, (9, panda.nq)))
+    shapes = robot_shapes(panda, None)
+    own, arrays = core_robot(panda, shapes), core_scene(scenes, shapes)
+    expected = gaps_at(own, q, arrays)
     by_core = osik.inverse_kinematics(panda, {HAND: poses}, scene=scenes, clearance=0.002)
-    np.testing.assert_array_equal(found.converged, by_core.converged)
-    np.testing.assert_array_equal(found.obstruction, by_core.obstruction)
-    assert anywhere.converged.all() and 0 < by_core.converged.sum() < 40
-    check(panda, poses, scenes, found, 0.002)
+    assert 0 < by_core.converged.sum() < 9 and (expected.distance < 0).sum() > 1  # depths too
+    found = {}
+
+    def call(method, shapes, *given, sizes, members=1):
+        space = _cuda.space_of_lane("clearances" if method == "are_free" else method, *sizes)
+        return list(map(jnp.asarray, _cuda.call_lanes(method, shapes, *given, space=space, members=members)))
+
+    monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
+    monkeypatch.setattr(_core, "call_here", call)
+    monkeypatch.setattr(_whole, "call_here", call)
+    with jax.disable_jit():
+        gaps = gaps_at(own, q, arrays)
+        np.testing.assert_array_equal(are_free(own, q, arrays, jnp.zeros(1)), expected.distance >= 0)
+        monkeypatch.setattr(_whole, "cuda_is_default", lambda: True)
+        for members, threads in ((2, 64), (8, 128), (8, 16)):  # the last one in stages, two targets at a time
+            monkeypatch.setattr(_whole, "_MEMBERS", members)
+            monkeypatch.setattr(_whole, "_MOST_THREADS", threads)
+            monkeypatch.setattr(_whole, "_FIRST", 1)
+            found[members, threads] = osik.inverse_kinematics(panda, {HAND: poses}, scene=scenes, clearance=0.002)
+    monkeypatch.undo()
+    for one, other in zip(gaps, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-8)
+    for answers in found.values():
+        np.testing.assert_array_equal(answers.converged, by_core.converged)
+        np.testing.assert_array_equal(answers.obstruction, by_core.obstruction)
+        free = np.asarray(answers.converged)
+        np.testing.assert_allclose(np.asarray(answers.q)[free], np.asarray(found[2, 64].q)[free], atol=1e-12)
+        check(panda, poses, scenes, answers, 0.002)
 
 
 def check(robot, poses, scenes, found, clearance):

@@ -89,6 +89,23 @@ inline unsigned __ballot_sync(unsigned, bool own) {
     return bits;
   });
 }
+inline bool __any_sync(unsigned, bool own) {
+  return reduced(8, int(own), 0, [](int a, int b) { return a || b; });
+}
+inline int __reduce_min_sync(unsigned members, int own) {
+  return of_all(9, own, [&](auto of) {
+    int least = own;
+    for (int k = 0; k < 32; ++k) least = members >> k & 1 && of(k) < least ? of(k) : least;
+    return least;
+  });
+}
+template <class T> T __shfl_sync(unsigned, T own, int from, int width) {
+  return of_all(10, own, [&, me = threadIdx.x](auto of) { return of(me / width * width + from); });
+}
+inline void __syncthreads() {
+  if (blockDim.x > 1) __syncwarp();
+}
+inline int __popc(unsigned a) { return __builtin_popcount(a); }
 template <class T> T __ldg(const T* at) { return *at; }
 inline int __ffs(unsigned a) { return __builtin_ffs(int(a)); }
 inline int __clz(unsigned a) { return a ? __builtin_clz(a) : 32; }

@@ -23,6 +23,13 @@ extern "C" void run(void** a, int problems) {
   run_blocks(problems, (char*)osik::shared_space, BYTES, sizeof osik::shared_space, kernel);
 }
 """
+_GROUPS = """
+extern "C" void run(void** a, int problems) {
+  blockDim.x = 32;
+  char none[1];
+  run_blocks((problems * MEMBERS + 31) / 32, none, 0, 0, [&] { osik_kernel(ARGUMENTS, problems); });
+}
+"""
 _EACH_LANE = """
 extern "C" void run(void** a, int problems) {
   for (blockIdx.x = 0; blockIdx.x < problems; ++blockIdx.x) osik_kernel(ARGUMENTS, problems);
@@ -101,17 +108,29 @@ def call_of_lanes(
     *inputs: Any,
     problems: int,
     lanes_last: Sequence[bool],
+    per_block: int = 64,
     **_: Any,
 ) -> list[np.ndarray]:
-    """Compute a method of ``core/kinematic_calls.hpp`` for all lanes on a CPU, in place of ``core/_cuda.call``."""
+    """Compute a method of ``core/lanes_cuda.hpp`` for all lanes on a CPU, in place of ``core/_cuda.call``.
+
+    Lanes of several threads are those of a warp, which all run.
+    """
+    members = 64 // per_block
     given = [
-        np.ascontiguousarray(np.moveaxis(a, 0, -1) if last else a) for a, last in zip(inputs, lanes_last, strict=False)
+        np.ascontiguousarray(np.moveaxis(np.asarray(a), 0, -1) if last else a)
+        for a, last in zip(inputs, lanes_last, strict=False)
     ]
     orders = lanes_last[len(inputs) :]
     shapes = [(*shape[1:], shape[0]) if last else shape for (shape, _), last in zip(outputs, orders, strict=True)]
-    results = [np.full(shape, np.nan, kind) for shape, (_, kind) in zip(shapes, outputs, strict=True)]
+    results = [
+        np.full(shape, np.nan if jnp.issubdtype(kind, jnp.floating) else -9, kind)
+        for shape, (_, kind) in zip(shapes, outputs, strict=True)
+    ]
     pointers = (ctypes.c_void_p * (len(given) + len(results)))(*(a.ctypes.data for a in (*given, *results)))
-    compiled(folder, source + _EACH_LANE.replace("ARGUMENTS", arguments_of(source))).run(pointers, problems)
+    is_grouped = "const int members = a" in source
+    run = _GROUPS.replace("MEMBERS", str(members)) if is_grouped else _EACH_LANE
+    source = source.replace("__shared__ Real s", "static Real s")  # one of all threads
+    compiled(folder, source + run.replace("ARGUMENTS", arguments_of(source))).run(pointers, problems)
     return [np.moveaxis(a, -1, 0) if last else a for a, last in zip(results, orders, strict=True)]
 
 
