@@ -86,7 +86,7 @@ template <class R, class Sizes> struct ThreadCall {
   int least_of_members(int number) const { return __reduce_min_sync(group(), number); }
   static bool any(bool flag) { return __any_sync(~0u, flag); }
   static bool is_time(bool waits, bool goes_on) {
-    constexpr int ENOUGH = 16;
+    constexpr int ENOUGH = 24;
     const unsigned waiting = __ballot_sync(~0u, waits), going_on = __ballot_sync(~0u, goes_on);
     return waiting && (!going_on || __popc(waiting) >= ENOUGH);
   }

@@ -30,7 +30,7 @@ from ._pool import CHECK, PROGRESS, TRIAL
 from ._seeds import increments, shift_of
 from ._solution import InverseKinematicsSolution
 
-_MOST_THREADS = 1 << 17
+_MOST_THREADS = 1 << 18
 """Threads that keep a GPU busy."""
 _FIRST, _MEMBERS = 16, 32
 """Searches of each target by one thread, where there are many; then threads for each that is left."""
