@@ -18,6 +18,8 @@ from ._unknowns import Parameter
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_TOO_MUCH = 5.0
+"""Residuals by the given sigma that noise does not explain."""
 _SHOWN = 0.05
 """Least part of an unknown in a combination, by what it does to the measurements, that is shown."""
 
@@ -127,6 +129,11 @@ class Calibration(eqx.Module):
             lines.append(
                 f"{part.kind}: {len(part.after)} readings, rms {before:.4g} -> {after:.4g} {part.unit}, "
                 f"{noise:.2f} of the given sigma, {int((np.asarray(part.weights) < 0.1).sum())} outliers"
+            )
+        if (worst := float(np.max(self.noise))) > _TOO_MUCH:
+            lines.append(
+                f"residuals of {worst:.0f} sigma are no noise: outliers (loss='geman_mcclure'), numbers in other units "
+                "(SI: m and rad), a joint or an unknown that is missing"
             )
         for name, value, sigma, unit in zip(
             self.names, np.asarray(self.vector), np.asarray(self.deviation), self.units, strict=True

@@ -22,6 +22,8 @@ from ..numerics._host import Numbers, module_of
 from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
+_ROUNDING = 1e-6
+"""Of distances [m]."""
 """Coordinates of a base, in the order of the grid's axes."""
 
 
@@ -97,6 +99,11 @@ def base_clearances(
     return distance, [
         (objects[max(pair) - len(links)], links[min(pair)]) if min(pair) >= 0 else ("", "") for pair in pairs
     ]
+
+
+def stands_free(gap: Any, clearance: Any) -> Any:
+    """Return whether bases stand free; those that touch within rounding all do not."""
+    return gap >= clearance + _ROUNDING
 
 
 def shape_clearances(

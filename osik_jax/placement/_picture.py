@@ -31,7 +31,12 @@ def draw_placement(found: Any) -> Figure:
     bar = figure.colorbar(cells, shrink=0.8)
     bar.set_label(f"of {len(found.q)} poses reached, best yaw and height [%]", color=_INK)
     _draw_scene(place, found.scene)
-    place.plot(*found.poses[:, :2].T, ".", color="#c0392b", ms=7, mec="white", mew=0.6, label="poses")
+    met = np.repeat(found.is_reached, len(found.poses) // len(found.is_reached))  # poses of all frames
+    for kind, chosen, label in ((".", met, "reached"), ("x", ~met, "not reached")):
+        if chosen.any():
+            place.plot(
+                *found.poses[chosen, :2].T, kind, color="#c0392b", ms=7, mew=0.6 if kind == "." else 1.5, label=label
+            )
     label = f"best base: {found.is_reached.sum()} poses, height {found.best[3]:.3g} m"
     _draw_base(place, found.best, _BEST, label)
     _finish(place, "grey: no pose reached; white: the base does not stand free, or is not tried")

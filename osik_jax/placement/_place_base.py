@@ -28,7 +28,7 @@ from ..kinematics._pose_forms import PoseLike
 from ..numerics._arguments import check_count
 from ..reachability._frame import read_frame
 from ..robot import Robot
-from ._bases import AXES, base_clearances, checked_axis, grid_bases
+from ._bases import AXES, base_clearances, checked_axis, grid_bases, stands_free
 from ._gradient import Climber
 from ._placement import Placement
 from ._score import Task, is_too_far, joint_margin, manipulability, score_bases, score_grid, solve_pairs
@@ -121,17 +121,18 @@ def place_base(
 
     grid = grid_bases(axes)
     gap, pairs = gaps(grid)
-    allowed = gap >= clearance
+    allowed = stands_free(gap, clearance)
     if not allowed.any():
         pair = pairs[int(gap.argmax())]
         raise OsikValueError(
-            f"no base of the grid stands free: at the best one {pair[0]} and {pair[1]} are {gap.max():.3g} m apart. If "
-            f"the base stands on it, let them touch by scene=scene.allow({pair}); else give other x, y or height"
+            f"no base of the grid stands free: at the best one {pair[0]} and {pair[1]} are {gap.max():.3g} m apart. "
+            f"Give other x, y or height; if the base stands on it, let them touch by scene=scene.allow({pair}), or "
+            f"--allow {':'.join(pair)}"
         )
     scores = score_grid(task, grid[allowed])
     best = grid[allowed][_order(*scores.table)[:_BEST]]
     reaches, margin, index = _spread(allowed, (scores.reached, *scores.table[1:]))
-    base, q = _refined(task, best, axes, refine, lambda bases: gaps(bases)[0] >= clearance)
+    base, q = _refined(task, best, axes, refine, lambda bases: stands_free(gaps(bases)[0], clearance))
     shape, count = tuple(map(len, axes)), len(task.goal.position)
     return Placement(
         robot=robot,

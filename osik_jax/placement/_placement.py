@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ..collision import Scene
 from ..inverse import InverseKinematicsSolution
 from ..robot import Robot
-from ._bases import base_poses
+from ._bases import base_poses, stands_free
 from ._gradient import BaseGradient, base_gradient
 from ._score import Task
 
@@ -103,7 +103,7 @@ class Placement:
     @property
     def stands_free(self) -> Bool[np.ndarray, "nx ny nyaw nh"]:
         """Return whether the base keeps the clearance to the scene at each base of the grid."""
-        return np.asarray(self.base_clearance >= self.clearance)
+        return np.asarray(stands_free(self.base_clearance, self.clearance))
 
     @property
     def pareto(self) -> Int[np.ndarray, "k 4"]:

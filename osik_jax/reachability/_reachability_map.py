@@ -69,7 +69,8 @@ def reachability_map(
         orientation_tolerance: largest angle to an orientation [rad].
         scene: obstacles: a pose is reached where the robot touches neither them nor itself, as in
             ``inverse_kinematics``.
-        clearance, srdf: with a scene, likewise.
+        clearance: smallest distance of all pairs of shapes, with a scene [m].
+        srdf: pairs that may touch, with a scene.
         out: folder for what is finished, as in ``run_in_chunks``: called again with the same arguments, a job that was
             killed goes on where it was. Default: none.
         progress: whether to show a bar; or a function of the number of positions that are done and of all. Those that
