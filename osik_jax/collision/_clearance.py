@@ -224,6 +224,7 @@ def shape_names(own: tuple[str, ...], rows: tuple[Any, ...], pair: np.ndarray, i
     """
     if pair[0] < 0:
         return "nothing", "nothing"
-    rows = rows[index] if rows and isinstance(rows[0], tuple) else rows
+    if rows and isinstance(rows[0], tuple):
+        rows = rows[index if len(rows) > 1 else 0]
     first, second = (own[k] if k < len(own) else rows[k - len(own)] for k in pair)
     return first, second

@@ -1,4 +1,4 @@
-"""Arrays of a robot's shapes and of a scene in the order in which ``core/collision.hpp`` reads them."""
+"""Arrays of a robot's shapes and of a scene in the order in which ``core/shapes.hpp`` reads them."""
 
 from __future__ import annotations
 

@@ -200,7 +200,7 @@ def _lanes_source(
         return ", ".join(f"{letter}{k}" for k in range(count))
 
     kept = [
-        k for k, shape in enumerate(given) if k not in integers and shape[0] == 1 and math.prod(shape) <= _MOST_KEPT
+        k for k, shape in enumerate(given) if k not in integers and shape[0] == 1 and 0 < math.prod(shape) <= _MOST_KEPT
     ]
     copies = [
         f"__shared__ Real s{k}[{math.prod(given[k])}];\n"

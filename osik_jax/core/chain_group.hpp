@@ -1,6 +1,6 @@
 // Whole searches for poses on a GPU (chain_find.hpp): some threads of a warp, the members of a group, take the searches of a
 // target in turn. The answer is that of the first search with a solution, in the order of their numbers, so that it depends
-// neither on how many members there are nor on other targets.
+// neither on how many members there are nor on other targets, where there is one.
 //
 // Whether solutions are free is asked for many threads of a warp at once: it takes a thread alone as long as all of them.
 //

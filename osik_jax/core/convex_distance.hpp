@@ -21,7 +21,7 @@ constexpr double DEPTH_TOLERANCE = 1e-8;  // [m]
 // A convex shape: all points within `radius` of its core. Fields as in collision/_table.py: ShapeTable.
 template <class Real> struct Convex {
   using V = Vec3<Real>;
-  int kind, count;       // a hull's number of vertices, a multiple of 4 (the last one is repeated)
+  int kind, count;       // a hull's number of vertices; a multiple of 4, the last one repeated, where `apart` is 1
   V size, position;
   Mat3<Real> rotation;   // from the shape's axes
   const Real* vertices;  // [3, count] in the shape's axes, or as `apart` and `axes` say
@@ -408,6 +408,7 @@ template <class Real> Gap<Real> gap_between(const Convex<Real>& a, const Convex<
   }
   const Real first = a.radius(), second = b.radius();
   const Gap<Real> core = Difference<Real>(a, b).gap(most > 0 ? most + first + second : most);
+  if (most > 0 && core.distance >= most + first + second) return {most, {}, {}, {}};
   return {core.distance - first - second, core.on_a + first * core.normal, core.on_b - second * core.normal, core.normal};
 }
 

@@ -2,11 +2,13 @@
 //
 // A call has arguments and results with a leading axis of lanes, or of length 1 where all lanes share one argument:
 //   size(k, axis), result_size(k, axis)   the length of an axis of argument or result k
-//   integers(k)                           argument k, integers that all lanes share
+//   integers(k), integers(k, lane)        argument k, integers that all lanes share; those of one lane
 //   in(k, lane), out(k, lane)             the numbers of one lane: pointers (In, Out), or what stands for them
 //   each_lane(f)                          f(lane) for all lanes, or for the one of a GPU's thread
+//   numbers(k, lane), labels(k, lane)     numbers that are neighbours, by a pointer (Numbers); integers of a result
+//   Collision                             what places shapes (collision.hpp, lane_collision.hpp)
 //   space()                               numbers to work with, a Space: as many as the caller in Python says
-// Both calls are written for it: one of a CPU (kinematics_cpu.cpp), one of a GPU (lanes_cuda.hpp).
+// Both calls are written for it: one of a CPU (xla.hpp: Batch), one of a GPU (lanes_cuda.hpp).
 #pragma once
 #include "task_rows.hpp"
 

@@ -17,7 +17,7 @@ problems that it cannot solve. A scheme's backend is that of its whole step.
     "core"    CPUs and CUDA: any robot, any precision
 
     of inverse kinematics                     searches for poses of frames that hinges and slides carry, in scenes too
-    "core"    CPUs and CUDA: any robot, any precision
+    "core"    CPUs and CUDA: any robot, any precision; "nearest" and "all" in a scene: CPUs
 
     of retargeting                            iterations of a plan                a plan's banded systems
     "core"                                    CPUs: any robot, any precision      CPUs: inside the former

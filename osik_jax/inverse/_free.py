@@ -133,7 +133,9 @@ def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Sce
     if pairs.ndim == 1:
         return dict(nearest_pair=np.zeros((), np.int32), pairs=(shape_names(shapes.names, scene.names, pairs, 0),))
     flat, own_names = pairs.reshape(-1, 2), bool(scene.names) and isinstance(scene.names[0], tuple)
-    of_scene = np.arange(len(flat)) * (own_names & (flat.max(-1, initial=-1) >= len(shapes.names)))
+    of_scene = (
+        np.arange(len(flat)) * (own_names and len(scene.names) > 1) * (flat.max(-1, initial=-1) >= len(shapes.names))
+    )
     codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))
     _, first, place = np.unique(codes, return_index=True, return_inverse=True)
     named = [shape_names(shapes.names, scene.names, flat[k], of_scene[k]) for k in first]

@@ -69,6 +69,9 @@ def searched(
         if alone and left.any():
             found = _with(found, left, by(seeds, left))
             left &= ~found.converged
+        return further(goals, found, left)
+
+    def further(goals: Any, found: InverseKinematicsSolution, left: np.ndarray) -> InverseKinematicsSolution:
         if not (go_on and left.any()):
             return found
         starts = min(seeds, _STARTS)
@@ -80,14 +83,12 @@ def searched(
         own = only(left, approach, goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
-    def in_all(wanted: np.ndarray) -> InverseKinematicsSolution:
-        return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
-
     if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
         found = by_the_core(goals, np.full(len(goals.position), seeds))
         missed = ~np.asarray(found.converged)
-        return _with(jax.device_get(found), missed, in_all(missed)) if missed.any() else found
-    return in_all(np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted)
+        return further(goals, jax.device_get(found), missed) if missed.any() else found
+    wanted = np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted
+    return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
 
 
 def found_at_once(

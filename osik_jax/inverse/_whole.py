@@ -216,10 +216,12 @@ def by_core(
         return call_here(method, outputs, *given, sizes=sizes, members=members)
 
     lanes = goals, most, *(() if around is None else map(jnp.asarray, around.scene))
-    return in_stages(call, *lanes) if cuda_is_default() else call(1, *lanes)
+    return in_stages(call, search.enough, *lanes) if cuda_is_default() else call(1, *lanes)
 
 
-def in_stages(call: Callable[..., list[Array]], goals: Array, most: Array, *scene: Array) -> list[Array]:
+def in_stages(
+    call: Callable[..., list[Array]], enough: Float[Array, ""], goals: Array, most: Array, *scene: Array
+) -> list[Array]:
     """Return what ``call(members, goals, most, *scene)`` finds for many targets on a GPU.
 
     A few searches for each target come first, by one thread. What they leave, which needs many searches, is done by
@@ -228,9 +230,7 @@ def in_stages(call: Callable[..., list[Array]], goals: Array, most: Array, *scen
     if _MEMBERS * len(most) <= _MOST_THREADS:
         return call(_MEMBERS, goals, most, *scene)
     found = call(1, goals, jnp.minimum(most, _FIRST), *scene)
-    targets, labels = len(most), found[2]
-    hopeless = found[-1][:, 2:] if scene else jnp.zeros((targets, 1), jnp.int32)  # see ``core/freedom.hpp``
-    size = _MOST_THREADS // _MEMBERS
+    targets, size = len(most), _MOST_THREADS // _MEMBERS
 
     def some(array: Array, at: Array) -> Array:
         return array[at] if len(array) > 1 else array
@@ -244,7 +244,11 @@ def in_stages(call: Callable[..., list[Array]], goals: Array, most: Array, *scen
         found = [a.at[place].set(b, mode="drop") for a, b in zip(found, new, strict=True)]
         return found, left.at[place].set(False, mode="drop")
 
-    left = (labels[:, 0] <= 0) & (most > _FIRST) & ((hopeless[:, 0] == 0) | (hopeless[:, 0] == EVERY_SOLUTION))
+    left = ~(found[1][:, 2] <= enough)  # as one search after another would go on
+    if scene:
+        reason = found[-1][:, 2]  # see ``core/freedom.hpp``
+        left = (found[2][:, 0] <= 0) & ((reason == 0) | (reason == EVERY_SOLUTION))
+    left &= most > _FIRST
     return jax.lax.while_loop(lambda state: state[1].any(), body, (found, left))[0]
 
 

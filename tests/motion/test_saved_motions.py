@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -98,7 +99,7 @@ def test_a_film_shows_the_motion_from_its_begin_to_its_end(tmp_path) -> None:
     arm, time = osik.load_robot("arm7"), jnp.array([0.0, 0.1, 0.35, 0.5])
     q = arm.q0 + jnp.array([0.0, 0.3, 0.7, 1.0])[:, None] * jnp.array([1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     motion = Motion(time, q, 0.0 * q + 0.5, 0.0 * q)
-    options = {"size": (160, 90)}
+    options: Any = {"size": (160, 90)}
     film_motion(motion, arm, tmp_path / "m.gif", np.full((3, 7), 2.0), **options)
     with Image.open(tmp_path / "m.gif") as film:
         assert getattr(film, "n_frames", 1) == 8  # seven in 0.5 s, and the end
