@@ -51,7 +51,10 @@ class Judge:
         allowed = {frozenset(pair) for pair in head["allowed"]}
         links = [self.model.frames[shape.parentFrame].name for shape in self.shapes.geometryObjects]
         joints = [shape.parentJoint for shape in self.shapes.geometryObjects]
-        near = lambda a, b: a == b or self.model.parents[a] == b or self.model.parents[b] == a  # noqa: E731
+
+        def near(a: int, b: int) -> bool:
+            return a == b or self.model.parents[a] == b or self.model.parents[b] == a
+
         self.pairs = [
             pin.CollisionPair(i, j)
             for j in range(self.own)

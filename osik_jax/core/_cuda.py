@@ -151,7 +151,7 @@ def call_lanes(
     given = tuple((min(len(a), 2), *a.shape[1:]) if _is_real(a) or a.ndim > 1 else a.shape for a in arrays)
     integers = tuple(k for k, a in enumerate(arrays) if not _is_real(a))
     results = tuple((min(lanes, 2), *shape[1:]) for shape, _ in outputs)
-    labels = tuple(k for k, (_, kind) in enumerate(outputs) if _kind(kind) == jnp.int32)
+    labels = tuple(k for k, (_, kind) in enumerate(outputs) if not jnp.issubdtype(jnp.dtype(kind), jnp.floating))
     source = _lanes_source(method, real == jnp.float32, given, integers, results, labels, space)
     shapes = [(shape, jnp.int32 if k in labels else real) for k, (shape, _) in enumerate(outputs)]
     last = [*_lanes_last(given), *_lanes_last(results, _MOST_NUMBERS)]
@@ -244,10 +244,6 @@ def _mask(flags: Sequence[bool]) -> int:
 
 def _is_real(a: Any) -> bool:
     return jnp.issubdtype(a.dtype, jnp.floating)
-
-
-def _kind(kind: Any) -> Any:
-    return jnp.float32 if jnp.issubdtype(jnp.dtype(kind), jnp.floating) else jnp.int32
 
 
 def _order(axes: int, lanes_last: bool) -> tuple[int, ...]:

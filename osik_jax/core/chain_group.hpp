@@ -1,6 +1,6 @@
 // Whole searches for poses on a GPU (chain_find.hpp): some threads of a warp, the members of a group, take the searches of a
-// target in turn. The answer is that of the first search with a solution, in the order of their numbers, so that it depends
-// neither on how many members there are nor on other targets, where there is one.
+// target in turn. Where there is a solution, the answer is that of the first search with one, in the order of their numbers:
+// it depends neither on how many members there are nor on other targets.
 //
 // Whether solutions are free is asked for many threads of a warp at once: it takes a thread alone as long as all of them.
 //
@@ -59,7 +59,8 @@ template <class Call, bool IN_SCENE> class GroupFinder : public ChainFinder<Call
           else first = best_seed = seed;
         }
       }
-      if (IN_SCENE && call.is_time(waits && seed < first, !waits && seed < first) && waits && seed < first) {
+      const bool goes_on = seed < first, asks = goes_on && waits;
+      if (IN_SCENE && call.is_time(asks, goes_on && !waits) && asks) {
         waits = false;
         if (this->is_free_end(goal, seed, search.x)) first = best_seed = seed;
         else if (freedom->is_blocked) first = NONE;

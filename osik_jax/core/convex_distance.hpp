@@ -66,9 +66,7 @@ template <class Real> struct Convex {
   }
   // Of the first vertices.
   OSIK_FN int farthest(V d, int number_of_first) const {
-#ifndef __CUDACC__
-    if (apart == 1) return farthest_of_neighbours(d, number_of_first);
-#endif
+#ifdef __CUDACC__
     int best = 0;
     Real most = inner(d, vertex(0));
     for (int k = 1; k < number_of_first; ++k) {
@@ -76,9 +74,7 @@ template <class Real> struct Convex {
       if (along > most) most = along, best = k;
     }
     return best;
-  }
-#ifndef __CUDACC__
-  int farthest_of_neighbours(V d, int number_of_first) const {
+#else  // where `apart` is 1
     typedef Real Pack __attribute__((vector_size(4 * sizeof(Real))));
     Pack most{}, at{}, number{0, 1, 2, 3};
     most += -std::numeric_limits<Real>::infinity();
@@ -93,8 +89,8 @@ template <class Real> struct Convex {
     int best = 0;
     for (int k = 1; k < 4; ++k) best = most[k] > most[best] ? k : best;
     return int(at[best]);
-  }
 #endif
+  }
   // A lower bound on the distance from a point of the world; exact outside of all kinds but hulls.
   OSIK_FN Real beyond(V point, V center, Real bound) const {
     const V out = point - position;

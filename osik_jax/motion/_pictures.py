@@ -82,8 +82,8 @@ def film_motion(
     q, *rates = (_at_times(shown, time, np.asarray(getattr(motion, kind))) for kind in ("position", *_RATES))
     if limits is not None:
         used = [(np.abs(rate) / limit).max(axis=1) for rate, limit in zip(rates, np.asarray(limits), strict=False)]
-        options |= {"curves": dict(zip(("speed", "acceleration"), used, strict=True))}
-        options |= {"curves_title": "largest by its limit"} if "curves_title" not in options else {}
+        curves = dict(zip(("speed", "acceleration"), used, strict=True))
+        options = {"curves_title": "largest by its limit", **options, "curves": curves}
     animate(Path(path), robot, q, dt=dt, frames_per_second=frames_per_second, **options)
 
 

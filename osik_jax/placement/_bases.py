@@ -23,7 +23,7 @@ from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
 _ROUNDING = 1e-6
-"""Of distances [m]."""
+"""Largest error of distances by rounding [m]."""
 """Coordinates of a base, in the order of the grid's axes."""
 
 
