@@ -96,10 +96,8 @@ def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> 
         copies = turned.reshape(len(branches), -1, len(own.first))
         if copies.shape[1] > most:
             copies = _nearest(copies, own, most)
-    every = copies.reshape(-1, copies.shape[-1])
-    others = ~(every[:, None] == branches).all(-1).any(1) & np.isfinite(every[:, 0])
-    every = every[others]
-    return every[np.argsort(np.linalg.norm(every - own.first, axis=1), kind="stable")]
+    every = copies[(copies != branches[:, None]).any(-1) & np.isfinite(copies[..., 0])]
+    return every[np.argsort(((every - own.first) ** 2).sum(1), kind="stable")]
 
 
 def _nearest(x: Float[np.ndarray, "k m n"], own: Coordinates, most: int) -> Float[np.ndarray, "k most n"]:

@@ -241,10 +241,15 @@ def default_seeds(coordinates: int, every: bool) -> int:
 def _coordinates(robot: Robot, route: Any, settings: Settings) -> Coordinates:
     """Return the entries of q that a search moves, as numbers."""
     entries, home = route.entries(robot), np.asarray(settings.home)
-    given: Any = np.asarray(settings.lower), np.asarray(settings.upper)
-    lower, upper = entry_limits(robot, *starting_box(*given))
+    lower, upper = _entry_box(robot, settings.lower, settings.upper)
     whole: Any = lower, upper, np.clip(home, lower, upper)
     return Coordinates(entries, route.turning(robot, settings), *(a[entries] for a in whole))
+
+
+@remembered
+def _entry_box(robot: Robot, lower: Array, upper: Array) -> tuple[Any, Any]:
+    given: Any = np.asarray(lower), np.asarray(upper)
+    return entry_limits(robot, *starting_box(*given))
 
 
 def joint_box(robot: Robot, limits: tuple[Limit, ...] | None) -> tuple[Array, Array]:

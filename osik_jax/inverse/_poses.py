@@ -61,11 +61,15 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
     count = next(iter(counts.values()), None)
     if count == 0:
         raise OsikValueError("there are no targets: the poses have a leading axis of length 0")
-    shape = (count or 1,)
     numbers = jnp if traced else np
-    position = numbers.stack([numbers.broadcast_to(p, (*shape, 3)) for p, _, _ in parts.values()], 1)
-    rotation = numbers.stack([numbers.broadcast_to(r, (*shape, 3, 3)) for _, r, _ in parts.values()], 1)
-    return Goal(cast(Array, position), cast(Array, rotation)), tuple(rows for _, _, rows in parts.values()), count
+
+    def together(part: int) -> Numbers:
+        own = [one[part] for one in parts.values()]
+        if count is None:
+            return numbers.stack(own)[None]
+        return numbers.stack([numbers.broadcast_to(a, (count, *a.shape[-1 - part :])) for a in own], 1)
+
+    return Goal(cast(Array, together(0)), cast(Array, together(1))), tuple(rows for _, _, rows in parts.values()), count
 
 
 def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Numbers, Numbers, tuple[bool, ...]]:

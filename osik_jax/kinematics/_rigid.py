@@ -15,16 +15,26 @@ from ..numerics._host import Numbers, module_of
 
 _GENERATORS = np.cross(np.eye(3)[:, None], np.eye(3)).mT
 """``[x]``, ``[y]`` and ``[z]``: the matrices of cross products with the axes."""
+_TABLE = np.zeros((4, 4, 3, 3))
+"""The rotation of a unit quaternion p: entries i, j are the sums of ``p[a] p[b] _TABLE[a, b, i, j]``."""
+_TABLE[0, 0], _TABLE[0, 1:] = np.eye(3), 2.0 * _GENERATORS
+for _i in range(3):
+    _TABLE[_i + 1, _i + 1] -= np.eye(3)
+    _TABLE[_i + 1, 1:, _i] += 2.0 * np.eye(3)
 
 
 def rotation_matrix(quaternion: Float[Numbers, "... 4"]) -> Float[Numbers, "... 3 3"]:
     """Return the rotation of a quaternion w, x, y, z of any length but 0.
 
-    Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries.
+    Made of whole arrays, for XLA makes one operation of that, and one for each entry of stacked entries. On the host
+    the fewest operations of NumPy.
     """
-    dtype = quaternion.dtype
-    # its products are twice a unit one's
-    half = quaternion * module_of(quaternion).sqrt(2.0 / (quaternion**2).sum(-1, keepdims=True))
+    dtype, many = quaternion.dtype, quaternion.shape[:-1]
+    if module_of(quaternion) is np:
+        unit = quaternion / np.sqrt((quaternion**2).sum(-1, keepdims=True))
+        columns = (unit @ _TABLE.reshape(4, 36).astype(dtype)).reshape(*many, 4, 9)
+        return (unit[..., None, :] @ columns).reshape(*many, 3, 3)
+    half = quaternion * jnp.sqrt(2.0 / (quaternion**2).sum(-1, keepdims=True))  # its products are twice a unit one's
     (w, x, y, z), v = (half[..., i, None, None] for i in range(4)), half[..., 1:]
     turn = w * sum(a * generator for a, generator in zip((x, y, z), _GENERATORS.astype(dtype), strict=True))
     stretch = (1.0 - (x * x + y * y + z * z)) * np.eye(3, dtype=dtype)
