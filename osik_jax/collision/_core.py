@@ -274,10 +274,13 @@ class Gaps(NamedTuple):
 
 def gaps_at(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> Gaps:
     """Return the nearest pair at each configuration."""
+    return read_gaps(*nearest_pairs(robot, q, scene))
+
+
+def nearest_pairs(robot: CoreRobot, q: Float[Array, "lanes nq"], scene: CoreScene) -> list[Array]:
+    """Return distance, points and normal (lanes, 10) and the pair (lanes, 2), as the core writes them."""
     lanes = max(map(len, (q, *scene)))
-    shapes = [((lanes, 10), float), ((lanes, 2), int)]
-    numbers, pair = _call_at("clearances", shapes, robot, q, scene)
-    return read_gaps(numbers, pair)
+    return _call_at("clearances", [((lanes, 10), float), ((lanes, 2), int)], robot, q, scene)
 
 
 def read_gaps(numbers: Float[Array, "lanes 10"], pair: Int[Array, "lanes 2"]) -> Gaps:

@@ -18,7 +18,7 @@ template <class Call, bool IN_SCENE> class ChainFinder {
   static constexpr Real TURN = 6.283185307179586, NEVER = INFINITE;
 
   int n, frames, check, trial, last, seeds, nq, nv, longest;
-  bool is_warm, is_near, is_every, is_single;
+  bool is_warm, is_near, is_every, is_single, is_unchecked;  // the last one: its caller asks whether solutions are free
   const int *shift, *increment, *turns, *entry, *dof;  // [n]
   const Real *low, *high, *home;                                 // [n], [n], [nq]
   Real progress, settled, isolated, stopped, still;
@@ -33,6 +33,7 @@ template <class Call, bool IN_SCENE> class ChainFinder {
     longest = *options.take(1), check = *options.take(1), trial = *options.take(1), last = *options.take(1),
     seeds = *options.take(1), nq = *options.take(1), nv = *options.take(1);
     is_warm = *options.take(1), is_near = *options.take(1), is_every = *options.take(1), is_single = *options.take(1);
+    is_unchecked = *options.take(1);
     shift = lists.take(n), increment = lists.take(n), turns = lists.take(n), entry = lists.take(n), dof = lists.take(n);
     search.read(call.numbers(2, 0));
     search.near = false, search.pull = 0;
@@ -106,7 +107,7 @@ template <class Call, bool IN_SCENE> class ChainFinder {
   // Write the answer `here`: the configuration q, its errors, residuals, and the limits that stop joints.
   void answer(const Call& call, int target, int seed, int steps) {
     const In goal = call.in(0, target);
-    if (!IN_SCENE) polish(goal);
+    for (int k = 0; !IN_SCENE && k < (is_unchecked ? POLISH : 1); ++k) polish(goal);
     unwind(search.x);
     for (int k = 0; k < nq; ++k) q[k] = home[k];
     for (int j = 0; j < n; ++j) q[entry[j]] = search.x[j] = is_single ? Real(float(search.x[j])) : search.x[j];

@@ -19,7 +19,7 @@ namespace osik {
 template <class Call, bool IN_SCENE> class GroupFinder : public ChainFinder<Call, IN_SCENE> {
   using Base = ChainFinder<Call, IN_SCENE>;
   using Base::NEVER, Base::n, Base::check, Base::trial, Base::longest, Base::progress, Base::here, Base::search,
-      Base::freedom;
+      Base::freedom, Base::is_unchecked;
   using typename Base::Real, typename Base::Errors, typename Base::In;
   enum End { FOUND, BLOCKED, TOUCHING, UNMET };  // of a member, the best one first
   static constexpr int NONE = -1;
@@ -45,7 +45,7 @@ template <class Call, bool IN_SCENE> class GroupFinder : public ChainFinder<Call
     while (call.any(seed < first)) {
       if (seed < first && !waits) {
         const Errors errors = own.advance(check, goal, here);
-        const bool is_met = errors.score <= (IN_SCENE ? Real(1) : own.enough);
+        const bool is_met = errors.score <= (IN_SCENE || is_unchecked ? Real(1) : own.enough);
         steps += check, age += check;
         if (errors.score < least && !(IN_SCENE && is_met)) {
           least = errors.score, best_seed = seed;

@@ -32,7 +32,7 @@ constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-
                  NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
 
 // rotations, collision
-constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, PARALLEL = 1e-6;
+constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, PARALLEL = 1e-6, TOUCH = 1e-6, SINGLE_TOUCH = 2e-5;
 
 // null space
 constexpr double NARROW_RANGE = 1e4;

@@ -15,8 +15,8 @@ template <class Call> SceneRows<typename Call::Real> scene_of(const Call& call, 
 
 template <class Call> class Freedom {
   using Real = typename Call::Real;
-  static constexpr Real TOUCH = sizeof(Real) == 8 ? 1e-6 : 2e-5;  // solutions keep so much more, against rounding [m]
-  static constexpr int MOST = 32;                                 // rejected solutions that are kept
+  static constexpr Real MORE = sizeof(Real) == 8 ? TOUCH : SINGLE_TOUCH;
+  static constexpr int MOST = 32;  // rejected solutions that are kept
   enum Reason { NONE, HELD_SHAPES, AROUND_TARGET, EVERY_SOLUTION };
 
   typename Call::Collision collision;
@@ -49,7 +49,7 @@ template <class Call> class Freedom {
   // Whether a solution is free. tips: positions of the frames; score, tolerances: of ChainSearch.
   bool accepts(const Real* x, int seed, const Real* tips, Real score, const Real* tolerances) {
     place(x);
-    if (collision.nearer(clearance + TOUCH, true).i < 0) return true;
+    if (collision.nearer(clearance + MORE, true).i < 0) return true;
     if (!rejected) is_blocked = is_around_target(tips, score, tolerances);  // the same at every solution
     if (rejected == MOST) return false;
     for (int j = 0; j < n; ++j) kept[rejected * n + j] = x[j];

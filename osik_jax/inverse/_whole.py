@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..collision._core import CoreRobot, CoreScene, Gaps, call_here, read_gaps
+from ..collision._core import CoreRobot, CoreScene, Gaps, call_here, nearest_pairs, read_gaps
 from ..execution._backends import core_is_here
 from ..execution._lanes import first_set
 from ..execution._platform import cuda_is_default
+from ..numerics._constants import SINGLE_TOUCH, TOUCH
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
@@ -32,8 +33,8 @@ from ._solution import InverseKinematicsSolution
 
 _MOST_THREADS = 1 << 18
 """Threads that keep a GPU busy."""
-_FIRST, _MEMBERS = 16, 32
-"""Searches of each target by one thread, where there are many; then threads for each that is left."""
+_FIRST, _SOME, _MEMBERS = 16, 16, 32
+"""Searches of each target at first, where there are many; threads of each where few are left, and for more searches."""
 EVERY_SOLUTION = 3
 """``InverseKinematicsSolution.obstruction`` where something is in the way of the best configuration."""
 _STILL = 1e-9
@@ -189,67 +190,87 @@ def by_core(
     residuals (targets, 3 + 6 frames). Then whether it has converged, the number of the search, steps, and at_limit
     (targets, 3 + nv). With ``every``, also end points, score and whether isolated (targets, seeds, n + 2). With
     ``around``, also the gap of the nearest pair (targets, 10), and the pair and the reason (targets, 3).
+
+    Many targets on a GPU are searched for in stages, each for the targets that the ones before have left: a few
+    searches by one thread, whose first solutions may touch something; the same, with each solution checked; then more,
+    by several threads, so that no thread works on when all others are done.
     """
     kind, nv = search.first.dtype, len(joints)
     targets, frames, n, nq = len(most), len(search.rows), len(search.first), len(search.home)
     goals = jnp.concatenate([goal.position[..., None, :], goal.rotation], -2).reshape(targets, frames, 12)
     tuned = np.array([PROGRESS, SETTLED, ISOLATED, STOPPED, _STILL], kind)
     numbers = [*numbers_of(search, (DAMPING, LEAST_DAMPING)), search.low, search.high, search.home, tuned]
-    flags = [how.warm, how.near, how.every, kind == jnp.float32]
+    flags = [how.warm, how.near, how.every, kind == jnp.float32, False]
     bits = [jax.lax.bitcast_convert_type(search.shift, jnp.int32), increments(n).view(np.int32)]
     options = jnp.stack([jnp.int32(a) for a in (steps, CHECK, TRIAL, LAST, how.seeds, nq, nv, *flags)])
     lists = jnp.stack([jnp.asarray(a, jnp.int32) for a in (*bits, search.turns, search.chain.layout.dofs, dofs)])
-    shapes: list[Any] = [((targets, nq), float), ((targets, 3 + 6 * frames), float), ((targets, 3 + nv), int)]
-    shapes += [((targets, how.seeds, n + 2), float)] * how.every
-    method, sizes = "chain_find", (n, frames, len(search.chain.layout.joints), nq)
-    if around is not None:
-        shapes += [((targets, 10), float), ((targets, 3), int)]
-        method, sizes = "free_find", (*sizes, *around.robot.sizes, around.scene.rows(around.robot.sizes[2]))
+    shapes: list[Any] = [((targets, nq), kind), ((targets, 3 + 6 * frames), kind), ((targets, 3 + nv), int)]
+    shapes += [((targets, how.seeds, n + 2), kind)] * how.every
+    sizes = (n, frames, len(search.chain.layout.joints), nq)
     shared = jnp.concatenate([jnp.ravel(a) for a in numbers])[None], integers_of(search, 0)
 
-    def call(members: int, goals: Array, most: Array, *scene: Array) -> list[Array]:
-        outputs = [((len(most), *shape[1:]), kind) for shape, kind in shapes]
-        more: tuple[Any, ...] = ()
-        if around is not None:
-            more = around.robot.integers, around.robot.numbers[None], *scene, around.clearance
-        given = goals, most[:, None], *shared, jnp.append(options, members), lists, *more
-        return call_here(method, outputs, *given, sizes=sizes, members=members)
+    def given(members: int, goals: Array, most: Array, options: Array) -> tuple[list[Any], tuple[Any, ...]]:
+        outputs = [((len(most), *shape[1:]), own) for shape, own in shapes]
+        return outputs, (goals, most[:, None], *shared, jnp.append(options, members), lists)
+
+    def plain(members: int, goals: Array, most: Array, *, unchecked: bool = False) -> list[Array]:
+        outputs, own = given(members, goals, most, options.at[-1].set(unchecked))
+        return call_here("chain_find", outputs, *own, sizes=sizes, members=members)
+
+    def in_scene(members: int, goals: Array, most: Array, *scene: Array) -> list[Array]:
+        assert around is not None
+        outputs, own = given(members, goals, most, options)
+        outputs += [((len(most), 10), kind), ((len(most), 3), int)]
+        more = around.robot.integers, around.robot.numbers[None], *scene, around.clearance
+        wide = *sizes, *around.robot.sizes, around.scene.rows(around.robot.sizes[2])
+        return call_here("free_find", outputs, *own, *more, sizes=wide, members=members)
 
     lanes = goals, most, *(() if around is None else map(jnp.asarray, around.scene))
-    return in_stages(call, search.enough, *lanes) if cuda_is_default() else call(1, *lanes)
-
-
-def in_stages(
-    call: Callable[..., list[Array]], enough: Float[Array, ""], goals: Array, most: Array, *scene: Array
-) -> list[Array]:
-    """Return what ``call(members, goals, most, *scene)`` finds for many targets on a GPU.
-
-    A few searches for each target come first, by one thread. What they leave, which needs many searches, is done by
-    several threads each, so that no thread works on when all others are done.
-    """
+    call = plain if around is None else in_scene
+    if not cuda_is_default():
+        return call(1, *lanes)
     if _MEMBERS * len(most) <= _MOST_THREADS:
-        return call(_MEMBERS, goals, most, *scene)
-    found = call(1, goals, jnp.minimum(most, _FIRST), *scene)
-    targets, size = len(most), _MOST_THREADS // _MEMBERS
+        return call(_MEMBERS, *lanes)
+    first, goes_on = jnp.minimum(most, _FIRST), most > _FIRST
+    found = plain(1, goals, first, unchecked=around is not None)
+    if around is None:
+        return gone_on(plain, found, goes_on & ~(found[1][:, 2] <= search.enough), _MEMBERS, *lanes)[0]
+    gap, pair = nearest_pairs(around.robot, found[0], around.scene)
+    found += [gap, jnp.pad(pair, ((0, 0), (0, 1)))]
+    least = around.clearance[0] + (SINGLE_TOUCH if kind == jnp.float32 else TOUCH)
+    left, again = ~((found[2][:, 0] > 0) & (gap[:, 0] >= least)), (goals, first, *lanes[2:])
+    found, left = gone_on(in_scene, found, left, 1, *again, enough=_MOST_THREADS // _SOME)
+    found, _ = gone_on(in_scene, found, left, _SOME, *again)
+    reason = found[-1][:, 2]  # see ``core/freedom.hpp``
+    left = goes_on & (found[2][:, 0] <= 0) & ((reason == 0) | (reason == EVERY_SOLUTION))
+    return gone_on(in_scene, found, left, _MEMBERS, *lanes)[0]
 
-    def some(array: Array, at: Array) -> Array:
-        return array[at] if len(array) > 1 else array
+
+def gone_on(
+    call: Callable[..., list[Array]],
+    found: list[Array],
+    left: Array,
+    members: int,
+    *lanes: Array,
+    enough: int = 0,
+) -> tuple[list[Array], Array]:
+    """Return ``found`` with what ``call(members, *lanes)`` finds for the targets that are left, and which still are.
+
+    As many targets at a time as keep a GPU busy, until ``enough`` or fewer are left.
+    """
+    targets, size = len(left), min(len(left), _MOST_THREADS // members)
 
     def body(state: tuple[list[Array], Array]) -> tuple[list[Array], Array]:
         found, left = state
         place = first_set(left, size)
         at = jnp.minimum(place, targets - 1)
-        new = call(_MEMBERS, goals[at], jnp.where(place < targets, most[at], 0), *(some(a, at) for a in scene))
+        goals, most, *scene = (a[at] if len(a) > 1 else a for a in lanes)
+        new = call(members, goals, jnp.where(place < targets, most, 0), *scene)
         new[2] = new[2].at[:, 2].add(found[2][at, 2])
         found = [a.at[place].set(b, mode="drop") for a, b in zip(found, new, strict=True)]
         return found, left.at[place].set(False, mode="drop")
 
-    left = ~(found[1][:, 2] <= enough)  # as one search after another would go on
-    if scene:
-        reason = found[-1][:, 2]  # see ``core/freedom.hpp``
-        left = (found[2][:, 0] <= 0) & ((reason == 0) | (reason == EVERY_SOLUTION))
-    left &= most > _FIRST
-    return jax.lax.while_loop(lambda state: state[1].any(), body, (found, left))[0]
+    return jax.lax.while_loop(lambda state: state[1].sum() > enough, body, (found, left))
 
 
 def named(

@@ -276,6 +276,10 @@ SMALL_ANGLE_SQUARED = 1e-2
 """Squared angle [rad^2] below which a series for the derivative of that logarithm is exact to roundoff."""
 PARALLEL = 1e-6
 """Squared sine of the angle between segments, below which they count as parallel."""
+TOUCH = 1e-6
+"""Distance beyond the clearance that solutions in a scene keep, against rounding [m]."""
+SINGLE_TOUCH = 2e-5
+"""The same in single precision."""
 
 # ---- tasks
 

@@ -70,6 +70,7 @@ def test_threads_of_a_warp_find_free_configurations(panda, tmp_path, monkeypatch
         np.testing.assert_array_equal(are_free(own, q, arrays, jnp.zeros(1)), expected.distance >= 0)
         monkeypatch.setattr(_whole, "cuda_is_default", lambda: True)
         for members, threads in ((2, 64), (8, 128), (8, 16)):  # the last one in stages, two targets at a time
+            monkeypatch.setattr(_whole, "_SOME", 2)
             monkeypatch.setattr(_whole, "_MEMBERS", members)
             monkeypatch.setattr(_whole, "_MOST_THREADS", threads)
             monkeypatch.setattr(_whole, "_FIRST", 1)
