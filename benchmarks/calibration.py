@@ -1,4 +1,4 @@
-"""Table of docs/calibration.md: calibrations of random robots, beside their truth and beside SciPy.
+"""Table of docs/data/measurements.md: calibrations of random robots, beside their truth and beside SciPy.
 
     python -m benchmarks.calibration
 

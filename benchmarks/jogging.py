@@ -1,4 +1,4 @@
-"""Tables of docs/jogging.md and docs/tasks_and_limits.md.
+"""Figures of docs/jogging.md, docs/tasks_and_limits.md and docs/data/measurements.md.
 
     python -m benchmarks.jogging
 

@@ -1,4 +1,4 @@
-"""Table of docs/placement.md: bases for 50 poses, judged by Pinocchio and coal on the true collision meshes.
+"""Table of docs/data/measurements.md: bases for 50 poses, judged by Pinocchio and coal on the true collision meshes.
 
     python -m benchmarks.placement [NAME ...]
 
