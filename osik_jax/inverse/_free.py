@@ -14,7 +14,16 @@ from jaxtyping import Array, Int
 
 from .._errors import OsikError, OsikValueError
 from ..collision._clearance import differentiable, distances, shape_names
-from ..collision._core import CoreRobot, CoreScene, check_length, check_scene, core_robot, core_scene, require_core
+from ..collision._core import (
+    CoreRobot,
+    CoreScene,
+    check_length,
+    check_scene,
+    core_robot,
+    core_scene,
+    read_gaps,
+    require_core,
+)
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
@@ -123,9 +132,9 @@ def find_free(
 
 def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
     """Return the answers with the names of their nearest pairs."""
-    assert results.gaps is not None
-    names = _pair_fields(np.asarray(results.gaps.pair), obstacles.shapes, obstacles.scene)
-    return with_fields(results.answer, **names, obstruction=results.reason)
+    pair = np.asarray(results.pair)
+    names = _pair_fields(pair[..., :2], obstacles.shapes, obstacles.scene)
+    return with_fields(results.answer, **names, obstruction=pair[..., 2])
 
 
 def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
@@ -205,10 +214,10 @@ def _traced(
     results = _in_one_call(how, dofs, joints)(fixed, there, counts, jnp.int32(steps), around)
     found = named(route.frames, joints, route.beyond(fixed, there), False, *results)
     own = answer(robot, route, search, goals, found.answer.q[:, entries], found.answer.seed, found.answer.steps)
-    assert found.gaps is not None
-    gap = differentiable(robot, obstacles.shapes, own.q, obstacles.scene, found.gaps)
+    gaps, reason = read_gaps(results[-2], results[-1][:, :2]), results[-1][:, 2]
+    gap = differentiable(robot, obstacles.shapes, own.q, obstacles.scene, gaps)
     is_free = own.converged & (gap >= around.clearance[0])
-    return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=found.reason), valid)
+    return or_far(dataclasses.replace(own, converged=is_free, clearance=gap, obstruction=reason), valid)
 
 
 def _in_one_call(how: Searches, dofs: tuple[int, ...], joints: tuple[str, ...]) -> Callable[..., list[Array]]:

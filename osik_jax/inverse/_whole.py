@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..collision._core import CoreRobot, CoreScene, Gaps, call_here, nearest_pairs, read_gaps
+from ..collision._core import CoreRobot, CoreScene, call_here, nearest_pairs
 from ..execution._backends import core_is_here
 from ..execution._lanes import first_set
 from ..execution._platform import cuda_is_default
@@ -46,17 +46,16 @@ class Whole(NamedTuple):
 
     Attributes:
         answer: the answers, as of ``ChainRoute.answer``.
-        score: of the answers. (targets,)
+        score: of the answers, where all searches run. (targets,)
         ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
-        gaps: with a scene, of the nearest pairs.
-        reason: with a scene, why there is no free solution, as in ``core/freedom.hpp``. (targets,)
+        pair: with a scene, numbers of the two shapes of the nearest pair, and why there is no free solution, as in
+            ``core/freedom.hpp``. (targets, 3)
     """
 
     answer: InverseKinematicsSolution
-    score: Float[Array, "*targets"]
+    score: Float[Array, "*targets"] | None
     ends: Float[Array, "*targets seeds n_and_2"] | None
-    gaps: Gaps | None = None
-    reason: Int[Array, "*targets"] | None = None
+    pair: Int[Array, "*targets 3"] | None = None
 
 
 class Around(NamedTuple):
@@ -169,6 +168,8 @@ def _program(
         results = by_core(search, goals, most, steps, how, dofs, joints, around)
         whole = named(route.frames, joints, beyond, how.every, *results)
         whole = whole._replace(answer=or_far(whole.answer, valid))
+        if not (how.near or how.every):  # XLA gives some of more than eight operations at a time to another thread
+            whole = whole._replace(score=None)
         return jax.tree.map(lambda a: a[0], whole) if single else whole
 
     return jax.jit(program)
@@ -285,7 +286,6 @@ def named(
 ) -> Whole:
     """Return the results of ``by_core`` by their names."""
     ends, around = (more[0] if every else None), more[every:]
-    gaps, reason = (read_gaps(around[0], around[1][:, :2]), around[1][:, 2]) if around else (None, None)
     residual = sizes[:, 3:].reshape(-1, len(frames), 6)
     answer = InverseKinematicsSolution(
         q=q,
@@ -297,7 +297,7 @@ def named(
         residual={name: residual[:, at] for at, name in enumerate(frames)},
         at_limit=labels[:, 3:],
         beyond_reach=beyond,
-        clearance=None if gaps is None else gaps.distance,
+        clearance=around[0][:, 0] if around else None,
         joints=joints,
     )
-    return Whole(answer, sizes[:, 2], ends, gaps, reason)
+    return Whole(answer, sizes[:, 2], ends, around[1] if around else None)
