@@ -197,7 +197,7 @@ def test_where_the_answer_is_not_finite_the_robot_stands_still(loop: ControlLoop
     assert until(lambda: loop.snapshot.status == osik.Status.SOLVED)
 
 
-def test_pause_push_and_reset(loop: ControlLoop) -> None:
+def test_pause_and_reset(loop: ControlLoop) -> None:
     loop.aim("hand", moved(-0.2, 0.2, 0.0))
     assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() > 0.1))
     loop.pause()
@@ -210,11 +210,6 @@ def test_pause_push_and_reset(loop: ControlLoop) -> None:
     loop.resume()
     assert until(lambda: not loop.snapshot.paused and loop.snapshot.time > 0.1)
     np.testing.assert_allclose(loop.snapshot.q, ROBOT.q0, atol=1e-6)
-    push = np.zeros(ROBOT.nv)
-    push[1] = 1.0
-    loop.push(push)
-    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - HOME[0]) > 0.01))
-    assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - HOME[0]) < 1e-3))
 
 
 def test_wrong_targets_raise_where_they_are_given(loop: ControlLoop) -> None:

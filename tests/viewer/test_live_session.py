@@ -1,4 +1,4 @@
-"""Sessions of a live view: files that hold all of a controller, and lines of Python that make the same."""
+"""Sessions of a live view: files that hold all of a controller."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from pathlib import Path
 from typing import Any, cast
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from every_class import all_limits, all_tasks
 from small_files import files_of_at_most
 
 import osik_jax as osik
@@ -22,7 +19,6 @@ from osik_jax.viewer import load_session
 from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._open import default_session
-from osik_jax.viewer.live._python import python
 from osik_jax.viewer.live._session import RobotSource, Session
 from osik_jax.viewer.live._step import Controller, compile_step
 
@@ -81,26 +77,6 @@ def test_an_argument_that_is_missing_in_its_file_is_the_default(tmp_path: Path) 
     loaded = load_session(path)
     assert not loaded.off and not loaded.limits_off
     assert eqx.tree_equal((loaded.tasks, loaded.scheme), ({"foot": osik.FrameTask(ROBOT, "l_sole")}, osik.WeightedQP()))
-
-
-def test_its_lines_of_python_make_the_same_controller() -> None:
-    wanted = session()
-    names: dict[str, Any] = {}
-    exec(wanted.to_python(), names)
-    assert list(names["tasks"]) == [name for name in wanted.tasks if name != "waist"]
-    options: dict[str, Any] = dict(scheme=wanted.scheme, limits=wanted.active_limits, dt=wanted.dt)
-    expected = osik.solve(ROBOT, jnp.asarray(wanted.q), wanted.active_tasks, **options)
-    assert expected.status == osik.Status.SOLVED and np.abs(expected.velocity).max() > 0.05
-    np.testing.assert_array_equal(names["solution"].velocity, expected.velocity)
-
-
-def test_lines_of_python_make_every_task_and_limit(arm: osik.Robot) -> None:
-    limits = [limit for limit in all_limits(arm) if not isinstance(limit, osik.CollisionAvoidanceLimit)]
-    for part in (*all_tasks(arm).values(), *limits, osik.NullSpace(method="saturated", margin=0.2)):
-        made = eval(python(part, arm), {"osik": osik, "np": np, "robot": arm})
-        assert jax.tree.structure(made) == jax.tree.structure(part), part
-        for own, given in zip(jax.tree.leaves(made), jax.tree.leaves(part), strict=True):
-            np.testing.assert_allclose(own, given, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.release
@@ -164,8 +140,6 @@ def test_what_a_file_cannot_hold_is_refused_in_words(tmp_path: Path) -> None:
     one = session(limits=(kept,))
     one.save(tmp_path / "session.json")
     assert eqx.tree_equal(load_session(tmp_path / "session.json").limits, one.limits)
-    with pytest.raises(ValueError, match="no program can make the shape 'stone'"):
-        session(limits=(kept,)).to_python()
 
 
 @pytest.mark.parametrize(

@@ -34,10 +34,6 @@ _HALF_A_MICROSECOND = 5e-7
 """Offset [s] added to the switch interval, which Python truncates to whole microseconds."""
 _loops: set[int] = set()
 """Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
-_FADES = 0.15
-"""Time in which a push falls to 1/e [s]."""
-_OVER = 1e-4
-"""Push below which it ends [m/s or rad/s]."""
 
 
 class _Job(NamedTuple):
@@ -95,7 +91,7 @@ class ControlLoop:
         self._job: _Job | None = None
         self._is_behind, self._problem = False, ""
         self._orders: deque[Callable[[], None]] = deque()
-        self._stopwatch, self._recorder, self._push = Stopwatch(), Recorder(self.dt), Push(still, self.dt)
+        self._stopwatch, self._recorder = Stopwatch(), Recorder(self.dt)
         self._snapshot = Snapshot(0.0, self._start, still, preparing=True)
         self._state: State = (jnp.asarray(self._start), jnp.asarray(still), None)
         self._program: Program | None = None
@@ -224,10 +220,6 @@ class ControlLoop:
         if left:
             self._orders.append(lambda: self._hold(left))
 
-    def push(self, velocity: Float[np.ndarray, " nv"]) -> None:
-        """Add a velocity disturbance [m/s, rad/s] that fades within a second; the controller corrects it."""
-        self._orders.append(lambda: self._push.start(velocity))
-
     def pause(self) -> None:
         """Stop the robot from the next step on."""
         self._orders.append(lambda: self._show(paused=True))
@@ -312,7 +304,7 @@ class ControlLoop:
         """Run one step; if its answer is unusable, stop the robot and cold-start the solver."""
         if job.program is not self._program:
             self._program, self._state = job.program, (*self._state[:2], job.program.cold)
-        state, status, errors = job.program.run(job.numbers, self._state, self._push.now())
+        state, status, errors = job.program.run(job.numbers, self._state)
         before, codes = self._snapshot, np.asarray(status)
         q, velocity = np.asarray(state[0]), np.asarray(state[1])
         usable = np.isfinite(q).all(-1, keepdims=True) & (codes != Status.NUMERICAL_ERROR)[..., None]
@@ -340,7 +332,6 @@ class ControlLoop:
         still = np.zeros_like(self._snapshot.velocity)
         cold = None if self._program is None else self._program.cold
         self._state = (jnp.asarray(self._start), jnp.asarray(still), cold)
-        self._push.stop()
         self._show(time=0.0, q=self._start, velocity=still, failures=0)
 
     def _abandoned(self) -> list[str]:
@@ -365,30 +356,3 @@ class ControlLoop:
         own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
         each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
         return jax.tree.map(lambda *rows: np.stack(rows), *each)
-
-
-class Push:
-    """Fading velocity added to that of the controller."""
-
-    def __init__(self, still: Float[np.ndarray, "*batch nv"], dt: float) -> None:
-        """Take velocities of 0 (nv,) and the period [s]."""
-        self._share, self._velocity = float(np.exp(-dt / _FADES)), still.copy()
-        self._none = jnp.asarray(still)
-
-    def start(self, velocity: Float[np.ndarray, "*batch nv"]) -> None:
-        """Start a push."""
-        self._velocity = np.asarray(velocity, float).copy()
-
-    def stop(self) -> None:
-        """End the push."""
-        self._velocity[:] = 0.0
-
-    def now(self) -> Float[Array, "*batch nv"]:
-        """Return the velocity of this step [m/s or rad/s], and reduce it for the next. (nv,)."""
-        if not self._velocity.any():
-            return self._none
-        pushed = jnp.asarray(self._velocity, self._none.dtype)
-        self._velocity *= self._share
-        if np.abs(self._velocity).max() < _OVER:
-            self.stop()
-        return pushed

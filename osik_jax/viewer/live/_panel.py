@@ -30,8 +30,6 @@ _SCENE = "collisions with itself and with the scene"
 _PLURALS = {"ball": "balls", "box": "boxes"}
 _NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
-_PUSH = 0.6
-"""Speed of a push, in sizes of the robot per second."""
 
 
 class Panel:
@@ -86,25 +84,14 @@ class Panel:
 
     def _add_buttons(self) -> None:
         gui, loop = self._server.gui, self._desk.loop
-        moves = ("Pause", "Reset", "Push") if self._desk.session.robot.floating_base else ("Pause", "Reset")
-        buttons = gui.add_button_group("", moves)
+        buttons = gui.add_button_group("", ("Pause", "Reset"))
 
         @buttons.on_click
         def _(event: GuiEvent[Any]) -> None:
-            match event.target.value:
-                case "Pause":
-                    loop.resume() if loop.snapshot.paused else loop.pause()
-                case "Reset":
-                    loop.reset()
-                case "Push":
-                    loop.push(self._shove())
-
-    def _shove(self) -> np.ndarray:
-        """Return a velocity of the base in a random horizontal direction, shape (nv,)."""
-        angle = np.random.default_rng().uniform(0.0, 2.0 * np.pi)
-        velocity = np.zeros(self._desk.session.robot.nv)
-        velocity[:2] = _PUSH * self._size * np.array([np.cos(angle), np.sin(angle)])
-        return velocity
+            if event.target.value == "Reset":
+                loop.reset()
+            else:
+                loop.resume() if loop.snapshot.paused else loop.pause()
 
     def _add_tasks(self) -> None:
         gui = self._server.gui
@@ -230,14 +217,12 @@ class Panel:
         gui.add_divider()
         save = gui.add_button("Download session.json")
         load = gui.add_upload_button("Load a session", mime_type="application/json")
-        python = gui.add_button("Show the Python lines")
         record.on_click(lambda _: self._desk.loop.record())
         motion.on_click(self._guarded(self._send_motion))
         save.on_click(
             self._guarded(lambda event: self._send(event, "session.json", self._desk.session.to_json().encode()))
         )
         load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
-        python.on_click(self._guarded(lambda event: self._show_python(event)))
 
     def _load(self, content: bytes) -> None:
         self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
@@ -254,11 +239,6 @@ class Panel:
     def _send(self, event: Any, name: str, content: bytes) -> None:
         """Send a file to the visitor who asked for it."""
         (event.client or self._server).send_file_download(name, content, save_immediately=True)
-
-    def _show_python(self, event: Any) -> None:
-        with event.client.gui.add_modal("The same controller in Python") as modal:
-            event.client.gui.add_markdown(f"```python\n{self._desk.session.to_python()}```")
-            event.client.gui.add_button("Close").on_click(lambda _: modal.close())
 
     @property
     def _name(self) -> str:

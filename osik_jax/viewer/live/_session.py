@@ -1,4 +1,4 @@
-"""Session: a robot by its source, its controller and its switched-off parts, as a file and as Python."""
+"""Session: a robot by its source, its controller and its switched-off parts, as a file."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ from ..._errors import OsikValueError
 from ..._whole_file import write_text
 from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
 from ...robot import Robot
-from ...robot._load_robot import is_file, read_robot
-from ...robot.loading import is_mjcf
+from ...robot._load_robot import read_robot
 from ...saving._parts import decode_parts, encode_parts
 from ...schemes import Scheme
 from ...tasks import Task
-from ._python import python
 from ._step import Controller
 
 _FORMAT = "osik-jax session 1"
@@ -112,34 +110,6 @@ class Session:
         } | encode_parts(self.robot, self.tasks, self.scheme, self.limits)
         return json.dumps(content, indent=1) + "\n"
 
-    def to_python(self) -> str:
-        """Return a program that makes the same controller and takes one step, without switched-off parts.
-
-        Raises:
-            ValueError: as in ``save``.
-        """
-        if self.source is None:
-            raise OsikValueError("where the robot comes from is not known, so no program can load it: give source=")
-        tasks = {name: python(task, self.robot, name) for name, task in self.active_tasks.items()}
-        limits = [python(limit, self.robot) for limit in self.active_limits]
-        lines = [
-            "import jax",
-            "import numpy as np",
-            "import osik_jax as osik",
-            "",
-            'jax.config.update("jax_enable_x64", True)',
-            "",
-            f"robot = {self.source.python()}",
-            f"q = np.array({np.asarray(self.q).tolist()})",
-            "tasks = {",
-            *(f"    {name!r}: {text}," for name, text in tasks.items()),
-            "}",
-            f"limits = ({''.join(f'{text}, ' for text in limits).rstrip(' ')})",
-            f"scheme = {python(self.scheme, self.robot)}",
-            f"solution = osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt={self.dt!r})",
-        ]
-        return "\n".join(lines) + "\n"
-
 
 def load_session(path: str | os.PathLike[str]) -> Session:
     """Read a session written by a live view or ``Session.save``.
@@ -198,10 +168,3 @@ class RobotSource:
     def load(self) -> Robot:
         """Return the robot."""
         return read_robot(self.robot, floating_base=self.floating_base)
-
-    def python(self) -> str:
-        """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
-        base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
-        if not is_file(self.robot):
-            return f"osik.load_robot({self.robot!r}{base})"
-        return f"osik.Robot.{'from_mjcf' if is_mjcf(self.robot) else 'from_urdf'}({self.robot!r}{base})"

@@ -81,34 +81,33 @@ def _aimed(task: Any, target: Any) -> Task:
 class Program:
     """Compiled control step."""
 
-    # from the controller's numbers, the state and a push (nv,) to the next state, status and task errors
-    run: Callable[[list[Array], State, Array], tuple[State, Array, dict[str, Array]]]
+    # from the controller's numbers and the state to the next state, status and task errors
+    run: Callable[[list[Array], State], tuple[State, Array, dict[str, Array]]]
     cold: Any  # the warm start of a first step
 
 
 def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
     """Compile one step of a controller in the calling thread; takes seconds.
 
-    The push is a velocity (nv,) that is added to the controller's. For a batch, all numbers, states and pushes have a
-    leading axis.
+    For a batch, all numbers and states have a leading axis.
     """
     tree = jax.tree.structure(controller)
     numbers, lead = controller.numbers(), () if batch is None else (batch,)
 
-    def step(numbers: list[Array], state: State, push: Array) -> tuple[State, Array, dict[str, Array]]:
+    def step(numbers: list[Array], state: State) -> tuple[State, Array, dict[str, Array]]:
         own = jax.tree.unflatten(tree, numbers)
         q, velocity, warm_start = state
         tasks, limits = remembering((own.tasks, own.limits), velocity, True)
         # not `solve`, which warns of a weighted scheme's ignored priorities: the page has a menu of schemes
         answer = one_step(robot, q, tasks, own.scheme, checked_limits(robot, limits), in_type_of(dt, q), warm_start)
-        moved = integrate(robot, q, answer.velocity + push, dt)
+        moved = integrate(robot, q, answer.velocity, dt)
         return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
 
     run = step if batch is None else jax.vmap(step)
     q, still = jnp.broadcast_to(robot.q0, (*lead, robot.nq)), jnp.zeros((*lead, robot.nv), robot.q0.dtype)
-    traced = jax.eval_shape(run, numbers, (q, still, None), still)
+    traced = jax.eval_shape(run, numbers, (q, still, None))
     cold = jax.tree.map(jnp.zeros_like, traced[0][2])
-    return Program(jax.jit(run).lower(numbers, (q, still, cold), still).compile(), cold)
+    return Program(jax.jit(run).lower(numbers, (q, still, cold)).compile(), cold)
 
 
 def stacked(controllers: Sequence[Controller]) -> Controller:
