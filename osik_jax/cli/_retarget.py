@@ -32,9 +32,6 @@ _COLUMNS = {
     "off\n[deg]": "segment_angle_deg_mean",
 }
 _MOST_ROWS, _MOST_NOTES = 50, 10
-_LIVE = ("look_ahead", "iterations", "budget")
-_HELD_OUT = 4
-"""Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +45,7 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH or AMC file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
+    """A BVH file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"
@@ -84,30 +81,11 @@ class Retarget:
     """Write the film (motion.gif); of a folder none is written."""
     report: bool = False
     """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes;
-    for a folder also index.html, with links to the pages of its clips. Needs the extra viewer."""
-    fit: Path | None = None
-    """Fit a profile (weights, scale, keypoints) to the clips of a folder and write it to this TOML file, instead of
-    motions. Every fourth clip is held out and selects the step that is kept."""
-    live: bool = False
-    """Retarget frame by frame: replay CLIP at its own rate, or with - read JSON lines from stdin and write JSON lines
-    to stdout (nothing to a folder)."""
-    look_ahead: float = 0.27
-    """Delay of the robot behind the person with --live [s]."""
-    iterations: int = 20
-    """Largest number of iterations per frame with --live."""
-    budget: float | None = None
-    """Computing time per frame with --live [s]; five iterations run in any case. Default: 60 % of the time between
-    frames, 4 ms at most."""
+    for a folder a page per clip. Needs the extra viewer."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
         _check(self)
-        if self.fit is not None:
-            _fit(self, self.fit)
-            return 0
-        if self.live:
-            _retarget_live(self)
-            return 0
         if os.path.isdir(self.clip):
             return _retarget_folder(self)
         from rich.console import Console
@@ -130,14 +108,8 @@ class Retarget:
 
 def _check(command: Retarget) -> None:
     """Raise an error for options that have no meaning beside the others."""
-    stream = command.live and command.clip == "-"
-    refuse(command, command.live, ("fit", "source", "smooth"), "whole clips, not with --live")
-    refuse(command, command.fit is not None, ("source",), "motions, not with --fit, which takes clips of people")
-    refuse(command, command.fit is not None, ("fps", "smooth", "balance", "report"), "motions, not with --fit")
-    refuse(command, not command.live, _LIVE, "--live")
     refuse(command, command.source is not None, ("unit", "up", "trim", "mapping"), "a person's clip, not with --source")
     refuse(command, command.source is None, ("source_fps", "source_profile"), "--source")
-    refuse(command, stream, ("fps", "unit", "up", "trim", "report"), "a file, not with -")
 
 
 def _reader(command: Retarget) -> Reader:
@@ -151,34 +123,6 @@ def _reader(command: Retarget) -> Reader:
     source = _robot_to_retarget(command.source)
     profile = _profile(command.source_profile) or find_profile(source)
     return Reader(source=source, profile=profile, fps=command.source_fps)
-
-
-def _fit(command: Retarget, file: Path) -> None:
-    """Write a profile found by a folder's clips."""
-    from rich.console import Console
-
-    from .. import retargeting
-
-    with told():
-        if not os.path.isdir(command.clip):
-            raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
-        motions: Any = _reader(command).all_in(Path(command.clip))
-        held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]
-        learned = [motion for number, motion in enumerate(motions, 1) if number % _HELD_OUT]
-        found = retargeting.fit(
-            _robot_to_retarget(command.robot, command.base),
-            learned,
-            held_out=held_out,
-            profile=_profile(command.profile),
-            mapping=_mapping(command.mapping),
-            acceleration=command.acceleration,
-        )
-        retargeting.save_profile(found.profile, file)
-    step, losses = found.step, found.losses
-    said = f"step {step} of {len(losses) - 1}: the loss of {len(learned)} clips is {losses[step]:.3f} times what it was"
-    if held_out:
-        said += f", of {len(held_out)} held out {found.held_out[step]:.3f} times"
-    _say(Console(), f"{said}\nwritten to {file}")
 
 
 def _retargeter(command: Retarget) -> Retargeter:
@@ -248,59 +192,6 @@ def _table(summary: dict[str, Any]) -> Table:
         values = ["-" if row.get(key) is None else f"{row[key]:.2f}" for key in _COLUMNS.values()]
         table.add_row(escape(name), f"{row['frames']:,}", *values)
     return table
-
-
-def _retarget_live(command: Retarget) -> None:
-    """Retarget a clip at its own rate, or a stream from stdin."""
-    import numpy as np
-    from rich.console import Console
-    from rich.markup import escape
-
-    from .. import retargeting
-    from ..retargeting._command import write_folder
-    from ..retargeting._live_command import replay, stream
-
-    console = Console()
-    with told():
-        if os.path.isdir(command.clip):
-            raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
-        profile = _profile(command.profile)
-        robot, mapping = _robot_to_retarget(command.robot, command.base), _mapping(command.mapping)
-
-        def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
-            return retargeting.LiveRetargeter(
-                robot,
-                standing,
-                profile=profile,
-                mapping=mapping,
-                acceleration=command.acceleration,
-                balance=command.balance,
-                look_ahead=command.look_ahead,
-                iterations=command.iterations,
-                budget=command.budget,
-            )
-
-        if command.clip == "-":
-            stream(make, sys.stdin, sys.stdout)
-            return
-        motion = _reader(command)(Path(command.clip))
-        assert isinstance(motion, retargeting.HumanMotion)  # without --source
-        motion, page = motion if command.fps is None else motion.resampled(command.fps), _page(command)
-        command.out.mkdir(parents=True, exist_ok=True)
-        console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
-        result, frames = replay(make, motion)
-        figures = write_folder(result, motion.name, command.out, animation=command.animation, page=page)
-    spent = 1e3 * np.array([frame.seconds for frame in frames])
-    ahead = max(1, round(command.look_ahead * motion.fps))
-    waiting = 1e3 * ahead / motion.fps
-    console.print(
-        f"the robot is {waiting + np.median(spent):.0f} ms behind: {ahead} frames of look-ahead are "
-        f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
-    )
-    lost = sum(frame.status.name == "FEET_OFF" for frame in frames)
-    if lost:
-        console.print(f"in {lost} of {len(frames)} frames limits did not let the feet hold (status feet_off)")
-    _print_retargeted(console, figures, command)
 
 
 def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarget) -> None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -15,22 +16,17 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._progress import Progress, reported
-from ..execution._platform import cpu_is_default
-from ..execution._workers import cores
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
 from ._command import write_json, write_motion
-from ._lanes import Clip, shared_length
+from ._lanes import Clip
 from ._load import Reader, clips_in
-from ._page import write_index
-from ._profile import Limb
-from ._profile_file import find_profile, profile_text, save_profile
+from ._profile_file import profile_text, save_profile
 from ._report import FIGURES, picked, report
-from ._retarget import Retargeter, Source
+from ._retarget import Retargeter
+from ._retargeted import Retargeted
 
 _JOB = "job.json"
-_COMPILING = 30_000
-"""Frames that a CPU plans in the time of one compilation."""
 
 
 def retarget_folder(
@@ -45,7 +41,7 @@ def retarget_folder(
     progress: Progress = True,
     page: bool = False,
 ) -> dict[str, Any]:
-    """Retarget every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` file directly inside a folder.
+    """Retarget every ``.bvh``, ``.npz`` and ``.csv`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
     also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with
@@ -61,7 +57,7 @@ def retarget_folder(
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
-        page: whether each clip gets a page, ``report.html``, and ``out`` an ``index.html`` with links to them.
+        page: whether each clip gets a page, ``report.html``.
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
@@ -75,111 +71,42 @@ def retarget_folder(
     """
     (files, others), reader = clips_in(folder), Reader() if reader is None else reader
     others = [name for name in others if folder / name != out]
-    if reader.source is not None:
-        retargeter = retargeter._led_by(reader.profile or find_profile(reader.source))
     job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
         sources = {name: _source(path, job) for name, path in files.items()}
-        work = _Work(retargeter, out, sources, chunk, page)
-        with reported(len(files), len(work.found), progress, "clips") as advance:
-            # longest first: shorter clips can then use the program compiled for longer ones
-            todo = [name for name in files if name not in work.found]
-            for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
-                advance(work.add(name, partial(reader.in_folder, files[name]), mapping, fps))
-            for done in work.rest():
-                advance(done)
-        summary = {**_summary(work.found, work.failed, [*files]), "no_clips": others}
+        finished = {name: _finished(out / name, of, page) for name, of in sources.items()}
+        found = {name: figures for name, figures in finished.items() if figures is not None}
+        failed: dict[str, str] = {}
+        # longest first, so that no core waits for a long clip at the end
+        todo = sorted((name for name in files if name not in found), key=lambda name: -files[name].stat().st_size)
+
+        def finish(number: int, make: Callable[[], Retargeted]) -> None:
+            name = todo[number]
+            try:
+                result = make()
+            except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
+                failed[name] = _reason(error)
+                return
+            found[name] = {"clip": name, **sources[name], **report(result)}
+            (out / name).mkdir(exist_ok=True)
+            write_motion(result, found[name], out / name, page)
+
+        def read(name: str) -> Clip:
+            return retargeter._prepared(reader.in_folder(files[name]), mapping, fps)
+
+        with (
+            reported(len(files), len(found), progress, "clips") as advance,
+            contextlib.closing(retargeter._each([partial(read, name) for name in todo], finish, chunk)) as each,
+        ):
+            for _ in each:
+                advance(1)
+        summary = {**_summary(found, failed, [*files]), "no_clips": others}
         write_json(summary, out / "report.json")
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(_index(summary))
-        if page:
-            write_index(summary, out / "index.html")
     return summary
-
-
-class _Work:
-    """Progress of a folder job: finished and failed clips, and clips that wait for others of the same length.
-
-    Attributes:
-        found: reports of finished clips by name.
-        failed: error messages of failed clips by name.
-    """
-
-    def __init__(
-        self,
-        retargeter: Retargeter,
-        out: Path,
-        sources: Mapping[str, dict[str, str]],
-        chunk: int,
-        page: bool,
-    ):
-        self._retargeter, self._out, self._sources, self._page = retargeter, out, sources, page
-        found = {name: _finished(out / name, of, page) for name, of in sources.items()}
-        self.found = {name: own for name, own in found.items() if own is not None}
-        self.failed: dict[str, str] = {}
-        self._lanes = cores() if cpu_is_default() else min(chunk, max(1, len(sources) - len(self.found)))
-        self._lengths = _Lengths()
-        self._waiting: dict[tuple[int, tuple[Limb, ...]], list[tuple[str, Clip]]] = {}
-
-    def add(
-        self,
-        name: str,
-        read: Callable[[], Source],
-        mapping: Mapping[str, str] | None,
-        fps: float | None,
-    ) -> int:
-        """Read a clip; retarget it with the waiting clips once a batch is full; return the number finished."""
-        try:
-            clip = self._retargeter._prepared(read(), mapping, fps)
-        except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
-            self.failed[name] = _reason(error)
-            return 1
-        length = self._lengths.of(shared_length(clip))
-        alike = length, clip.touching
-        waiting = self._waiting.setdefault(alike, [])
-        waiting.append((name, clip))
-        return self._finish(length, self._waiting.pop(alike)) if len(waiting) == self._lanes else 0
-
-    def rest(self) -> Iterator[int]:
-        """Retarget all waiting clips, one batch per length; yield the number finished."""
-        for (length, _), waiting in self._waiting.items():
-            yield self._finish(length, waiting)
-
-    def _finish(self, length: int, clips: list[tuple[str, Clip]]) -> int:
-        made = self._retargeter._solved([clip for _, clip in clips], length, self._lanes)
-        for (name, _), record in zip(clips, made, strict=True):
-            try:
-                result = record()
-            except ValueError as error:
-                self.failed[name] = _reason(error)
-                continue
-            self.found[name] = {"clip": name, **self._sources[name], **report(result)}
-            (self._out / name).mkdir(exist_ok=True)
-            write_motion(result, self.found[name], self._out / name, self._page)
-        return len(clips)
-
-
-class _Lengths:
-    """Frame counts for which programs are compiled.
-
-    A clip uses the next longer compiled length, until the padding of its length adds up to the cost of a compilation.
-    """
-
-    def __init__(self) -> None:
-        self._compiled: set[int] = set()
-        self._wasted: dict[int, int] = {}
-
-    def of(self, own: int) -> int:
-        """Return the number of frames to which a clip of ``own`` frames is padded."""
-        longer = min((length for length in self._compiled if length >= own), default=own)
-        wasted = self._wasted.get(own, 0) + longer - own
-        if wasted > _COMPILING:
-            longer, wasted = own, 0
-        self._wasted[own] = wasted
-        self._compiled.add(longer)
-        return longer
 
 
 def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,22 +11,21 @@ from typing import Any
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..scaling._fingerprint import fingerprint, identifier
-from ._amc import read_amc
 from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
 from ._profile import Profile
 from ._profile_file import find_profile, profile_text
 from ._source_motion import SourceMotion
-from ._up import Up, checked_up, find_rest_up, standing_up
+from ._up import Up
 
-ENDINGS = (".bvh", ".amc", ".npz", ".csv")
+ENDINGS = (".bvh", ".npz", ".csv")
 
 
 def load_motion(
     path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
 ) -> HumanMotion:
-    """Read a person's motion: BVH, AMC with its ASF beside it, ``.npz`` or ``.csv``, told apart by the ending.
+    """Read a person's motion: BVH, ``.npz`` or ``.csv``, told apart by the ending.
 
     Args:
         path: the file.
@@ -46,14 +45,11 @@ def load_motion(
     if ending not in ENDINGS and (ending or Path(path).exists()):  # a misspelt folder has no ending, and is missing
         raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
     if unit is not None and ending in ENDINGS and ending != ".bvh":
-        raise OsikValueError("unit goes with BVH files; keypoints are metres, and an .asf says its unit")
+        raise OsikValueError("unit goes with BVH files; keypoints are metres")
     if not Path(path).is_file():
         raise FileNotFoundError(f"no such file: {path}")
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up, trim=trim)
-    if ending == ".amc":
-        motion = read_amc(Path(path))
-        return standing_up(str(path), motion, checked_up(up), "y", find_rest_up(motion))
     return read_keypoints(path, up=up)
 
 
@@ -80,16 +76,6 @@ class Reader:
         unit, fps = self.unit if ending == ".bvh" else None, self.fps if ending == ".csv" else None
         return dataclasses.replace(self, unit=unit, fps=fps)(path)
 
-    def all_in(self, folder: Path) -> list[HumanMotion | SourceMotion]:
-        """Read all clips of a folder in order of name; an error's message starts with the clip's name."""
-        motions = []
-        for name, path in clips_in(folder)[0].items():
-            try:
-                motions.append(self.in_folder(path))
-            except (ValueError, KeyError) as error:
-                raise type(error)(f"{name}: {error.args[0]}") from error
-        return motions
-
     def options(self) -> dict[str, Any]:
         """Return the options that change what the reader returns, as numbers and strings."""
         if self.source is None:
@@ -102,12 +88,11 @@ class Reader:
 def clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """Return the motion files of a folder by clip name, and the names of what else is in it.
 
-    A clip's name is the file's, without its ending unless two would clash. Skeletons (.asf) and hidden files are not
-    named.
+    A clip's name is the file's, without its ending unless two would clash. Hidden files are not named.
     """
     inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
     files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
-    others = [path.name + "/" * path.is_dir() for path in inside if path not in files and path.suffix.lower() != ".asf"]
+    others = [path.name + "/" * path.is_dir() for path in inside if path not in files]
     if not files:
         seen = shortened([path.name for path in inside]) or "nothing"
         raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen}")

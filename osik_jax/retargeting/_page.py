@@ -6,7 +6,6 @@ import html
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from ._retargeted import Retargeted
 
 _OFF, _MOST_JOINTS = 1e-3, 8
 """Distance from the plan that counts [rad or m], and number of joints that the panel lists."""
-# on a narrow screen the scene keeps the width to height of 3:2 that its camera is placed for; 36 px are its controls
 # On a narrow screen the scene keeps the ratio of 3:2 that its camera is placed for; its controls take 36 px.
 _STYLE = """<style>
 #root{position:fixed;left:0;top:0;bottom:0;width:calc(100% - 340px)}
@@ -29,17 +27,6 @@ font:13px/1.4 system-ui,sans-serif;color:#1f2933;background:#fff;border-left:1px
 @media (max-width:800px){#root{width:100%;height:min(67vw + 36px,60%)}
 #osik{width:100%;top:min(67vw + 36px,60%);border-left:0;border-top:1px solid #d9dfe7}}
 #osik .lines{position:relative}#osik .now{position:absolute;top:0;bottom:0;width:1px;background:#1c6fb8}
-</style>"""
-_INDEX_STYLE = """<style>
-body{font:14px/1.45 system-ui,sans-serif;color:#1f2933;margin:20px;max-width:1400px}h1{font-size:20px;margin:0}
-table{border-collapse:collapse;width:100%;margin-top:14px}tbody{border-top:1px solid #d9dfe7}
-th,td{padding:4px 6px;text-align:right;vertical-align:top;font-variant-numeric:tabular-nums}
-th{font-size:12px;font-weight:600;vertical-align:bottom}th:first-child,td:first-child{text-align:left;min-width:8em}
-ul{margin:0;padding-left:18px}ul,.failed{color:#b3261e;text-align:left!important;max-width:110ch;overflow-wrap:anywhere}
-@media (max-width:800px){body{margin:12px}thead{display:none}table,tbody,td{display:block}tbody{padding:8px 0}
-tr{display:grid;grid-template-columns:1fr 1fr;column-gap:20px}td{padding:1px 0}td:first-child,.failed{grid-column:1/-1}
-td[title]{display:flex;justify-content:space-between;gap:6px}td[title]::before{content:attr(title);color:#52606d;
-text-align:left}a{font-weight:600}}
 </style>"""
 _SCRIPT = """<script>
 setInterval(()=>{const s=document.querySelector('#root [role=slider]');if(!s)return;
@@ -56,36 +43,6 @@ def write_report(result: Retargeted, figures: Mapping[str, Any], motion: Path, o
     panel = _STYLE + _panel(result, figures) + _SCRIPT
     title = str(figures.get("clip", motion.stem))
     write_page(result.robot, read_motion(motion, result.robot), out, title=title, beside=panel)
-
-
-def write_index(summary: Mapping[str, Any], out: Path) -> None:
-    """Write the summary of a folder as HTML: a clip's name is a link to its page, and its notes are below its figures.
-
-    Clips that failed come first, then those with notes. The file is in the folder of the clips' folders.
-    """
-    failed, notes, rows = summary["failed"], summary["notes"], summary["figures"]
-    titles = ["frames", "frames a second", *(title for title, _ in FIGURES.values())]
-    parts = [
-        "<!doctype html><html lang=en><meta charset=utf-8><meta name=viewport content='width=device-width'>",
-        f"<title>Retargeted clips</title>{_INDEX_STYLE}<h1>Retargeted clips</h1>",
-        f"<p>{summary['clips']} clips, {summary['frames']:,} frames; {len(notes)} with notes, {len(failed)} failed",
-        f"<p>No clips: {_text(', '.join(summary['no_clips']))}" if summary["no_clips"] else "",
-        f"<table><thead><tr><th>clip{''.join(f'<th>{_text(title)}' for title in titles)}</thead>",
-    ]
-    parts += [
-        f"<tbody><tr><td>{_text(name)}<td class=failed colspan={len(titles)}>{_text(reason)}"
-        for name, reason in failed.items()
-    ]
-    for name in sorted(rows, key=lambda name: name not in notes):
-        linked = _text(name)
-        if (out.parent / name / "report.html").exists():
-            linked = f'<a href="{quote(name)}/report.html">{linked}</a>'
-        cells = zip(titles, rows[name].values(), strict=True)
-        figures = "".join(f'<td title="{_text(title)}">{_number(value)}' for title, value in cells)
-        parts.append(f"<tbody><tr><td>{linked}{figures}")
-        items = "".join(f"<li>{_text(note)}" for note in notes.get(name, ()))
-        parts += [f"<tr class=notes><td colspan={len(titles) + 1}><ul>{items}</ul>"] if items else []
-    out.write_text("\n".join([*parts, "</table>"]), encoding="utf-8")
 
 
 def _panel(result: Retargeted, figures: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -128,18 +128,6 @@ class Profile:
             ends = {role for limb in reached for role in limb}
             limbs = tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
         return (*limbs, *reached)
-
-    def without(self, roles: Collection[str]) -> Profile:
-        """Return the profile without some keypoints, and without the limbs and reaches that they belong to."""
-        gone = set(roles)
-        for first, second in LIMBS:  # from the trunk outwards
-            gone |= {second} if first in gone else set()
-        limbs, reaches = (
-            pairs if pairs is None else tuple(pair for pair in pairs if gone.isdisjoint(pair))
-            for pairs in (self.limbs, self.reaches)
-        )
-        keypoints = {role: place for role, place in self.keypoints.items() if role not in gone}
-        return dataclasses.replace(self, keypoints=keypoints, limbs=limbs, reaches=reaches)
 
     @property
     def is_hand(self) -> bool:

@@ -14,7 +14,6 @@ from ..robot._mujoco import model_qpos
 from ..tasks._polygon import hull
 from ._contact import stretches
 from ._facing import facing_at_home
-from ._hand import is_other_hand
 from ._notes import notes
 from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
@@ -58,12 +57,11 @@ def report(result: Retargeted) -> dict[str, Any]:
     - ``shapes``: depth of overlaps between the profile's capsules.
     - ``tracking``: keypoint errors per limb, at the scale that fits each limb best; mean angles between the person's
       segments and the robot's; ``trunk_angle_deg``: those of the orientations of pelvis and chest, and of the line from
-      hips to shoulders (None without these); ``other_hand``: whether a left hand follows a right one or the other way
-      round.
+      hips to shoulders (None without these).
     - ``touches``: distance of joints from their place on what they hold.
     - ``notes``: sentences on violated bounds, on clips that are too fast for the joints, on a trunk that leans over 10
-      degrees away from the person's, on joints at an end of their range in most frames, on a left hand that follows a
-      right one, and on clips whose feet stand in less than 20 % of the frames.
+      degrees away from the person's, on joints at an end of their range in most frames, and on clips whose feet stand
+      in less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, model_qpos(result.robot, result.q))
     figures = {
@@ -194,7 +192,6 @@ def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:
         "segment_angle_deg": angles,
         "segment_angle_deg_mean": float(np.mean(list(angles.values()))),
         "trunk_angle_deg": _trunk(result, places, person),
-        "other_hand": result.profile.is_hand and is_other_hand(result.robot, result.profile, person),
     }
 
 
