@@ -30,6 +30,12 @@ class Foot:
     toe: tuple[Point, Point]  # the front left and the front right corner in that frame [m]
     radius: float = 0.0  # radius of a round foot, whose corners are its centre [m]
 
+    def __post_init__(self) -> None:
+        _check_points(f"heel of {self.frame}", self.heel, (2, 3))
+        _check_points(f"toe of {self.frame}", self.toe, (2, 3))
+        if not self.radius >= 0.0:
+            raise OsikValueError(f"the radius of {self.frame} is {self.radius}; it is a length in metres, 0 or more")
+
 
 @dataclasses.dataclass(frozen=True)
 class Capsule:
@@ -39,6 +45,12 @@ class Capsule:
     start: Point
     end: Point
     radius: float
+
+    def __post_init__(self) -> None:
+        _check_points(f"start of the capsule on {self.frame}", self.start, (3,))
+        _check_points(f"end of the capsule on {self.frame}", self.end, (3,))
+        if not self.radius > 0.0 or self.start == self.end:
+            raise OsikValueError(f"the capsule on {self.frame}: the radius and the length have to be more than 0")
 
     def hides(self, other: Capsule) -> bool:
         """Return whether another capsule is inside this one, about the same segment."""
@@ -91,9 +103,10 @@ class Profile:
                 f"the profile has no keypoints {', '.join(dict.fromkeys(missing))}; a limb begins at a hip or a "
                 "shoulder, and there are two hips or none"
             )
-        for role in self.keypoints:
+        for role, (_, point) in self.keypoints.items():
             if role not in (*NEEDED, *HAND):
                 raise unknown_name("keypoint", role, (*NEEDED, *HAND))
+            _check_points(f"the keypoint {role}", point, (3,))
         for role in (role for limb in (*(self.limbs or ()), *(self.reaches or ())) for role in limb):
             if role not in self.keypoints:
                 raise unknown_name("keypoint", role, tuple(self.keypoints))
@@ -188,6 +201,13 @@ def world_points(robot: Robot, kinematics: Kinematics, places: Sequence[Place]) 
     """Return where places of a robot are in the world [m]."""
     positions, rotations = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
     return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
+
+
+def _check_points(what: str, points: object, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless these are points, finite and of a shape."""
+    numbers = np.asarray(points, float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise OsikValueError(f"{what} is {points!r}, of shape {numbers.shape}; expected {shape}, finite, in metres")
 
 
 def _middle(a: Point, b: Point) -> Point:
