@@ -162,36 +162,6 @@ def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, t
 
 
 @pytest.mark.release
-def test_an_obstacle_that_is_dragged_into_the_hand(view: LiveView, visit: Visit, tmp_path: Path) -> None:
-    page, left = visit.page, np.array([0.0, 1.0, 0.0])
-    enter(view, page)
-    view._desk.take_scheme("Weighted QP")
-    page.get_by_role("tab", name="Obstacles").click()
-    page.get_by_text("ball", exact=True).click()
-    assert until(lambda: "ball 1" in view._desk.obstacles)
-    assert view.loop.wait_until_ready(300.0)
-    before = target(view)
-    ball = before + np.array([0.0, -0.15, 0.0])
-    view._desk.move_obstacle("ball 1", position=ball, size=np.array([0.04, 0.0, 0.0]))
-    let_it_draw(page, 1500)
-    handle = view._obstacles._handles["ball 1"]
-    pull(view, page, ball + 0.75 * handle.scale * left, left, 0.14)
-    moved = view._desk.obstacles["ball 1"].position
-    assert moved[1] - ball[1] > 0.1
-    np.testing.assert_allclose(moved[[0, 2]], ball[[0, 2]], atol=1e-6)
-    assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 0.02)
-    data = next(mujoco_poses(ROBOT, view.loop.snapshot.q))
-    assert np.linalg.norm(mujoco_frame_pose(ROBOT, data, HAND)[0] - moved) > 0.04
-    assert away(view) > 0.01  # it had to give way
-    page.wait_for_timeout(1500)
-    page.screenshot(path=tmp_path / "obstacle.png")
-    page.get_by_role("button", name="Remove the one chosen").click()
-    assert until(lambda: not view._desk.obstacles)
-    assert until(lambda: away(view) < 1e-3)
-    visit.check()
-
-
-@pytest.mark.release
 def test_a_visitor_who_leaves_in_the_middle_of_a_drag_while_another_stays(view: LiveView, visit: Visit) -> None:
     page = visit.page
     enter(view, page)

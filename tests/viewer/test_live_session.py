@@ -16,7 +16,6 @@ import osik_jax as osik
 from osik_jax.control import _checks
 from osik_jax.robot._hands import find_hands
 from osik_jax.viewer import load_session
-from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._open import default_session
 from osik_jax.viewer.live._session import RobotSource, Session
@@ -103,7 +102,7 @@ def test_what_is_switched_off_is_as_if_it_were_not_there() -> None:
 
 
 def test_edits_at_the_desk() -> None:
-    desk = Desk(session(), robot_parts(ROBOT))
+    desk = Desk(session())
     desk.loop.aim("hand", (np.array([0.1, 0.1, 0.3]), np.eye(3)))
     desk.rank("foot", 2)
     desk.renumber("hand", weight=7.0)
