@@ -32,8 +32,6 @@ class Info:
     """Print the spheres that cover its collision shapes: how many, and how far they stick out."""
     given: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
     """With --spheres: spheres of your own, a .yaml of cuRobo or a URDF whose collision shapes are spheres."""
-    png: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
-    """With --spheres: write a picture of the robot and the spheres."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -49,9 +47,9 @@ class Info:
             raise CommandError("osik info needs a robot, as in osik info nao, or --system")
         robot = read_robot(self.robot, self.base)
         if self.spheres:
-            return _print_spheres(console, robot, self.given, self.png)
-        if self.given or self.png:
-            raise CommandError("--given and --png go with --spheres")
+            return _print_spheres(console, robot, self.given)
+        if self.given:
+            raise CommandError("--given goes with --spheres")
         base = "floating base" if robot.floating_base else "bolted down"
         own = robot.body_mass[robot.tree.is_own] if len(robot.tree.robots) <= 1 else robot.body_mass
         size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {float(own.sum()):.3f} kg"
@@ -85,13 +83,12 @@ def _print_system(console: Console) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
-def _print_spheres(console: Console, robot: Robot, given: str, png: str) -> int:
+def _print_spheres(console: Console, robot: Robot, given: str) -> int:
     """Print a table of the covering spheres of each collision shape; return the exit code."""
     from rich.markup import escape
     from rich.table import Table
 
     from ..collision import covering_spheres
-    from ..viewer._figures import sphere_picture
 
     try:
         spheres = covering_spheres(robot, given or None)
@@ -112,8 +109,6 @@ def _print_spheres(console: Console, robot: Robot, given: str, png: str) -> int:
         highlight=False,
         soft_wrap=True,
     )
-    if png:
-        console.print(f"{sphere_picture(png, robot, spheres)}: the robot, and its spheres", markup=False)
     return 0
 
 

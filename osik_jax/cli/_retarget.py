@@ -79,9 +79,6 @@ class Retarget:
     """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
     animation: bool = True
     """Write the film (motion.gif); of a folder none is written."""
-    report: bool = False
-    """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes;
-    for a folder a page per clip. Needs the extra viewer."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -96,12 +93,11 @@ class Retarget:
         console = Console()
         with told():
             motion = _reader(self)(Path(self.clip))
-            retargeter, page = _retargeter(self), _page(self)
-            mapping = _mapping(self.mapping)
+            retargeter, mapping = _retargeter(self), _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
             result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
-            figures = write_folder(result, motion.name, self.out, animation=self.animation, page=page)
+            figures = write_folder(result, motion.name, self.out, animation=self.animation)
         _print_retargeted(console, figures, self)
         return 0
 
@@ -153,7 +149,6 @@ def _retarget_folder(command: Retarget) -> int:
             _reader(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
-            page=_page(command),
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
@@ -231,15 +226,6 @@ def _profile(file: str | None) -> Profile | None:
     from ..retargeting import load_profile
 
     return None if file is None else load_profile(file)
-
-
-def _page(command: Retarget) -> bool:
-    """Return whether a page is written; the extra has to be installed then."""
-    if command.report:
-        from ..viewer.live._server import import_viser
-
-        import_viser()
-    return command.report
 
 
 def _number_or_name(text: str) -> str | float:

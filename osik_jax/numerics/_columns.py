@@ -41,7 +41,9 @@ def _says_something(row: Sequence[str]) -> bool:
 def _numbers(where: str, row: Sequence[str], names: Sequence[str]) -> list[float]:
     """Return the numbers of a line; ``where`` names it in messages."""
     if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
-        raise OsikValueError(f"{where}: {len(row)} values, but there are {len(names)} headings")
+        raise OsikValueError(
+            f"{where}: {len(row)} values, but there are {len(names)} headings; each line has {len(names)} numbers"
+        )
     values = [as_number(cell) for cell in row[: len(names)]]
     for name, value, cell in zip(names, values, row, strict=False):
         if not np.isfinite(value):

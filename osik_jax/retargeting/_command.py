@@ -17,7 +17,6 @@ from ..robot._mujoco import mujoco_poses
 from ..viewer._animate import paint_over, write_gif
 from ..viewer._overlay import BLUE, INK, Canvas
 from ..viewer._stage import frame_camera
-from ._page import write_report
 from ._profile_file import save_profile
 from ._report import report
 from ._retargeted import Retargeted
@@ -29,22 +28,20 @@ _FLOOR = "#9aa3ad"
 _RATE = 15.0
 
 
-def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool, page: bool = False) -> dict[str, Any]:
-    """Write motion (.npz and .csv), report, profile and optionally GIF and page; return the report."""
+def write_folder(result: Retargeted, name: str, out: Path, *, animation: bool) -> dict[str, Any]:
+    """Write motion (.npz and .csv), report, profile and optionally a GIF; return the report."""
     figures = {"clip": name, **report(result)}
-    write_motion(result, figures, out, page)
+    write_motion(result, figures, out)
     save_profile(result.profile, out / "profile.toml")
     if animation:
         film(result, out / "motion.gif")
     return figures
 
 
-def write_motion(result: Retargeted, figures: dict[str, Any], out: Path, page: bool = False) -> None:
-    """Write ``motion.npz``, ``motion.csv``, the page and, last of all, ``report.json`` to an existing folder."""
+def write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
     result.motion.save_csv(out / "motion.csv")
-    if page:
-        write_report(result, figures, out / "motion.npz", out / "report.html")
     write_json(figures, out / "report.json")
 
 

@@ -39,7 +39,6 @@ def retarget_folder(
     fps: float | None = None,
     chunk: int = 32,
     progress: Progress = True,
-    page: bool = False,
 ) -> dict[str, Any]:
     """Retarget every ``.bvh``, ``.npz`` and ``.csv`` file directly inside a folder.
 
@@ -57,7 +56,6 @@ def retarget_folder(
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
-        page: whether each clip gets a page, ``report.html``.
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
@@ -76,7 +74,7 @@ def retarget_folder(
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
         sources = {name: _source(path, job) for name, path in files.items()}
-        finished = {name: _finished(out / name, of, page) for name, of in sources.items()}
+        finished = {name: _finished(out / name, of) for name, of in sources.items()}
         found = {name: figures for name, figures in finished.items() if figures is not None}
         failed: dict[str, str] = {}
         # longest first, so that no core waits for a long clip at the end
@@ -91,7 +89,7 @@ def retarget_folder(
                 return
             found[name] = {"clip": name, **sources[name], **report(result)}
             (out / name).mkdir(exist_ok=True)
-            write_motion(result, found[name], out / name, page)
+            write_motion(result, found[name], out / name)
 
         def read(name: str) -> Clip:
             return retargeter._prepared(reader.in_folder(files[name]), mapping, fps)
@@ -145,15 +143,14 @@ def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:
     return {"source": path.name, "sha256": content, "job": identifier(job)}
 
 
-def _finished(folder: Path, source: dict[str, str], page: bool) -> dict[str, Any] | None:
-    """Return the report of a finished clip, or None if there is none for this file and job, or lacks its ``page``."""
+def _finished(folder: Path, source: dict[str, str]) -> dict[str, Any] | None:
+    """Return the report of a finished clip, or None if there is none for this file and job."""
     figures = _read(folder / "report.json") or {}
     try:
         picked(figures)
     except (KeyError, TypeError):
         return None
-    whole = source.items() <= figures.items() and ((folder / "report.html").exists() or not page)
-    return figures if whole else None
+    return figures if source.items() <= figures.items() else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -342,6 +342,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     before = first.stat().st_mtime_ns
     assert cli.main(["retarget", str(clips), "--out", str(out)]) == 1
     told, wrong = capsys.readouterr()
+    assert "no clips, and not read: notes.txt\n" in told
     assert "2 clips, 51 frames" in told and "osik: 1 of 3 clips failed" in wrong
     assert "broken: " in wrong and "line 1: a joint has the three columns NAME.x, NAME.y and NAME.z" in wrong
     assert first.stat().st_mtime_ns == before
