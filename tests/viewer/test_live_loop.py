@@ -147,24 +147,21 @@ def test_a_target_that_was_let_go_stays(loop: ControlLoop) -> None:
 
 
 def test_numbers_change_without_compiling(loop: ControlLoop) -> None:
-    program = loop._job.program if loop._job else None
+    steps = loop._steps
     loop.aim("hand", moved(-0.05, 0.0, 0.0))
     softer = tasks(hand=tasks()["hand"].replace(gain=2.0, weight=0.5))
     slow = (LIMITS[0], osik.VelocityLimit(ROBOT, velocity={"*": 0.01}))
     loop.change(lambda now: Controller(softer, now.scheme.replace(damping=1e-4), slow))
-    assert not loop._is_behind and loop._job is not None and loop._job.program is program
+    assert until(lambda: loop._laid is loop.controller) and loop._steps is steps
     assert until(lambda: bool(0.0 < np.abs(loop.snapshot.velocity).max() <= 0.01 * (1.0 + 1e-9)))
 
 
-def test_a_new_structure_takes_over_while_the_old_one_goes_on(loop: ControlLoop) -> None:
-    before = loop.snapshot.time
+def test_a_new_structure_follows_the_target_from_where_the_robot_is(loop: ControlLoop) -> None:
     loop.change(lambda now: Controller(now.tasks, osik.HierarchicalQP(), now.limits))
-    assert loop._is_behind
     target = moved(-0.05, 0.05, 0.0)
     loop.aim("hand", target)
-    assert until(lambda: loop.snapshot.time > before + 0.05)
     assert loop.wait_until_ready()
-    assert isinstance(loop._running.scheme, osik.HierarchicalQP)
+    assert isinstance(loop._steps[0].scheme, osik.HierarchicalQP)
     assert until(lambda: bool(np.linalg.norm(hand(loop.snapshot.q) - target[0]) < 1e-4))
 
 
@@ -175,6 +172,21 @@ def test_a_change_that_cannot_be_compiled_is_taken_back_and_told(loop: ControlLo
     assert "broken" not in loop.controller.tasks
     before = loop.snapshot.time
     assert until(lambda: loop.snapshot.time > before + 0.05)
+
+
+def test_a_step_that_raises_is_told_and_the_robot_stands_still(
+    loop: ControlLoop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(q: Any) -> None:
+        raise ValueError(f"no step at {len(q)} numbers")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(loop._steps[0], "step", refuse)
+        assert until(lambda: loop.snapshot.problem == "no step at 7 numbers" and loop.snapshot.failures > 3)
+        assert not loop.snapshot.velocity.any()
+    loop.change(lambda now: Controller(tasks(), now.scheme, now.limits))
+    before = loop.snapshot.time
+    assert until(lambda: not loop.snapshot.problem and loop.snapshot.time > before + 0.05)
 
 
 def _broken() -> osik.Task:

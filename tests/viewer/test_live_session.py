@@ -19,7 +19,7 @@ from osik_jax.viewer import load_session
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._open import default_session
 from osik_jax.viewer.live._session import RobotSource, Session
-from osik_jax.viewer.live._step import Controller, compile_step
+from osik_jax.viewer.live._step import Controller, laid_out
 
 ROBOT = osik.load_robot("nao")
 
@@ -183,6 +183,6 @@ def test_the_page_of_a_robot_does_not_complain_of_its_own_scheme(
 ) -> None:
     monkeypatch.setattr(_checks, "_said_ignored", set())  # each set of tasks is warned of once
     made = default_session(osik.load_robot("arm7"))
-    compile_step(made.robot, Controller(dict(made.tasks), made.scheme, made.limits), made.dt)
+    laid_out(made.robot, Controller(dict(made.tasks), made.scheme, made.limits), made.dt).step(made.q)
     assert len({task.priority for task in made.tasks.values()}) > 1 and isinstance(made.scheme, osik.WeightedQP)
     assert not [w for w in recwarn if issubclass(w.category, osik.OsikWarning)]
