@@ -39,7 +39,7 @@ class Retarget:
     """Retargets a person's motion to a robot: reads a motion file or a folder of them, and writes a folder.
 
     Writes motion.npz (MuJoCo's order, with the person's joints), motion.csv (position, quaternion x y z w, joints; no
-    headings), report.json (figures recomputed by MuJoCo), profile.toml (the robot's profile) and motion.gif.
+    headings), report.json (figures recomputed by MuJoCo) and profile.toml (the robot's profile).
     For a folder, each clip gets its own folder in --out, and report.json has the figures of all clips. The same
     command resumes an interrupted job.
     """
@@ -77,8 +77,6 @@ class Retarget:
     BVH's rest pose, and z of keypoints."""
     trim: bool = True
     """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
-    animation: bool = True
-    """Write the film (motion.gif); of a folder none is written."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -88,7 +86,7 @@ class Retarget:
         from rich.console import Console
         from rich.markup import escape
 
-        from ..retargeting._command import write_folder
+        from ..retargeting._folder import write_folder
 
         console = Console()
         with told():
@@ -97,7 +95,7 @@ class Retarget:
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
             result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
-            figures = write_folder(result, motion.name, self.out, animation=self.animation)
+            figures = write_folder(result, motion.name, self.out)
         _print_retargeted(console, figures, self)
         return 0
 

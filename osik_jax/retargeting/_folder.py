@@ -1,4 +1,4 @@
-"""Implementation of ``osik retarget FOLDER``: all clips of a folder, resumable after an interruption."""
+"""Files of ``osik retarget``: of one clip, or of all clips of a folder, resumable after an interruption."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._progress import Progress, reported
+from .._whole_file import write_text
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
-from ._command import write_json, write_motion
 from ._lanes import Clip
 from ._load import Reader, clips_in
 from ._profile_file import profile_text, save_profile
@@ -27,6 +27,26 @@ from ._retarget import Retargeter
 from ._retargeted import Retargeted
 
 _JOB = "job.json"
+
+
+def write_folder(result: Retargeted, name: str, out: Path) -> dict[str, Any]:
+    """Write motion (.npz and .csv), report and profile; return the report."""
+    figures = {"clip": name, **report(result)}
+    _write_motion(result, figures, out)
+    save_profile(result.profile, out / "profile.toml")
+    return figures
+
+
+def _write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
+    result.save(out / "motion.npz")
+    result.motion.save_csv(out / "motion.csv")
+    _write_json(figures, out / "report.json")
+
+
+def _write_json(figures: dict[str, Any], path: Path) -> None:
+    """Write a JSON file, so that a file of this name is always complete."""
+    write_text(path, json.dumps(figures, indent=2, allow_nan=False) + "\n")
 
 
 def retarget_folder(
@@ -89,7 +109,7 @@ def retarget_folder(
                 return
             found[name] = {"clip": name, **sources[name], **report(result)}
             (out / name).mkdir(exist_ok=True)
-            write_motion(result, found[name], out / name)
+            _write_motion(result, found[name], out / name)
 
         def read(name: str) -> Clip:
             return retargeter._prepared(reader.in_folder(files[name]), mapping, fps)
@@ -101,7 +121,7 @@ def retarget_folder(
             for _ in each:
                 advance(1)
         summary = {**_summary(found, failed, [*files]), "no_clips": others}
-        write_json(summary, out / "report.json")
+        _write_json(summary, out / "report.json")
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(_index(summary))
     return summary
@@ -131,7 +151,7 @@ def _claim(out: Path, job: dict[str, Any]) -> None:
     changed = differences(old, json.loads(json.dumps(job))) if old else []
     if changed:
         raise OsikValueError(f"{out} has another job in it; name another folder. What differs: {'; '.join(changed)}")
-    write_json(job, path)
+    _write_json(job, path)
 
 
 def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:

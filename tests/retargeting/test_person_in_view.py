@@ -17,7 +17,7 @@ FRAMES = 20
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     clip = write_bvh(folder / "dance <1>.bvh", dancer(FRAMES), 0.01)
-    assert Retarget(clip=str(clip), robot="nao", out=folder / "out", animation=False).run() == 0
+    assert Retarget(clip=str(clip), robot="nao", out=folder / "out").run() == 0
     return folder / "out"
 
 

@@ -219,7 +219,7 @@ def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, lea
     alone = [retarget(nao, dataclasses.replace(leaning, contact=one_foot), balance=b).q for b in (None, 0.01)]
     np.testing.assert_allclose(alone[0], alone[1], atol=1e-9)
     out = tmp_path / "out"
-    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02", "--no-animation"]) == 0
+    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02"]) == 0
     assert json.loads((out / "report.json").read_text())["balance"]["com_margin_mm_min"] > 20.0 - 0.05
     capsys.readouterr()
 
@@ -385,7 +385,7 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     many.mkdir()
     names = np.array(motion.joint_names)
     np.savez(many / "dance.npz", fps=FPS, positions=motion.positions, joint_names=names, **held)
-    arguments = ["--no-animation", "--out", str(tmp_path / "out")]
+    arguments = ["--out", str(tmp_path / "out")]
     assert cli.main(["retarget", str(many / "dance.npz"), *arguments]) == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -434,9 +434,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     out = tmp_path / "out"
     assert cli.main(["retarget", str(dance), "--out", str(out)]) == 0
     assert "written to" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == {
-        "motion.npz", "motion.csv", "motion.gif", "report.json", "profile.toml"
-    }  # fmt: skip
+    assert {path.name for path in out.iterdir()} == {"motion.npz", "motion.csv", "report.json", "profile.toml"}
     figures = json.loads((out / "report.json").read_text())
     assert figures["clip"] == "dance" and figures["feet"]["slip_mm_max"] < 0.01
     motion = RobotMotion.load(out / "motion.npz")
@@ -448,7 +446,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
 def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
     clip = write_bvh(tmp_path / "clip.bvh", with_first(2, dancer(30)))
     out = tmp_path / "out"
-    assert cli.main(["retarget", str(clip), "--no-trim", "--no-animation", "--out", str(out)]) == 0
+    assert cli.main(["retarget", str(clip), "--no-trim", "--out", str(out)]) == 0
     assert len(RobotMotion.load(out / "motion.npz").qpos) == 32
 
 

@@ -99,7 +99,7 @@ def test_other_rates_and_tables(nao, danced, tmp_path):
         SourceMotion.load(file, nao, fps=60.0)
     with pytest.raises(ValueError, match="mapping names joints of a person's clip"):
         retarget(nao, fast, mapping={"left_hip": "hip"})
-    assert cli.main(["retarget", str(table), "--source", "nao", "--source-fps", "30", "--no-animation",
+    assert cli.main(["retarget", str(table), "--source", "nao", "--source-fps", "30",
                      "--out", str(tmp_path / "out")]) == 0  # fmt: skip
     assert len(RobotMotion.load(tmp_path / "out" / "motion.npz").qpos) == len(first.q)
 

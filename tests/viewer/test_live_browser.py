@@ -203,7 +203,7 @@ def test_an_exported_page_plays_without_a_server(visit: Visit, tmp_path: Path) -
 @pytest.mark.release
 def test_a_retargeted_motion_plays_beside_the_person(visit: Visit, tmp_path: Path) -> None:
     clip = write_bvh(tmp_path / "dance.bvh", dancer(40), 0.01)
-    assert Retarget(clip=str(clip), out=tmp_path / "out", animation=False).run() == 0
+    assert Retarget(clip=str(clip), out=tmp_path / "out").run() == 0
     assert View(file=tmp_path / "out" / "motion.npz", html=tmp_path / "motion.html").run() == 0
     page: Any = visit.page
     visit.requests.clear()
