@@ -13,7 +13,7 @@ from made_up_map import WHOLE, made_up_map
 from motion_files import dancer, write_bvh
 from playwright.sync_api import Page, sync_playwright
 from scipy.spatial.transform import Rotation
-from waiting import until
+from waiting import steps_of, until
 
 import osik_jax as osik
 from osik_jax.cli import Retarget, View
@@ -127,31 +127,30 @@ def enter(view: LiveView, page: Page) -> None:
 def test_dragging_switching_and_reaching_too_far(view: LiveView, visit: Visit, tmp_path: Path) -> None:
     page, ahead, up = visit.page, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     enter(view, page)
-    view.loop.record()
     start = target(view)
+    with steps_of(view.loop) as steps:
+        drag(view, page, up, 0.05)
+        assert target(view)[2] - start[2] == pytest.approx(0.05, abs=0.02)
+        np.testing.assert_allclose(target(view)[:2], start[:2], atol=1e-6)
+        assert until(lambda: away(view) < 1e-3)
+        page.screenshot(path=tmp_path / "dragged.png")
 
-    drag(view, page, up, 0.05)
-    assert target(view)[2] - start[2] == pytest.approx(0.05, abs=0.02)
-    np.testing.assert_allclose(target(view)[:2], start[:2], atol=1e-6)
-    assert until(lambda: away(view) < 1e-3)
-    page.screenshot(path=tmp_path / "dragged.png")
+        page.get_by_role("combobox", name="Scheme").click()
+        page.get_by_role("option", name="Hierarchical QP").click()
+        assert until(lambda: isinstance(view.session.scheme, osik.HierarchicalQP))
+        assert view.loop.wait_until_ready(120.0)
+        assert until(lambda: away(view) < 1e-3)
 
-    page.get_by_role("combobox", name="Scheme").click()
-    page.get_by_role("option", name="Hierarchical QP").click()
-    assert until(lambda: isinstance(view.session.scheme, osik.HierarchicalQP))
-    assert view.loop.wait_until_ready(120.0)
-    assert until(lambda: away(view) < 1e-3)
+        drag(view, page, ahead, 0.4)
+        assert target(view)[0] - start[0] > 0.3
+        assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 0.1)
+        assert away(view) > 0.02
+        page.screenshot(path=tmp_path / "out_of_reach.png")
+        drag(view, page, ahead, -0.4)
+        assert until(lambda: away(view) < 1e-3)
+        page.screenshot(path=tmp_path / "back.png")
 
-    drag(view, page, ahead, 0.4)
-    assert target(view)[0] - start[0] > 0.3
-    assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 0.1)
-    assert away(view) > 0.02
-    page.screenshot(path=tmp_path / "out_of_reach.png")
-    drag(view, page, ahead, -0.4)
-    assert until(lambda: away(view) < 1e-3)
-    page.screenshot(path=tmp_path / "back.png")
-
-    _, q = view.loop.recorded()
+    q = np.array([step.q for step in steps])
     lower, upper, top = (
         np.asarray(part)[6:] for part in (ROBOT.position_lower, ROBOT.position_upper, ROBOT.velocity_limit)
     )

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from mujoco_states import mujoco_at
 from refusals import refuses
+from waiting import steps_of
 from waiting import until as until_within
 
 import osik_jax as osik
@@ -84,11 +85,11 @@ def test_the_robot_goes_where_its_target_is(loop: ControlLoop) -> None:
 
 def test_every_step_is_the_solution_of_its_step(loop: ControlLoop) -> None:
     target = moved(-0.1, 0.1, 0.0)
-    loop.record()
-    loop.aim("hand", target)
-    assert until(lambda: (loop.snapshot.recording or 0.0) > 0.3)
-    time, q = loop.recorded()
-    np.testing.assert_allclose(np.diff(time), DT, atol=1e-12)
+    with steps_of(loop) as steps:
+        loop.aim("hand", target)
+        assert until(lambda: len(steps) > 60)
+    q = np.array([step.q for step in steps])
+    np.testing.assert_allclose(np.diff([step.time for step in steps]), DT, atol=1e-12)
     wanted = tasks(hand=tasks()["hand"].replace(target=target))
     for k in (20, 40, len(q) - 2):
         v = osik.solve(ROBOT, q[k], wanted, scheme=osik.WeightedQP(), limits=LIMITS, dt=DT).velocity
@@ -96,11 +97,10 @@ def test_every_step_is_the_solution_of_its_step(loop: ControlLoop) -> None:
 
 
 def test_limits_hold_on_the_way_to_what_is_out_of_reach(loop: ControlLoop) -> None:
-    loop.record()
-    loop.aim("hand", moved(2.0, 0.5, 1.0))
-    assert until(lambda: (loop.snapshot.recording or 0.0) > 1.5)
-    _, q = loop.recorded()
-    assert len(q) > 250
+    with steps_of(loop) as steps:
+        loop.aim("hand", moved(2.0, 0.5, 1.0))
+        assert until(lambda: len(steps) > 300)
+    q = np.array([step.q for step in steps])
     speed = np.abs(np.diff(q, axis=0)) / DT
     assert np.all(speed <= np.asarray(ROBOT.velocity_limit) * (1.0 + 1e-9))
     assert speed.max() > 0.5

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from refusals import refuses
-from waiting import until
+from waiting import steps_of, until
 
 import osik_jax as osik
 from osik_jax.cli import main
@@ -135,10 +135,10 @@ def test_robots_side_by_side_each_with_its_own_numbers() -> None:
         for name in view.names:
             view.aim(name, "hand", (target, rotation))
         view.loop.reset()
-        view.loop.record()
-        view.loop.resume()
-        assert until(lambda: (view.loop.snapshot.recording or 0.0) > 0.3)
-        q = view.loop.recorded().q
+        with steps_of(view.loop) as steps:
+            view.loop.resume()
+            assert until(lambda: len(steps) > 60)
+        q = np.array([np.tile(ARM.q0, (2, 1)), *(step.q for step in steps)])
         assert q.shape[1:] == (2, ARM.nq)
         for lane, (name, own) in enumerate(robots.items()):
             aimed = {**own, "hand": own["hand"].replace(target=(target, rotation))}

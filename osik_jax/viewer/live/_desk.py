@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError, unknown_name
-from ...limits import VelocityLimit
 from ...saving._parts import decode, encode
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
@@ -117,16 +116,6 @@ class Desk:
         with self._lock:
             off = self._session.limits_off
             self.edit(limits_off=off - {number} if on else off | {number})
-
-    def slow_down(self, share: float) -> None:
-        """Set speed limits to a share of the robot's own."""
-        with self._lock:
-            own = np.asarray(self._session.robot.velocity_limit)
-            limits = [
-                limit.replace(velocity=own * share) if type(limit) is VelocityLimit else limit
-                for limit in self._session.limits
-            ]
-            self.edit(limits=tuple(limits))
 
     @property
     def obstacles(self) -> dict[str, Obstacle]:

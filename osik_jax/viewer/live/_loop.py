@@ -21,7 +21,7 @@ from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._obstacles import moved
-from ._snapshot import Recorder, Recording, Snapshot
+from ._snapshot import Snapshot
 from ._step import Controller, laid_out, lane_of, targets_here, with_targets
 from ._timing import CONTROL, Stopwatch, Timing, be_nice
 
@@ -50,8 +50,8 @@ class ControlLoop:
     does not have it; the robot stands still meanwhile, as while paused and after an answer that is not finite. If the
     owner of a target (``aim``) leaves or its timeout passes, the target becomes the robot's current pose.
 
-    Of a batch of B robots, q0 is (B, nq), and each number of the controller has a leading axis B. So have targets,
-    snapshots and recordings.
+    Of a batch of B robots, q0 is (B, nq), and each number of the controller has a leading axis B. So have targets
+    and snapshots.
 
     Attributes:
         robot: the robot.
@@ -83,7 +83,7 @@ class ControlLoop:
         self._leases: dict[str, _Lease] = {}
         self._problem = ""
         self._orders: deque[Callable[[], None]] = deque()
-        self._stopwatch, self._recorder = Stopwatch(), Recorder(self.dt)
+        self._stopwatch = Stopwatch()
         self._snapshot = Snapshot(0.0, self._start, still, preparing=True)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="osik-control", daemon=True)
@@ -211,14 +211,6 @@ class ControlLoop:
         """Move the robot to its start configuration at once; targets stay."""
         self._orders.append(self._reset)
 
-    def record(self) -> None:
-        """Start a recording of at most ten minutes; a running one is discarded."""
-        self._orders.append(lambda: self._recorder.start(self._snapshot.q))
-
-    def recorded(self) -> Recording:
-        """End the recording and return it; empty if none ran."""
-        return self._recorder.stop()
-
     def _run(self) -> None:
         """Run the control thread."""
         be_nice(CONTROL)
@@ -306,7 +298,6 @@ class ControlLoop:
             status=int(codes.max()),
             errors=one.error,
             failures=before.failures + int(np.sum(~usable)),
-            recording=self._recorder.add(q),
         )
 
     def _show(self, **changes: Any) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..._errors import OsikValueError
 from ...limits import Limit, NoLimits
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
@@ -112,8 +111,6 @@ class Panel:
         gui = self._server.gui
         self._limits = gui.add_folder("On and off")
         self._limit_boxes: list[Any] = []
-        speed = gui.add_slider("Speeds, share", 0.05, 1.0, step=0.05, initial_value=1.0)
-        speed.on_update(self._guarded(lambda event: self._desk.slow_down(event.target.value)))
         gui.add_markdown("**Nearest to a limit**")
         self._joints = gui.add_markdown("")
 
@@ -137,31 +134,19 @@ class Panel:
 
     def _add_session(self) -> None:
         gui = self._server.gui
-        record, motion = gui.add_button("Start recording"), gui.add_button("Stop, and download motion.npz")
-        gui.add_divider()
         save = gui.add_button("Download session.json")
         load = gui.add_upload_button("Load a session", mime_type="application/json")
-        record.on_click(lambda _: self._desk.loop.record())
-        motion.on_click(self._guarded(self._send_motion))
-        save.on_click(
-            self._guarded(lambda event: self._send(event, "session.json", self._desk.session.to_json().encode()))
-        )
+        save.on_click(self._guarded(self._send))
         load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
 
     def _load(self, content: bytes) -> None:
         self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
         self.refill()
 
-    def _send_motion(self, event: Any) -> None:
-        """Send the recording to the visitor, in the format of ``osik demo``."""
-        recording = self._desk.loop.recorded()
-        if not len(recording.time):
-            raise OsikValueError("nothing was recorded")
-        self._send(event, "motion.npz", recording.to_npz(q_live=recording.q))
-
-    def _send(self, event: Any, name: str, content: bytes) -> None:
-        """Send a file to the visitor who asked for it."""
-        (event.client or self._server).send_file_download(name, content, save_immediately=True)
+    def _send(self, event: Any) -> None:
+        """Send the session to the visitor who asked for it."""
+        content = self._desk.session.to_json().encode()
+        event.client.send_file_download("session.json", content, save_immediately=True)
 
     @property
     def _name(self) -> str:

@@ -28,8 +28,6 @@ def state_text(snapshot: Snapshot) -> str:
     doing = "**paused**" if snapshot.paused else "**running**"
     if snapshot.preparing:
         doing += " · compiling the change …"
-    if snapshot.recording is not None:
-        doing += f" · recording {snapshot.recording:.1f} s"
     return doing
 
 
