@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import sys
@@ -12,16 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .._errors import OsikValueError
-from ._messages import refuse, told
+from ._messages import told
 from ._robots import read_robot
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from ..retargeting import Profile, Retargeter
-    from ..retargeting._load import Reader
-    from ..robot import Robot
+    from ..retargeting import Retargeter
 
 _COLUMNS = {
     "slip\n[mm]": "slip_mm_max",
@@ -45,17 +44,11 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
+    """A BVH file, keypoints as .npz or .csv, or a folder of such files."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"
     """Base of a robot that comes as a file: "floating" moves, "fixed" stands still and only the limbs follow."""
-    source: str | None = None
-    """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
-    source_fps: float | None = None
-    """Frames a second of a CSV with --source."""
-    source_profile: str | None = None
-    """Profile (TOML) of the robot of --source, as --profile."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
@@ -80,17 +73,17 @@ class Retarget:
 
     def run(self) -> int:
         """Run the command; return the exit code."""
-        _check(self)
         if os.path.isdir(self.clip):
             return _retarget_folder(self)
         from rich.console import Console
         from rich.markup import escape
 
+        from ..retargeting import load_motion
         from ..retargeting._folder import write_folder
 
         console = Console()
         with told():
-            motion = _reader(self)(Path(self.clip))
+            motion = load_motion(self.clip, **_reading(self))
             retargeter, mapping = _retargeter(self), _mapping(self.mapping)
             console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
@@ -100,32 +93,23 @@ class Retarget:
         return 0
 
 
-def _check(command: Retarget) -> None:
-    """Raise an error for options that have no meaning beside the others."""
-    refuse(command, command.source is not None, ("unit", "up", "trim", "mapping"), "a person's clip, not with --source")
-    refuse(command, command.source is None, ("source_fps", "source_profile"), "--source")
-
-
-def _reader(command: Retarget) -> Reader:
-    """Return the function that reads a clip as the command says."""
-    from ..retargeting._load import Reader
-    from ..retargeting._profile_file import find_profile
-
-    if command.source is None:
-        unit = None if command.unit is None else _number_or_name(command.unit)
-        return Reader(unit=unit, up=command.up, trim=command.trim)
-    source = _robot_to_retarget(command.source)
-    profile = _profile(command.source_profile) or find_profile(source)
-    return Reader(source=source, profile=profile, fps=command.source_fps)
+def _reading(command: Retarget) -> dict[str, Any]:
+    """Return the arguments of ``load_motion``."""
+    unit: Any = command.unit
+    with contextlib.suppress(TypeError, ValueError):  # no option, or a unit by name
+        unit = float(unit)
+    return {"unit": unit, "up": command.up, "trim": command.trim}
 
 
 def _retargeter(command: Retarget) -> Retargeter:
-    """Return the retargeter of whole clips that the command describes."""
+    """Return the retargeter of whole clips that the command describes; a robot of the package is as it is."""
     from .. import retargeting
+    from ..robot.loading import ROBOTS
 
+    base = "auto" if command.robot in ROBOTS and command.base == "floating" else command.base
     return retargeting.Retargeter(
-        _robot_to_retarget(command.robot, command.base),
-        profile=_profile(command.profile),
+        read_robot(command.robot, base),
+        profile=None if command.profile is None else retargeting.load_profile(command.profile),
         acceleration=command.acceleration,
         smoothness=command.smooth,
         balance=command.balance,
@@ -144,7 +128,7 @@ def _retarget_folder(command: Retarget) -> int:
             _retargeter(command),
             Path(command.clip),
             command.out,
-            _reader(command),
+            **_reading(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
         )
@@ -211,26 +195,6 @@ def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarg
 def _say(console: Console, text: str) -> None:
     """Print a text as it is, on as many lines as it has."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
-    """Return a robot by name or file; one that comes with the package is as it is."""
-    from ..robot.loading import ROBOTS
-
-    return read_robot(source, "auto" if source in ROBOTS and base == "floating" else base)
-
-
-def _profile(file: str | None) -> Profile | None:
-    from ..retargeting import load_profile
-
-    return None if file is None else load_profile(file)
-
-
-def _number_or_name(text: str) -> str | float:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:

@@ -20,11 +20,12 @@ from .._whole_file import write_text
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
 from ._lanes import Clip
-from ._load import Reader, clips_in
+from ._load import clips_in, load_motion
 from ._profile_file import profile_text, save_profile
 from ._report import FIGURES, picked, report
 from ._retarget import Retargeter
 from ._retargeted import Retargeted
+from ._up import Up
 
 _JOB = "job.json"
 
@@ -53,8 +54,10 @@ def retarget_folder(
     retargeter: Retargeter,
     folder: Path,
     out: Path,
-    reader: Reader | None = None,
     *,
+    unit: str | float | None = None,
+    up: Up | None = None,
+    trim: bool = True,
     mapping: Mapping[str, str] | None = None,
     fps: float | None = None,
     chunk: int = 32,
@@ -71,7 +74,9 @@ def retarget_folder(
         retargeter: the retargeter of the robot.
         folder: folder of the clips; folders inside it are not searched.
         out: output folder.
-        reader: function that reads a clip. None: as ``load_motion`` does.
+        unit: as of ``load_motion``, of the BVH files.
+        up: as of ``load_motion``.
+        trim: as of ``load_motion``.
         mapping: as of ``Retargeter.retarget``, the same for all clips.
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
@@ -87,9 +92,9 @@ def retarget_folder(
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    (files, others), reader = clips_in(folder), Reader() if reader is None else reader
+    files, others = clips_in(folder)
     others = [name for name in others if folder / name != out]
-    job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
+    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up, "trim": trim})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
@@ -112,7 +117,9 @@ def retarget_folder(
             _write_motion(result, found[name], out / name)
 
         def read(name: str) -> Clip:
-            return retargeter._prepared(reader.in_folder(files[name]), mapping, fps)
+            path = files[name]
+            motion = load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up, trim=trim)
+            return retargeter._prepared(motion, mapping, fps)
 
         with (
             reported(len(files), len(found), progress, "clips") as advance,

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from .._errors import OsikValueError
-from ..robot import Robot
-from ..scaling._fingerprint import fingerprint, identifier
 from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
-from ._profile import Profile
-from ._profile_file import find_profile, profile_text
-from ._source_motion import SourceMotion
 from ._up import Up
 
 ENDINGS = (".bvh", ".npz", ".csv")
@@ -51,38 +44,6 @@ def load_motion(
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up, trim=trim)
     return read_keypoints(path, up=up)
-
-
-@dataclasses.dataclass(frozen=True)
-class Reader:
-    """Reader for the clips of a job: motions of a person, or of a robot if ``source`` is given."""
-
-    unit: str | float | None = None  # unit of BVH files, as of ``load_motion``
-    up: Up | None = None  # up axis of all files, as of ``load_motion``
-    trim: bool = True  # for BVH files, as of ``load_motion``
-    source: Robot | None = None  # the robot whose motions the files hold; None: the files hold a person's motions
-    profile: Profile | None = None  # profile of ``source``, as of ``SourceMotion.load``
-    fps: float | None = None  # frame rate of CSV files of ``source``, as of ``SourceMotion.load``
-
-    def __call__(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read one clip."""
-        if self.source is not None:
-            return SourceMotion.load(path, self.source, profile=self.profile, fps=self.fps)
-        return load_motion(path, unit=self.unit, up=self.up, trim=self.trim)
-
-    def in_folder(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read one of the clips of a folder, where ``unit`` is that of the BVH files and ``fps`` that of the CSVs."""
-        ending = path.suffix.lower()
-        unit, fps = self.unit if ending == ".bvh" else None, self.fps if ending == ".csv" else None
-        return dataclasses.replace(self, unit=unit, fps=fps)(path)
-
-    def options(self) -> dict[str, Any]:
-        """Return the options that change what the reader returns, as numbers and strings."""
-        if self.source is None:
-            return {"unit": self.unit, "up": self.up, "trim": self.trim}
-        profile = find_profile(self.source) if self.profile is None else self.profile
-        source = {"robot": identifier(fingerprint(self.source)), "profile": identifier({"text": profile_text(profile)})}
-        return {"source": source, "source_fps": self.fps}
 
 
 def clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:

@@ -468,10 +468,7 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         (["DANCE", "--mapping", "left_hip"], "--mapping takes ROLE=NAME; got left_hip"),
         (["DANCE", "--mapping", "left_hip=Hip"], "no joint of the clip 'Hip'"),
         (["DANCE", "--unit", "yard"], "no unit 'yard'"),
-        (["m.npz", "--source", "nao", "--unit", "cm", "--no-trim"], "--unit, --trim go with a person's clip, not with"),
-        (["DANCE", "--source-fps", "30"], "--source-fps goes with --source"),
         (["NPZ", "--unit", "cm"], "unit goes with BVH files"),
-        (["NPZ", "--source", "nao", "--source-fps", "30"], "joint_names and fps go with a CSV"),
         (["DANCE", "--base", "fixed"], "--base goes with a file; nao is what it is"),
     ],
 )
