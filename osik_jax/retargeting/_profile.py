@@ -49,8 +49,10 @@ class Capsule:
     def __post_init__(self) -> None:
         _check_points(f"start of the capsule on {self.frame}", self.start, (3,))
         _check_points(f"end of the capsule on {self.frame}", self.end, (3,))
-        if not self.radius > 0.0 or self.start == self.end:
-            raise OsikValueError(f"the capsule on {self.frame}: the radius and the length have to be more than 0")
+        if not self.radius > 0.0:
+            raise OsikValueError(
+                f"the capsule on {self.frame} has radius {self.radius}; it is a length in metres, over 0"
+            )
 
     def hides(self, other: Capsule) -> bool:
         """Return whether another capsule is inside this one, about the same segment."""
@@ -71,11 +73,6 @@ class Profile:
         scale: factor on the person's path; None: the ratio of leg lengths (arm lengths without legs) times ``stretch``.
         stretch: factor on the ratio of lengths.
         weights: weights of the cost terms.
-        limbs: segments whose directions are tracked, as pairs of roles; None: all between keypoints, if they do not end
-            where a reach does.
-        reaches: pairs of roles whose vector is tracked, direction and length, relative to nominal lengths of robot and
-            person; None: hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of
-            a hand.
         rolls: whether the feet are wheels that roll in any direction: they stay on the floor and move along it.
 
     Raises:
@@ -91,8 +88,6 @@ class Profile:
     scale: float | None = None
     stretch: float = 1.0
     weights: Weights = dataclasses.field(default_factory=Weights)
-    limbs: tuple[Limb, ...] | None = None
-    reaches: tuple[Limb, ...] | None = None
     rolls: bool = False
 
     def __post_init__(self) -> None:
@@ -107,9 +102,6 @@ class Profile:
             if role not in (*NEEDED, *HAND):
                 raise unknown_name("keypoint", role, (*NEEDED, *HAND))
             _check_points(f"the keypoint {role}", point, (3,))
-        for role in (role for limb in (*(self.limbs or ()), *(self.reaches or ())) for role in limb):
-            if role not in self.keypoints:
-                raise unknown_name("keypoint", role, tuple(self.keypoints))
         knuckles = [finger for finger in FINGERS[1:] if f"{finger}_1" in self.keypoints]
         if self.is_hand and (len(knuckles) < 2 or "wrist" not in self.keypoints):
             raise OsikValueError("a hand has a keypoint wrist, and index_1, middle_1, ring_1 or little_1: two of these")
@@ -125,22 +117,19 @@ class Profile:
 
     @property
     def reached(self) -> tuple[Limb, ...]:
-        """Return the reaches that are tracked."""
-        on_four = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
-        return (
-            tuple(limb for limb in on_four if set(limb) <= set(self.keypoints))
-            if self.reaches is None
-            else self.reaches
-        )
+        """Return the pairs of roles whose vector is tracked, direction and length, relative to nominal lengths.
+
+        Hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of a hand.
+        """
+        pairs = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
+        return tuple(pair for pair in pairs if set(pair) <= set(self.keypoints))
 
     @property
     def followed(self) -> tuple[Limb, ...]:
-        """Return all limbs that are tracked, the reaches last."""
-        limbs, reached = self.limbs, self.reached
-        if limbs is None:
-            ends = {role for limb in reached for role in limb}
-            limbs = tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
-        return (*limbs, *reached)
+        """Return what is tracked: the limbs between keypoints that do not end where a reach does, then the reaches."""
+        ends = {role for limb in self.reached for role in limb}
+        limbs = (limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
+        return (*limbs, *self.reached)
 
     @property
     def is_hand(self) -> bool:

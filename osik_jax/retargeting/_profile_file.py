@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -65,8 +64,6 @@ def profile_text(profile: Profile) -> str:
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]
     lines += [] if profile.stretch == 1.0 else [f"stretch = {profile.stretch!r}"]
     lines += ["rolls = true"] if profile.rolls else []
-    given = {name: getattr(profile, name) for name in ("limbs", "reaches")}
-    lines += [f"{name} = {json.dumps(limbs)}" for name, limbs in given.items() if limbs is not None]
     rows = [f'frame = "{c.frame}", start = {_point(c.start)}, end = {_point(c.end)}, radius = {c.radius!r}'
             for c in profile.capsules]  # fmt: skip
     lines += ["capsules = [", *(f"    {{ {row} }}," for row in rows), "]"] if rows else []

@@ -216,16 +216,6 @@ def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):
     assert "j[left]" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_info_tells_of_the_spheres(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cli.main(["info", "ur5", "--spheres"]) == 0
-    printed = capsys.readouterr().out
-    assert "upper_arm_link:0" in printed and "no surface is uncovered" in printed
-    assert "--given goes with --spheres" in refused(capsys, "info", "ur5", "--given", "a.yaml")
-    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
-
-
 def test_poses_are_read_with_a_head_in_any_order_and_without_one(tmp_path):
     path, rows = tmp_path / "poses.csv", np.arange(14.0).reshape(2, 7)
     for names in ([*"xyz", "qw", "qx", "qy", "qz"], ["qz", "qw", "qx", "qy", "z", "y", "x"], []):

@@ -726,8 +726,11 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
 def test_links_without_a_size_get_no_capsule():
     path = example_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)
-    capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
+    profile = guess_profile(icub)
+    capsules = {capsule.frame: capsule.radius for capsule in profile.capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
+    assert any(capsule.start == capsule.end for capsule in profile.capsules)  # balls
+    assert Retargeter(icub, profile=profile)._pairs
 
 
 @pytest.mark.variants(slow=["romeo_description/urdf/romeo.urdf-LHipPitchLink-ends1"])
@@ -825,7 +828,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         ("scale = 0.8", "scale = 0.0", "scale is 0.0"),
         ("stretch = 1.1", "stretch = 0.0", "stretch is 0.0"),
         ("[feet.left]", "[feet.left", "is no TOML"),
-        ("radius = ", "radius = -", "radius and the length have to be more than 0"),
+        ("radius = ", "radius = -", "has radius -.*; it is a length in metres, over 0"),
     ):
         assert old in text
         (tmp_path / "broken.toml").write_text(text.replace(old, new))

@@ -75,6 +75,8 @@ class Desk:
                 here = targets_here(session.robot, self.loop.snapshot.q, session.tasks, [name])
                 moved = with_targets(Controller({name: session.tasks[name]}, session.scheme, ()), here)
                 self._put(name, moved.tasks[name], off=session.off - {name})
+            elif len(session.active_tasks) == 1:
+                raise OsikValueError("one task at least stays on")
             else:
                 self.edit(off=session.off | {name})
 

@@ -186,6 +186,7 @@ class Panel:
             except (KeyError, ValueError, TypeError, OSError, ImportError) as error:
                 text = str(error.args[0]) if error.args else str(error)
                 event.client.add_notification("That does not work", " ".join(text.split()), color="red")
+                self.refill()
 
         return answer
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ..._errors import OsikValueError
 from ..._whole_file import write_text
-from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
+from ...limits import Limit, no_limits, with_own_limits
 from ...robot import Robot
 from ...robot._load_robot import read_robot
 from ...saving._parts import decode_parts, encode_parts
@@ -74,13 +74,8 @@ class Session:
         return (no_limits, *on) if self.limits_off else on
 
     def controller(self) -> Controller:
-        """Return the controller, in which switched-off tasks have weight 0 and switched-off limits are infinite.
-
-        So a switch compiles nothing. A switched-off limit that cannot be infinite is left out.
-        """
-        tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
-        limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
-        return Controller(tasks, self.scheme, (no_limits, *(limit for limit in limits if limit is not None)))
+        """Return the controller of what is switched on."""
+        return Controller(self.active_tasks, self.scheme, self.active_limits)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the session to a file for ``load_session``.
@@ -146,16 +141,6 @@ def _session(content: Mapping[str, Any]) -> Session:
     robot.check_configuration(jnp.asarray(q))
     off = {name: frozenset(content.get(name, ())) for name in ("off", "limits_off")}
     return Session(robot, *decode_parts(content, robot), float(content["dt"]), q, **off, source=source)
-
-
-def _loose(limit: Limit) -> Limit | None:
-    """Return the limit with numbers that bound nothing, or None if it has no such numbers."""
-    if type(limit) is ConfigurationLimit:
-        free = np.full(limit.lower.shape, np.inf)
-        return limit.replace(lower=-free, upper=free)
-    if type(limit) is VelocityLimit:
-        return limit.replace(velocity=np.full(limit.velocity.shape, np.inf))
-    return None
 
 
 @dataclasses.dataclass(frozen=True)
