@@ -40,11 +40,12 @@ from osik_jax.retargeting import (
     report,
 )
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
-from osik_jax.retargeting._live import LiveFrame, replay
+from osik_jax.retargeting._live import LiveFrame
 from osik_jax.robot.loading import NAMES
 from osik_jax.runtime import configure_cpu
 
 from .machine import processor
+from .replayed import replay
 
 FIGURES = {
     "slip [mm]": ("slip", "move_mm_max"),

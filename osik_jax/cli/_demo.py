@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ._messages import CommandError, progress, told, writing
+from ._messages import CommandError, told, writing
 
 if TYPE_CHECKING:
     from ..demo._motion import Motion
@@ -42,23 +42,23 @@ class Demo:
         from rich.console import Console
         from rich.markup import escape
 
-        from ..demo._demo import run_demo, writable_folder
+        from ..demo._demo import run_demo
 
         console = Console()
         motion, dt = demo_motion(self), 1.0 / self.frequency
         with told():
-            out = writable_folder(self.out, motion, schemes=len(self.schemes), dt=dt)
+            self.out.mkdir(parents=True, exist_ok=True)
         console.print(escape(motion.title))
-        with writing(out), progress(console) as announce:
+        with writing(self.out), console.status("starting") as status:
             shown, _ = run_demo(
                 motion,
-                out,
+                self.out,
                 schemes=self.schemes,
                 dt=dt,
                 physics=self.physics,
                 animation=self.animation,
                 picture=self.picture,
-                announce=announce,
+                announce=status.update,
             )
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -24,7 +23,6 @@ from ._on_robot import ACCELERATION, OnRobot
 from ._person import measure, read_person
 from ._plan import make_plan, mend_plan
 from ._profile import Profile
-from ._retargeted import Retargeted, as_retargeted
 from ._stance import Stance, hold_feet
 from ._terms import Body, Bounds
 
@@ -342,17 +340,3 @@ def _filled(seen: Float[np.ndarray, "F J 3"], known: Float[np.ndarray, "J 3"]) -
         for axis in range(3):
             out[:, joint, axis] = np.interp(frames, frames[there], seen[there, joint, axis])
     return out
-
-
-def replay(make: Callable[[HumanMotion], LiveRetargeter], motion: HumanMotion) -> tuple[Retargeted, list[LiveFrame]]:
-    """Retarget a clip frame by frame, as fast as frames are computed; ``make`` is given the clip to measure."""
-    live = make(motion)
-    for _ in range(live.frames_ahead + 2):  # so that all is compiled when the first frame comes
-        live.step(motion.positions[0])
-    live.reset()
-    contacts = [None] * motion.frames if motion.contact is None else motion.contact
-    found = [live.step(positions, contact) for positions, contact in zip(motion.positions, contacts, strict=True)]
-    frames = [frame for frame in found if frame is not None] + live.finish()
-    q, contact, off = (np.array([getattr(frame, name) for frame in frames]) for name in ("q", "contact", "off_plan"))
-    person = dataclasses.replace(read_person(motion, live.roles), contact=contact)
-    return as_retargeted(live.robot, live.profile, person, q, off), frames

@@ -11,8 +11,9 @@ from motion_files import bent_forward, dancer, write_bvh
 from small_robots import nao_soles
 
 import osik_jax as osik
+from benchmarks.replayed import replay
 from osik_jax.retargeting import LiveRetargeter, load_motion, report, retarget
-from osik_jax.retargeting._live import LiveStatus, replay
+from osik_jax.retargeting._live import LiveStatus
 from osik_jax.retargeting._stance import Stance, hold_feet
 from osik_jax.retargeting._terms import soles
 
