@@ -1,4 +1,4 @@
-"""Messages of the commands: errors in one line, notes and progress."""
+"""Messages of the commands: errors in one line, and notes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    pass
-
+from typing import Any
 
 USER_ERRORS = (OSError, KeyError, ValueError, ImportError)
 

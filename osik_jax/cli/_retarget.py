@@ -17,9 +17,6 @@ from ._messages import told
 from ._robots import read_robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
     from ..retargeting import Retargeter
 
 _COLUMNS = {
@@ -75,21 +72,22 @@ class Retarget:
         """Run the command; return the exit code."""
         if os.path.isdir(self.clip):
             return _retarget_folder(self)
-        from rich.console import Console
-        from rich.markup import escape
-
         from ..retargeting import load_motion
         from ..retargeting._folder import write_folder
+        from ..retargeting._notes import notes
+        from ..retargeting._report import picked
 
-        console = Console()
         with told():
             motion = load_motion(self.clip, **_reading(self))
             retargeter, mapping = _retargeter(self), _mapping(self.mapping)
-            console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
+            print(f"{motion.name}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
             result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
             figures = write_folder(result, motion.name, self.out)
-        _print_retargeted(console, figures, self)
+        _print_figures([(motion.name, {"frames": figures["frames"], **picked(figures)})])
+        print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
+        for note in notes(figures, self.balance):
+            print(f"note: {note}")
         return 0
 
 
@@ -118,8 +116,6 @@ def _retargeter(command: Retarget) -> Retargeter:
 
 def _retarget_folder(command: Retarget) -> int:
     """Retarget all clips of a folder; return the exit code."""
-    from rich.console import Console
-
     from ..retargeting._folder import retarget_folder
     from ..retargeting._load import shortened
 
@@ -134,20 +130,19 @@ def _retarget_folder(command: Retarget) -> int:
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
-    console = Console()
     if summary["clips"]:
-        console.print(_table(summary))
-    _say(
-        console,
+        rows = summary["figures"].items() if summary["clips"] <= _MOST_ROWS else ()
+        _print_figures([*rows, ("worst", {"frames": summary["frames"], **summary["worst"]})])
+    print(
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
         f"{command.out / 'report.json'}",
     )
     if summary["no_clips"]:
-        _say(console, f"no clips, and not read: {shortened(summary['no_clips'])}")
+        print(f"no clips, and not read: {shortened(summary['no_clips'])}")
     for note in noted[:_MOST_NOTES]:
-        _say(console, f"note: {note}")
+        print(f"note: {note}")
     if len(noted) > _MOST_NOTES:
-        console.print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
+        print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
     for name, reason in failed.items():
         print(f"osik: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -155,46 +150,19 @@ def _retarget_folder(command: Retarget) -> int:
     return 1 if failed else 0
 
 
-def _table(summary: dict[str, Any]) -> Table:
-    """Return a line for each clip, if they are not too many, and the worst of all."""
+def _print_figures(rows: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Print a line of figures for each clip."""
+    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     table = Table()
     for title in ("clip", "frames", *_COLUMNS):
         table.add_column(escape(title), justify="left" if title == "clip" else "right")
-    rows: dict[str, dict[str, Any]] = summary["figures"]
-    worst = {"frames": summary["frames"], **summary["worst"]}
-    for name, row in [*(rows.items() if len(rows) <= _MOST_ROWS else ()), ("worst", worst)]:
+    for name, row in rows:
         values = ["-" if row.get(key) is None else f"{row[key]:.2f}" for key in _COLUMNS.values()]
         table.add_row(escape(name), f"{row['frames']:,}", *values)
-    return table
-
-
-def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarget) -> None:
-    """Print the figures of a clip; the last lines are warnings about its use."""
-    from ..retargeting._notes import notes
-
-    joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
-    soles = {name: "-" if value is None else f"{value:.2f}" for name, value in feet.items()}
-    trunk = "".join(
-        f"{part} {tracking['trunk_angle_deg'][part]:.1f}, "
-        for part in ("pelvis", "chest")
-        if tracking["trunk_angle_deg"][part] is not None
-    )
-    console.print(
-        f"{trunk}segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
-        f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
-        f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
-    )
-    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}", markup=False)
-    for note in notes(figures, command.balance):
-        _say(console, f"note: {note}")
-
-
-def _say(console: Console, text: str) -> None:
-    """Print a text as it is, on as many lines as it has."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    Console().print(table)
 
 
 def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:

@@ -34,11 +34,9 @@ def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
         steps = loop._steps
         tool = np.asarray(osik.forward_kinematics(arm, desk.session.q).frame_pose(arm, "tool0")[0])
         place = tool * [1.1, 1.1, 1.0]  # farther out, with the tool inside
-        desk.move_obstacle("box", position=place)
-        desk.move_obstacle("box", size=np.array([0.12, 0.12, 0.12]))
+        desk.move_obstacle("box", place, np.eye(3))
         moved = desk.session.limits[-1]
         assert isinstance(moved, osik.CollisionAvoidanceLimit) and moved.scene is not None
-        np.testing.assert_allclose(moved.scene.table.size[0], 0.12)
         np.testing.assert_allclose(desk.obstacles["box"].position, place)
         gaps = jax.jit(lambda q: moved.distances(arm, osik.forward_kinematics(arm, q)).min())
         assert gaps(desk.session.q) < -0.01
@@ -63,6 +61,6 @@ def test_a_ball_of_a_limit_is_moved_with_its_numbers_alone() -> None:
     limit = osik.CollisionAvoidanceLimit(arm, shapes=ball, pairs=[("ball", "link7:0")])
     desk = Desk(dataclasses.replace(default_session(arm), limits=(limit,)))
     structure = desk.session.controller().structure()
-    desk.move_obstacle("ball", position=np.array([0.0, 1.0, 0.5]), size=np.array([0.1, 0.0, 0.0]))
+    desk.move_obstacle("ball", np.array([0.0, 1.0, 0.5]), np.eye(3))
     np.testing.assert_allclose(desk.obstacles["ball"].position, [0.0, 1.0, 0.5])
-    assert desk.obstacles["ball"].size[0] == 0.1 and desk.session.controller().structure() == structure
+    assert desk.session.controller().structure() == structure

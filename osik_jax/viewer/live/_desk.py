@@ -127,11 +127,12 @@ class Desk:
                 self._seen = self._session.limits, obstacles_in(self._session.limits)
             return self._seen[1]
 
-    def move_obstacle(self, name: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Set position, rotation or size of an obstacle without compiling."""
+    def move_obstacle(self, name: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """Set position and rotation of an obstacle without compiling."""
         with self._lock:
-            self._session = dataclasses.replace(self._session, limits=moved(self._session.limits, name, **changes))
-            self.loop.place(name, **changes)
+            limits = moved(self._session.limits, name, position, rotation)
+            self._session = dataclasses.replace(self._session, limits=limits)
+            self.loop.place(name, position, rotation)
 
     def load(self, session: Session) -> None:
         """Replace the session by another one of the same robot, at the current configuration."""

@@ -182,10 +182,10 @@ class ControlLoop:
                 self._leases[name] = _Lease(owner, until)
             self._wanted = with_targets(self._wanted, {name: new})
 
-    def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Set position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``) in all controllers."""
+    def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """Set position and rotation of an obstacle."""
         with self._lock:
-            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, **changes))
+            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, position, rotation))
 
     def let_go(self, owner: Hashable) -> None:
         """Keep the targets where their owner left them, without a timeout."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +12,6 @@ from jaxtyping import Float
 from ...collision._geometry import Kind
 from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
-from ...numerics._host import replaced_at
 
 
 class Obstacle(NamedTuple):
@@ -58,22 +56,18 @@ def _in_scene(limit: Limit) -> Iterator[Obstacle]:
             yield Obstacle(name, kind, table.position[row], table.rotation[row], table.size[row])
 
 
-def _with_scene(limit: CollisionAvoidanceLimit, name: str, **changes: Float[np.ndarray, "..."]) -> Limit:
-    """Return the limit with an obstacle of its scene moved or resized."""
-    one, scene = next(one for one in _in_scene(limit) if one.name == name)._replace(**changes), limit.scene
-    assert scene is not None
-    scene, row = scene.moved(name, (one.position, one.rotation)), scene.names.index(name)
-    size = replaced_at(scene.table.size, row, one.size)
-    return limit.replace(scene=eqx.tree_at(lambda scene: scene.table.size, scene, size))
+def moved(
+    limits: Sequence[Limit], name: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]
+) -> tuple[Limit, ...]:
+    """Return the limits with an obstacle moved."""
 
+    def one(limit: Limit) -> Limit:
+        if not isinstance(limit, CollisionAvoidanceLimit):
+            return limit
+        if name in limit.layout.names[len(limit.layout.geoms) :]:
+            return limit.moved(name, position=position, rotation=rotation)
+        if limit.scene is None or name not in limit.scene.names:
+            return limit
+        return limit.replace(scene=limit.scene.moved(name, (position, rotation)))
 
-def moved(limits: Sequence[Limit], name: str, **changes: Float[np.ndarray, "..."]) -> tuple[Limit, ...]:
-    """Return the limits with an obstacle moved or resized."""
-    return tuple(
-        limit.moved(name, **changes)
-        if isinstance(limit, CollisionAvoidanceLimit) and name in limit.layout.names[len(limit.layout.geoms) :]
-        else _with_scene(limit, name, **changes)
-        if isinstance(limit, CollisionAvoidanceLimit) and any(one.name == name for one in _in_scene(limit))
-        else limit
-        for limit in limits
-    )
+    return tuple(one(limit) for limit in limits)

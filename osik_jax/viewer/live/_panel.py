@@ -10,7 +10,7 @@ import numpy as np
 from ...limits import Limit, NoLimits
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
-from ._readout import error_table, joint_table, state_text, timing_text
+from ._readout import error_table, state_text, timing_text
 from ._server import show_texts
 from ._session import session_from_json
 
@@ -52,7 +52,6 @@ class Panel:
             (self._state, state_text(snapshot)),
             (self._timing, timing_text(snapshot, self._desk.loop.timing)),
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
-            (self._joints, joint_table(session.robot, snapshot.q, snapshot.velocity)),
         )
         show_texts(texts)
 
@@ -111,8 +110,6 @@ class Panel:
         gui = self._server.gui
         self._limits = gui.add_folder("On and off")
         self._limit_boxes: list[Any] = []
-        gui.add_markdown("**Nearest to a limit**")
-        self._joints = gui.add_markdown("")
 
     def _fill_limits(self) -> None:
         """Add a switch for each limit."""
