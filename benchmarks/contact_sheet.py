@@ -1,4 +1,4 @@
-"""Twelve robots of example-robot-data through ``osik demo --robot``: pictures on one sheet, and what was reached.
+"""Twelve robots of example-robot-data whose waist or hand sways as NAO's: pictures on one sheet, and what was reached.
 
     python -m benchmarks.contact_sheet [--robots ur5,panda] [--out sheet] [--write]
 
@@ -18,8 +18,7 @@ import numpy as np
 from PIL import Image
 
 from osik_jax import viewer
-from osik_jax.cli import Demo
-from osik_jax.cli._demo import demo_motion
+from osik_jax.cli import read_robot
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import Figure, figures
 from osik_jax.demo._motion import Motion
@@ -27,6 +26,7 @@ from osik_jax.runtime import configure_cpu
 
 from .command_line import listed
 from .data_file import DATA, DOCS, write_csv
+from .demonstrated import file_motion
 from .robots_table import ROBOTS, file_of
 
 SHEET, TABLE = DOCS / "images" / "robots.png", DATA / "demonstrations.csv"
@@ -73,7 +73,7 @@ class Row(NamedTuple):
 def demonstrate(name: str, folder: Path) -> Row:
     """Runs the demonstration of a robot."""
     started = time.process_time()
-    motion = demo_motion(Demo(robot=str(file_of(name)), duration=DURATION))
+    motion = file_motion(read_robot(str(file_of(name))), name=file_of(name).stem, duration=DURATION)
     _, (run,) = run_demo(motion, folder / name, schemes=(SCHEME,), picture=True, animation=False)
     found = {figure.label: figure for figure in figures(motion, run)}
     return Row(name, motion, run.q, found, len(run.solution.status), time.process_time() - started)

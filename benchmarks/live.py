@@ -1,9 +1,8 @@
 """How regular the control loop of a live view is, with a visitor connected: python -m benchmarks.live [--robot g1].
 
 Leads both hands along circles that leave the reach, for a minute; prints periods, step times, what broke a limit and
-how the memory grew. With ``--obstacles`` the robot keeps off itself and off a ball in the way of one hand, and what is
-drawn of it is held against the ball. A visitor is a websocket, in a process of its own, that reads all that the page
-sends. Beside it a loop runs that only sleeps.
+how the memory grew. A visitor is a websocket, in a process of its own, that reads all that the page sends. Beside it a
+loop runs that only sleeps.
 """
 
 from __future__ import annotations
@@ -24,14 +23,11 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.cli import read_robot
 from osik_jax.robot._feet import guess_feet
-from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.runtime import configure_cpu
-from osik_jax.viewer._parts import robot_parts
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._open import find_hands
 from osik_jax.viewer.live._page import LiveView
 from osik_jax.viewer.live._session import RobotSource
-from osik_jax.viewer.live._surfaces import part_triangles
 from osik_jax.viewer.live._timing import Stopwatch
 
 _IDLE = """
@@ -48,10 +44,6 @@ while deadline - begin < seconds:
 print(json.dumps(np.percentile(np.diff(starts), (50.0, 99.0, 100.0)).tolist()))
 """
 """A loop of the same rate that does nothing, in a process of its own: what the machine alone makes of the periods."""
-
-
-_BALL, _BALL_AHEAD = 0.05, 0.12
-"""Radius of the ball, and how far ahead of the hand it is [m]."""
 
 
 def idle(dt: float, seconds: float) -> subprocess.Popen[str]:
@@ -116,43 +108,19 @@ def broken(robot: osik.Robot, q: np.ndarray, dt: float) -> dict[str, int]:
     return dict(too_fast=int(fast.any(1).sum()), outside=int(outside.any(1).sum()))
 
 
-def put_ball(view: LiveView, robot: osik.Robot) -> None:
-    """A ball ahead of the first hand; and the robot is to keep off itself."""
-    tasks: Any = view.session.tasks
-    position, _ = tasks[find_hands(robot)[0]].target
-    view._desk.avoid_itself()
-    ball = view._desk.add_obstacle("ball", np.asarray(position) + np.array([_BALL_AHEAD, 0.0, 0.1]), 1.0)
-    view._desk.move_obstacle(ball, size=np.array([_BALL, 0.0, 0.0]))
-
-
-def nearest(view: LiveView, robot: osik.Robot, q: np.ndarray) -> float:
-    """Least distance of what is drawn of the robot from the ball, at every hundredth configuration [m]."""
-    (ball,) = view._desk.obstacles.values()
-    shapes = robot_parts(robot)
-    surfaces = [part_triangles(part).vertices for part in shapes.parts]
-    least = np.inf
-    for row in q[::100]:
-        poses = shapes.poses(next(mujoco_poses(robot, row)))
-        for points, place, turn in zip(surfaces, *poses, strict=True):
-            least = min(least, float(np.linalg.norm(points @ turn.T + place - ball.position, axis=1).min()))
-    return least - float(ball.size[0])
-
-
 def resident() -> float:
     """Memory of this process [MB], on Linux."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     return pages * resource.getpagesize() / 2**20
 
 
-def measure(name: str, seconds: float, obstacles: bool) -> dict[str, object]:
+def measure(name: str, seconds: float) -> dict[str, object]:
     """One session."""
     source = RobotSource(name)
     robot = read_robot(source.robot)
     feet = guess_feet(robot) if robot.floating_base else ()
     load = os.getloadavg()[0]
     with _open.open_robot(robot, source, feet, host="127.0.0.1", port=0) as view:
-        if obstacles:
-            put_ball(view, robot)
         view.loop.wait_until_ready(300.0)
         visitor = visit(view.url)
         time.sleep(5.0)
@@ -165,7 +133,6 @@ def measure(name: str, seconds: float, obstacles: bool) -> dict[str, object]:
         lead(view, robot, seconds, radius=0.35 if robot.floating_base else 0.2)
         timing, failures = view.loop.timing, view.loop.snapshot.failures
         after, q, dt = resident(), view.loop.recorded().q, view.loop.dt
-        gap = {"nearest to the ball [mm]": round(1e3 * nearest(view, robot, q), 1)} if obstacles else {}
         nothing = json.loads(beside.communicate()[0])
         read = int(visitor.communicate("end\n")[0])
     return {
@@ -177,7 +144,6 @@ def measure(name: str, seconds: float, obstacles: bool) -> dict[str, object]:
         "period of a loop beside it that does nothing [ms]": [round(1e3 * x, 2) for x in nothing],
         "failures": failures,
         **broken(robot, q, dt),
-        **gap,
         "memory grew by [MB]": round(after - before, 1),
         "of which the recording has [MB]": round(q.nbytes / 2**20, 1),
         "visitor read [MB]": round(read / 2**20, 1),
@@ -192,10 +158,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.live", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--robot", default="nao")
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--obstacles", action="store_true")
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    json.dump(measure(given.robot, given.seconds, given.obstacles), sys.stdout, indent=1)
+    json.dump(measure(given.robot, given.seconds), sys.stdout, indent=1)
     print()
 
 

@@ -41,11 +41,11 @@ from osik_jax.retargeting import (
 )
 from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live import LiveFrame
-from osik_jax.retargeting._live_command import replay
 from osik_jax.robot.loading import NAMES
 from osik_jax.runtime import configure_cpu
 
 from .machine import processor
+from .replayed import replay
 
 FIGURES = {
     "slip [mm]": ("slip", "move_mm_max"),
@@ -211,7 +211,7 @@ def frame_by_frame(
 
     clock, processor = [], []
     for motion in motions:
-        result, frames = replay(make, motion, paced=False)
+        result, frames = replay(make, motion)
         clock.append([1e3 * frame.seconds for frame in frames])
         processor.append([1e3 * seconds for seconds in made[-1].processor])
         times = [f"{np.percentile(own[-1], p):.1f}" for own in (clock, processor) for p in (50, 99)]

@@ -1,18 +1,14 @@
-"""Messages of the commands: errors in one line, notes and progress."""
+"""Messages of the commands: errors in one line, and notes."""
 
 from __future__ import annotations
 
 import dataclasses
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
+from typing import Any
 
 USER_ERRORS = (OSError, KeyError, ValueError, ImportError)
 
@@ -74,14 +70,3 @@ def writing(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise CommandError(f"cannot write to {folder}: {error.strerror or error}; it may be incomplete") from error
-
-
-@contextmanager
-def progress(console: Console) -> Iterator[Callable[[str, float], None]]:
-    """Draw a progress bar over the stages; yield the function that takes the stage and the finished share."""
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (BarColumn(bar_width=30), TextColumn("{task.percentage:>3.0f} %"), TimeElapsedColumn())
-    with Progress(*columns, TextColumn("{task.description}"), console=console) as bar:
-        task = bar.add_task("starting", total=1.0)
-        yield lambda stage, done: bar.update(task, description=stage, completed=done)

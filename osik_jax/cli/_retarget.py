@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import sys
@@ -12,16 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .._errors import OsikValueError
-from ._messages import refuse, told
+from ._messages import told
 from ._robots import read_robot
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from ..retargeting import Profile, Retargeter
-    from ..retargeting._load import Reader
-    from ..robot import Robot
+    from ..retargeting import Retargeter
 
 _COLUMNS = {
     "slip\n[mm]": "slip_mm_max",
@@ -32,9 +28,6 @@ _COLUMNS = {
     "off\n[deg]": "segment_angle_deg_mean",
 }
 _MOST_ROWS, _MOST_NOTES = 50, 10
-_LIVE = ("look_ahead", "iterations", "budget")
-_HELD_OUT = 4
-"""Every fourth clip is held out of a fit: it selects the step that is kept but not its direction."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,23 +35,17 @@ class Retarget:
     """Retargets a person's motion to a robot: reads a motion file or a folder of them, and writes a folder.
 
     Writes motion.npz (MuJoCo's order, with the person's joints), motion.csv (position, quaternion x y z w, joints; no
-    headings), report.json (figures recomputed by MuJoCo), profile.toml (the robot's profile) and motion.gif.
+    headings), report.json (figures recomputed by MuJoCo) and profile.toml (the robot's profile).
     For a folder, each clip gets its own folder in --out, and report.json has the figures of all clips. The same
     command resumes an interrupted job.
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH or AMC file, keypoints as .npz or .csv, or a folder of such files; with --source, motions of that robot."""
+    """A BVH file, keypoints as .npz or .csv, or a folder of such files."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"
     """Base of a robot that comes as a file: "floating" moves, "fixed" stands still and only the limbs follow."""
-    source: str | None = None
-    """The robot whose motion CLIP is (motion.npz, or a CSV with --source-fps), by file or name. Default: a person."""
-    source_fps: float | None = None
-    """Frames a second of a CSV with --source."""
-    source_profile: str | None = None
-    """Profile (TOML) of the robot of --source, as --profile."""
     out: Path = Path("osik-retarget")
     """Folder to write to."""
     profile: str | None = None
@@ -80,114 +67,47 @@ class Retarget:
     BVH's rest pose, and z of keypoints."""
     trim: bool = True
     """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
-    animation: bool = True
-    """Write the film (motion.gif); of a folder none is written."""
-    report: bool = False
-    """Write a page as well (report.html) that plays person and robot without network, with contacts, limits and notes;
-    for a folder also index.html, with links to the pages of its clips. Needs the extra viewer."""
-    fit: Path | None = None
-    """Fit a profile (weights, scale, keypoints) to the clips of a folder and write it to this TOML file, instead of
-    motions. Every fourth clip is held out and selects the step that is kept."""
-    live: bool = False
-    """Retarget frame by frame: replay CLIP at its own rate, or with - read JSON lines from stdin and write JSON lines
-    to stdout (nothing to a folder)."""
-    look_ahead: float = 0.27
-    """Delay of the robot behind the person with --live [s]."""
-    iterations: int = 20
-    """Largest number of iterations per frame with --live."""
-    budget: float | None = None
-    """Computing time per frame with --live [s]; five iterations run in any case. Default: 60 % of the time between
-    frames, 4 ms at most."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
-        _check(self)
-        if self.fit is not None:
-            _fit(self, self.fit)
-            return 0
-        if self.live:
-            _retarget_live(self)
-            return 0
         if os.path.isdir(self.clip):
             return _retarget_folder(self)
-        from rich.console import Console
-        from rich.markup import escape
+        from ..retargeting import load_motion
+        from ..retargeting._folder import write_folder
+        from ..retargeting._notes import notes
+        from ..retargeting._report import picked
 
-        from ..retargeting._command import write_folder
-
-        console = Console()
         with told():
-            motion = _reader(self)(Path(self.clip))
-            retargeter, page = _retargeter(self), _page(self)
-            mapping = _mapping(self.mapping)
-            console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second")
+            motion = load_motion(self.clip, **_reading(self))
+            retargeter, mapping = _retargeter(self), _mapping(self.mapping)
+            print(f"{motion.name}: {motion.frames} frames at {motion.fps:g} a second")
             self.out.mkdir(parents=True, exist_ok=True)
             result = retargeter.retarget(motion, mapping=mapping, fps=self.fps)
-            figures = write_folder(result, motion.name, self.out, animation=self.animation, page=page)
-        _print_retargeted(console, figures, self)
+            figures = write_folder(result, motion.name, self.out)
+        _print_figures([(motion.name, {"frames": figures["frames"], **picked(figures)})])
+        print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}")
+        for note in notes(figures, self.balance):
+            print(f"note: {note}")
         return 0
 
 
-def _check(command: Retarget) -> None:
-    """Raise an error for options that have no meaning beside the others."""
-    stream = command.live and command.clip == "-"
-    refuse(command, command.live, ("fit", "source", "smooth"), "whole clips, not with --live")
-    refuse(command, command.fit is not None, ("source",), "motions, not with --fit, which takes clips of people")
-    refuse(command, command.fit is not None, ("fps", "smooth", "balance", "report"), "motions, not with --fit")
-    refuse(command, not command.live, _LIVE, "--live")
-    refuse(command, command.source is not None, ("unit", "up", "trim", "mapping"), "a person's clip, not with --source")
-    refuse(command, command.source is None, ("source_fps", "source_profile"), "--source")
-    refuse(command, stream, ("fps", "unit", "up", "trim", "report"), "a file, not with -")
-
-
-def _reader(command: Retarget) -> Reader:
-    """Return the function that reads a clip as the command says."""
-    from ..retargeting._load import Reader
-    from ..retargeting._profile_file import find_profile
-
-    if command.source is None:
-        unit = None if command.unit is None else _number_or_name(command.unit)
-        return Reader(unit=unit, up=command.up, trim=command.trim)
-    source = _robot_to_retarget(command.source)
-    profile = _profile(command.source_profile) or find_profile(source)
-    return Reader(source=source, profile=profile, fps=command.source_fps)
-
-
-def _fit(command: Retarget, file: Path) -> None:
-    """Write a profile found by a folder's clips."""
-    from rich.console import Console
-
-    from .. import retargeting
-
-    with told():
-        if not os.path.isdir(command.clip):
-            raise OsikValueError(f"--fit takes a folder of clips; {command.clip} is none")
-        motions: Any = _reader(command).all_in(Path(command.clip))
-        held_out = motions[_HELD_OUT - 1 :: _HELD_OUT]
-        learned = [motion for number, motion in enumerate(motions, 1) if number % _HELD_OUT]
-        found = retargeting.fit(
-            _robot_to_retarget(command.robot, command.base),
-            learned,
-            held_out=held_out,
-            profile=_profile(command.profile),
-            mapping=_mapping(command.mapping),
-            acceleration=command.acceleration,
-        )
-        retargeting.save_profile(found.profile, file)
-    step, losses = found.step, found.losses
-    said = f"step {step} of {len(losses) - 1}: the loss of {len(learned)} clips is {losses[step]:.3f} times what it was"
-    if held_out:
-        said += f", of {len(held_out)} held out {found.held_out[step]:.3f} times"
-    _say(Console(), f"{said}\nwritten to {file}")
+def _reading(command: Retarget) -> dict[str, Any]:
+    """Return the arguments of ``load_motion``."""
+    unit: Any = command.unit
+    with contextlib.suppress(TypeError, ValueError):  # no option, or a unit by name
+        unit = float(unit)
+    return {"unit": unit, "up": command.up, "trim": command.trim}
 
 
 def _retargeter(command: Retarget) -> Retargeter:
-    """Return the retargeter of whole clips that the command describes."""
+    """Return the retargeter of whole clips that the command describes; a robot of the package is as it is."""
     from .. import retargeting
+    from ..robot.loading import ROBOTS
 
+    base = "auto" if command.robot in ROBOTS and command.base == "floating" else command.base
     return retargeting.Retargeter(
-        _robot_to_retarget(command.robot, command.base),
-        profile=_profile(command.profile),
+        read_robot(command.robot, base),
+        profile=None if command.profile is None else retargeting.load_profile(command.profile),
         acceleration=command.acceleration,
         smoothness=command.smooth,
         balance=command.balance,
@@ -196,8 +116,6 @@ def _retargeter(command: Retarget) -> Retargeter:
 
 def _retarget_folder(command: Retarget) -> int:
     """Retarget all clips of a folder; return the exit code."""
-    from rich.console import Console
-
     from ..retargeting._folder import retarget_folder
     from ..retargeting._load import shortened
 
@@ -206,27 +124,25 @@ def _retarget_folder(command: Retarget) -> int:
             _retargeter(command),
             Path(command.clip),
             command.out,
-            _reader(command),
+            **_reading(command),
             mapping=_mapping(command.mapping),
             fps=command.fps,
-            page=_page(command),
         )
     failed: dict[str, str] = summary["failed"]
     noted = [f"{name}: {note}" for name, notes in summary["notes"].items() for note in notes]
-    console = Console()
     if summary["clips"]:
-        console.print(_table(summary))
-    _say(
-        console,
+        rows = summary["figures"].items() if summary["clips"] <= _MOST_ROWS else ()
+        _print_figures([*rows, ("worst", {"frames": summary["frames"], **summary["worst"]})])
+    print(
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
         f"{command.out / 'report.json'}",
     )
     if summary["no_clips"]:
-        _say(console, f"no clips, and not read: {shortened(summary['no_clips'])}")
+        print(f"no clips, and not read: {shortened(summary['no_clips'])}")
     for note in noted[:_MOST_NOTES]:
-        _say(console, f"note: {note}")
+        print(f"note: {note}")
     if len(noted) > _MOST_NOTES:
-        console.print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
+        print(f"note: {len(noted) - _MOST_NOTES} more are in report.json")
     for name, reason in failed.items():
         print(f"osik: {name}: {reason}", file=sys.stderr)
     if failed:
@@ -234,128 +150,19 @@ def _retarget_folder(command: Retarget) -> int:
     return 1 if failed else 0
 
 
-def _table(summary: dict[str, Any]) -> Table:
-    """Return a line for each clip, if they are not too many, and the worst of all."""
+def _print_figures(rows: Sequence[tuple[str, dict[str, Any]]]) -> None:
+    """Print a line of figures for each clip."""
+    from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
 
     table = Table()
     for title in ("clip", "frames", *_COLUMNS):
         table.add_column(escape(title), justify="left" if title == "clip" else "right")
-    rows: dict[str, dict[str, Any]] = summary["figures"]
-    worst = {"frames": summary["frames"], **summary["worst"]}
-    for name, row in [*(rows.items() if len(rows) <= _MOST_ROWS else ()), ("worst", worst)]:
+    for name, row in rows:
         values = ["-" if row.get(key) is None else f"{row[key]:.2f}" for key in _COLUMNS.values()]
         table.add_row(escape(name), f"{row['frames']:,}", *values)
-    return table
-
-
-def _retarget_live(command: Retarget) -> None:
-    """Retarget a clip at its own rate, or a stream from stdin."""
-    import numpy as np
-    from rich.console import Console
-    from rich.markup import escape
-
-    from .. import retargeting
-    from ..retargeting._command import write_folder
-    from ..retargeting._live_command import replay, stream
-
-    console = Console()
-    with told():
-        if os.path.isdir(command.clip):
-            raise OsikValueError(f"--live takes one clip, and {command.clip} is a folder")
-        profile = _profile(command.profile)
-        robot, mapping = _robot_to_retarget(command.robot, command.base), _mapping(command.mapping)
-
-        def make(standing: retargeting.HumanMotion) -> retargeting.LiveRetargeter:
-            return retargeting.LiveRetargeter(
-                robot,
-                standing,
-                profile=profile,
-                mapping=mapping,
-                acceleration=command.acceleration,
-                balance=command.balance,
-                look_ahead=command.look_ahead,
-                iterations=command.iterations,
-                budget=command.budget,
-            )
-
-        if command.clip == "-":
-            stream(make, sys.stdin, sys.stdout)
-            return
-        motion = _reader(command)(Path(command.clip))
-        assert isinstance(motion, retargeting.HumanMotion)  # without --source
-        motion, page = motion if command.fps is None else motion.resampled(command.fps), _page(command)
-        command.out.mkdir(parents=True, exist_ok=True)
-        console.print(f"{escape(motion.name)}: {motion.frames} frames at {motion.fps:g} a second, as they come")
-        result, frames = replay(make, motion)
-        figures = write_folder(result, motion.name, command.out, animation=command.animation, page=page)
-    spent = 1e3 * np.array([frame.seconds for frame in frames])
-    ahead = max(1, round(command.look_ahead * motion.fps))
-    waiting = 1e3 * ahead / motion.fps
-    console.print(
-        f"the robot is {waiting + np.median(spent):.0f} ms behind: {ahead} frames of look-ahead are "
-        f"{waiting:.0f} ms, and computing took {np.median(spent):.1f} ms a frame ({spent.max():.1f} at most)"
-    )
-    lost = sum(frame.status.name == "FEET_OFF" for frame in frames)
-    if lost:
-        console.print(f"in {lost} of {len(frames)} frames limits did not let the feet hold (status feet_off)")
-    _print_retargeted(console, figures, command)
-
-
-def _print_retargeted(console: Console, figures: dict[str, Any], command: Retarget) -> None:
-    """Print the figures of a clip; the last lines are warnings about its use."""
-    from ..retargeting._notes import notes
-
-    joints, feet, tracking = figures["joints"], figures["feet"], figures["tracking"]
-    soles = {name: "-" if value is None else f"{value:.2f}" for name, value in feet.items()}
-    trunk = "".join(
-        f"{part} {tracking['trunk_angle_deg'][part]:.1f}, "
-        for part in ("pelvis", "chest")
-        if tracking["trunk_angle_deg"][part] is not None
-    )
-    console.print(
-        f"{trunk}segments {tracking['segment_angle_deg_mean']:.1f} deg off, slip {soles['slip_mm_max']} mm, soles "
-        f"{soles['float_mm_max']} mm above and {soles['below_floor_mm_max']} mm below the floor at most, "
-        f"acceleration {joints['acceleration_max']:.0f} rad/s^2 at most"
-    )
-    console.print(f"written to {command.out}: {', '.join(sorted(os.listdir(command.out)))}", markup=False)
-    for note in notes(figures, command.balance):
-        _say(console, f"note: {note}")
-
-
-def _say(console: Console, text: str) -> None:
-    """Print a text as it is, on as many lines as it has."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _robot_to_retarget(source: str, base: str = "floating") -> Robot:
-    """Return a robot by name or file; one that comes with the package is as it is."""
-    from ..robot.loading import ROBOTS
-
-    return read_robot(source, "auto" if source in ROBOTS and base == "floating" else base)
-
-
-def _profile(file: str | None) -> Profile | None:
-    from ..retargeting import load_profile
-
-    return None if file is None else load_profile(file)
-
-
-def _page(command: Retarget) -> bool:
-    """Return whether a page is written; the extra has to be installed then."""
-    if command.report:
-        from ..viewer.live._server import import_viser
-
-        import_viser()
-    return command.report
-
-
-def _number_or_name(text: str) -> str | float:
-    try:
-        return float(text)
-    except ValueError:
-        return text
+    Console().print(table)
 
 
 def _mapping(pairs: Sequence[str]) -> dict[str, str] | None:

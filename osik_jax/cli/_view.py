@@ -12,13 +12,19 @@ import tyro
 
 from ._messages import CommandError, refuse, told
 from ._robots import FLOATING, read_robot
+from ._scene import InScene
 
 if TYPE_CHECKING:
+    from ..collision import Scene
+    from ..limits import Limit
     from ..robot import Robot
+
+_CLEARANCE = 0.01
+"""Default distance from obstacles [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
-class View:
+class View(InScene):
     """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
 
     With a file: plays the motion.npz that osik demo wrote, opens a session that a view has saved, or shows slices of
@@ -53,7 +59,8 @@ class View:
                 raise CommandError("--html goes with a motion.npz")
             saved = self.file is not None and self.file.suffix == ".json"
             refuse(self, saved, ("robot", "base"), "a robot or a motion, not with a session, which has its own")
-            refuse(self, self.file is not None, ("support",), "a robot to drag, not with a file")
+            refuse(self, self.file is not None, ("support", "scene"), "a robot to drag, not with a file")
+            obstacles = self.obstacles()
             _server.import_viser()
             _server.check_port(self.host, 0 if self.html is not None else self.port)
             options: Any = dict(host=self.host, port=self.port)
@@ -62,7 +69,8 @@ class View:
             elif self.file is None:
                 robot = read_robot(self.robot, self.base)
                 source = RobotSource(self.robot, FLOATING[self.base])
-                view = _open.open_robot(robot, source, self.support or _feet(robot), **options)
+                keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()
+                view = _open.open_robot(robot, source, self.support or _feet(robot), limits=keeps_off, **options)
             elif _open.is_map(self.file):
                 view = _open.open_map(self.file, read_robot(self.robot, self.base), **options)
             else:
@@ -80,6 +88,13 @@ class View:
             view.wait()
         view.stop()
         return 0
+
+
+def _keeps_off(robot: Robot, scene: Scene, srdf: Path | None, clearance: float) -> tuple[Limit, ...]:
+    """Return the limit that keeps the robot off obstacles and off itself."""
+    from ..limits import CollisionAvoidanceLimit
+
+    return (CollisionAvoidanceLimit(robot, scene=scene, srdf=srdf, minimum_distance=clearance or _CLEARANCE),)
 
 
 def _feet(robot: Robot) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,24 +17,6 @@ from ._physics import PhysicsRun, run_physics
 from ._run import TITLES, Run, run_scheme
 
 _DIRECTIONS = ("forward", "to the left", "up")
-_PICTURES = 12_000_000
-"""Upper bound of the size of film, figure, picture and report [bytes]."""
-
-
-def writable_folder(path: Path, motion: Motion, *, schemes: int, dt: float) -> Path:
-    """Create the folder and check that the files can be written to it, the motion counted without compression."""
-    path.mkdir(parents=True, exist_ok=True)
-    try:
-        with tempfile.TemporaryFile(dir=path) as file:
-            file.write(b"\0" * 4096)
-            file.flush()
-    except OSError as error:
-        raise OSError(f"cannot write to {path}: {error.strerror or error}") from error
-    entries = 1 + schemes * (motion.robot.nq + motion.robot.nv)
-    free, needed = shutil.disk_usage(path).free, _PICTURES + 8 * (round(motion.duration / dt) + 1) * entries
-    if free < needed:
-        raise OSError(f"{path} has {free / 1e6:.1f} MB of room left, and up to {needed / 1e6:.0f} MB are needed")
-    return path
 
 
 def run_demo(
@@ -47,14 +28,14 @@ def run_demo(
     physics: bool = False,
     animation: bool = True,
     picture: bool = False,
-    announce: Callable[[str, float], None] = lambda stage, done: None,
+    announce: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Table, Sequence[Run]]:
     """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
 
     Return the table of all figures, and the runs. With ``physics`` the loop is closed with MuJoCo; the motion is then
     one of NAO. The film is that of the last scheme, ``motion.gif``, and ``motion.mp4`` where the program ffmpeg is
     installed. ``picture`` adds ``picture.png``, three instants side by side. ``announce`` is called with the current
-    stage and the finished share, 0 to 1.
+    stage.
 
     Raises:
         KeyError: no such scheme.
@@ -64,23 +45,20 @@ def run_demo(
     if physics:
         run, doing = run_physics, "planning, then simulating"
         motion = dataclasses.replace(motion, title=f"{motion.title}, with dynamics")
-    share, runs = (0.6 if animation else 0.9) / len(schemes), []
+    runs = []
     for scheme in schemes:
-        announce(f"{TITLES.get(scheme, scheme)}: {doing}", share * len(runs))
+        announce(f"{TITLES.get(scheme, scheme)}: {doing}")
         runs.append(run(motion, scheme, dt=dt))
-    start = share * len(runs)
-    announce("drawing the comparison", start)
+    announce("drawing the comparison")
     found = {run.scheme: figures(motion, run) for run in runs}
     comparison(motion.title, found, dt).savefig(folder / "comparison.png")
     np.savez_compressed(folder / "motion.npz", allow_pickle=False, **_arrays(runs))
     if animation:
-        names = ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]
-        for name in names:
-            _film(folder / name, motion, runs[-1], dt, lambda x: announce("filming", start + 0.35 * x))
+        announce("filming")
+        for name in ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]:
+            _film(folder / name, motion, runs[-1], dt)
     if picture:
-        announce("drawing the picture", 0.97)
         _draw_picture(folder / "picture.png", motion, runs[-1])
-    announce("done", 1.0)
     return table(motion.title, found), runs
 
 
@@ -101,7 +79,7 @@ def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _film(path: Path, motion: Motion, run: Run, dt: float, progress: Callable[[float], None]) -> None:
+def _film(path: Path, motion: Motion, run: Run, dt: float) -> None:
     """Write a film of a scheme's motion, with a curve of the largest component of up to two goals [mm]."""
     seen, values, wanted = run.seen, {}, {}
     for label in list(motion.goals)[:2]:
@@ -119,7 +97,6 @@ def _film(path: Path, motion: Motion, run: Run, dt: float, progress: Callable[[f
         wanted=wanted,
         curves_title="moved from the start [mm], dashed: wanted",
         caption=f"{motion.title}: {TITLES[run.scheme]}",
-        progress=progress,
     )
 
 

@@ -61,7 +61,6 @@ class Motion:
         stances: frames that stand.
         goals: label to moving frame; pictures show the first one.
         balanced: whether a task keeps the centre of mass over the support polygon.
-        notes: remarks for the user.
         scale: size of the motion relative to 5 cm; required errors grow with it.
     """
 
@@ -74,7 +73,6 @@ class Motion:
     stances: tuple[Stance, ...]
     goals: Mapping[str, Goal]
     balanced: bool = True
-    notes: tuple[str, ...] = ()
     scale: float = 1.0
 
 

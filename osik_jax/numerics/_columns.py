@@ -13,26 +13,49 @@ from .._errors import OsikValueError
 
 
 def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> dict[str, Float[np.ndarray, " n"]]:
-    """Return the numbers of a CSV file by the names of its columns; lines that begin with # are left out.
+    """Return the finite numbers of a CSV file by the names of its columns; lines that begin with # are left out.
 
-    The head names the columns; ``unnamed`` does so for a file that begins with numbers.
+    The head names the columns; ``unnamed`` does so for a file that begins with numbers. Lines without any number, and
+    empty cells behind the last column, are those of a spreadsheet.
     """
-    with open(path, newline="", encoding="utf-8") as file:
-        head, *lines = [row for row in csv.reader(file) if row and not row[0].startswith("#")] or [[]]
-    if unnamed and _are_numbers(head):
-        head, lines = list(unnamed[: len(head)]), [head, *lines]
-    names = [name.strip() for name in head]
-    if not lines or len(set(names)) < len(names):
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            lines = [(number, row) for number, row in enumerate(csv.reader(file), 1) if _says_something(row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise OsikValueError(f"{path} is no table in UTF-8: {error}") from None
+    if unnamed and lines and not np.isnan(as_number(lines[0][1][0])):
+        lines = [(0, list(unnamed[: len(lines[0][1])])), *lines]
+    names = [name.strip() for name in lines[0][1]] if lines else []
+    while names and not names[-1]:
+        names.pop()
+    if len(lines) < 2 or len(set(names)) < len(names):
         raise OsikValueError(f"{path}: a head with different names and at least one line of numbers are expected")
-    try:
-        table = np.array([[float(cell) for cell in line] for line in lines])
-        return dict(zip(names, table.T, strict=True))
-    except ValueError as error:
-        raise OsikValueError(f"{path}: {error}; each line has {len(names)} numbers") from None
+    table = np.array([_numbers(f"{path}, line {number}", row, names) for number, row in lines[1:]])
+    return dict(zip(names, table.T, strict=True))
 
 
-def _are_numbers(cells: Sequence[str]) -> bool:
+def _says_something(row: Sequence[str]) -> bool:
+    return any(cell.strip() for cell in row) and not row[0].startswith("#")
+
+
+def _numbers(where: str, row: Sequence[str], names: Sequence[str]) -> list[float]:
+    """Return the numbers of a line; ``where`` names it in messages."""
+    if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
+        raise OsikValueError(
+            f"{where}: {len(row)} values, but there are {len(names)} headings; each line has {len(names)} numbers"
+        )
+    values = [as_number(cell) for cell in row[: len(names)]]
+    for name, value, cell in zip(names, values, row, strict=False):
+        if not np.isfinite(value):
+            raise OsikValueError(
+                f"{where}, column {name}: {cell!r} is no finite number; each line has {len(names)} numbers"
+            )
+    return values
+
+
+def as_number(word: str) -> float:
+    """Return a word as a number; NaN if it is none."""
     try:
-        return bool([float(cell) for cell in cells])
+        return float(word)
     except ValueError:
-        return False
+        return np.nan

@@ -9,7 +9,7 @@ import codecs
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikKeyError, OsikValueError, warn
+from ..numerics._columns import as_number
 from ._motion import HumanMotion
 from ._rotations import UNTURNED, continuous, forward
 from ._up import UPS, Up, checked_up, find_up, named, standing_up
@@ -37,11 +38,10 @@ _JUMP = 5.0
 """Speed of a joint relative to the root above which the step out of the rest pose counts as a jump [m/s]."""
 _ABOVE_ALL = 3.0
 """Least ratio of that step to every other step of the clip."""
+_KEYWORDS = {"ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "{", "}", "MOTION"}
 _CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
 _LARGEST = 1e8
 """Largest accepted absolute value of a length in any unit, or of an angle [deg]."""
-_KEYWORDS = {"HIERARCHY", "ROOT", "JOINT", "OFFSET", "CHANNELS", "{", "}", "MOTION"}
-_MOTION_KEYWORDS = {"FRAMES:", "FRAMES", "FRAME"}
 
 
 @dataclasses.dataclass
@@ -69,9 +69,9 @@ def read_bvh(
     length of the joints from a foot to the head gives the unit.
     """
     source, up = str(path), checked_up(up)
-    lines = Lines(source, _text(Path(path)))
-    joints = _hierarchy(lines)
-    fps, values = _frames(lines, sum(len(joint.channels) for joint in joints))
+    words = _Words(source, _text(Path(path)))
+    joints = _hierarchy(words)
+    fps, values = _frames(words, sum(len(joint.channels) for joint in joints))
     parents, names = [joint.parent for joint in joints], tuple(joint.name for joint in joints)
     positions, rotations = forward(parents, *_moves(joints, values))
     rest = forward(parents, np.array([joint.offset for joint in joints]), np.tile(UNTURNED, (1, len(joints), 1)))[0][0]
@@ -128,98 +128,89 @@ def _text(path: Path) -> str:
     return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
 
 
-def _hierarchy(lines: Lines) -> list[_Joint]:
-    if lines.next("HIERARCHY")[0].upper() != "HIERARCHY":
-        raise lines.error("a BVH file starts with HIERARCHY")
+def _hierarchy(words: _Words) -> list[_Joint]:
+    """Return the joints of the tree, parents first."""
+    if words.next("HIERARCHY").upper() != "HIERARCHY":
+        raise words.error("a BVH file starts with HIERARCHY")
     joints: list[_Joint] = []
-    open_joints: list[int] = []
+    inside: list[int] = []  # the joints whose braces are open
     while True:
-        words = lines.next("JOINT, End Site, } or MOTION")
-        word = words[0].upper()
-        if word in ("ROOT", "JOINT") or (word, *map(str.upper, words[1:2])) == ("END", "SITE"):
-            _check_place(lines, word, joints, open_joints)
-            open_joints.append(_joint(lines, words, joints, open_joints[-1] if open_joints else -1))
-        elif word == "OFFSET" and open_joints:
-            joint = joints[open_joints[-1]]
-            if not np.isnan(joint.offset).any():
-                raise lines.error(f"{joint.name} has an OFFSET already")
-            joint.offset = np.array(lines.numbers(words[1:], 3, "OFFSET"))
-        elif word == "CHANNELS" and open_joints:
-            joint = joints[open_joints[-1]]
-            if joint.is_end or joint.channels:
-                raise lines.error(
-                    "an End Site has no CHANNELS" if joint.is_end else f"{joint.name} has CHANNELS already"
-                )
-            joint.channels = _channels(lines, words)
-        elif word == "}" and open_joints:
-            if np.isnan(joints[open_joints[-1]].offset).any():
-                raise lines.error(f"{joints[open_joints[-1]].name} has no OFFSET")
-            open_joints.pop()
-        elif word == "MOTION" and joints and not open_joints:
-            return joints
-        else:
-            raise lines.error(f"{words[0]} is not expected here")
+        word = words.next("JOINT, End Site, } or MOTION")
+        own = joints[inside[-1]] if inside else None
+        match word.upper():
+            case "ROOT" | "JOINT" | "END" as kind:
+                if (kind == "ROOT") == bool(joints) or (kind == "ROOT") == bool(inside):
+                    raise words.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
+                if own is not None and own.is_end:
+                    raise words.error("nothing is inside an End Site but its OFFSET")
+                joints.append(_joint(words, kind, joints, inside[-1] if inside else -1))
+                inside.append(len(joints) - 1)
+            case "OFFSET" if own is not None:
+                if not np.isnan(own.offset).any():
+                    raise words.error(f"{own.name} has an OFFSET already")
+                own.offset = words.offset()
+            case "CHANNELS" if own is not None:
+                if own.is_end or own.channels:
+                    what = "an End Site has no CHANNELS" if own.is_end else f"{own.name} has CHANNELS already"
+                    raise words.error(what)
+                own.channels = _channels(words)
+            case "}" if own is not None:
+                if np.isnan(own.offset).any():
+                    raise words.error(f"{own.name} has no OFFSET")
+                inside.pop()
+            case "MOTION" if joints and not inside:
+                return joints
+            case _:
+                raise words.error(f"{word} is not expected here")
 
 
-def _check_place(lines: Lines, word: str, joints: list[_Joint], open_joints: list[int]) -> None:
-    """Raise ValueError unless a joint may start here: exactly one ROOT, joints inside it, none inside an End Site."""
-    if (word == "ROOT") == bool(joints) or (word == "ROOT") == bool(open_joints):
-        raise lines.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
-    if open_joints and joints[open_joints[-1]].is_end:
-        raise lines.error("nothing is inside an End Site but its OFFSET")
-
-
-def _joint(lines: Lines, words: list[str], joints: list[_Joint], parent: int) -> int:
-    """Append a joint after reading its opening brace; return its index."""
-    if words[0].upper() == "END":
+def _joint(words: _Words, kind: str, joints: list[_Joint], parent: int) -> _Joint:
+    """Return a joint after reading its name and opening brace."""
+    name = words.name()
+    if kind == "END":
         name = f"{joints[parent].name}_end"
         name = name if all(joint.name != name for joint in joints) else f"{name}_{len(joints)}"
-    else:
-        name = " ".join(words[1:])
     if not name:
-        raise lines.error(f"{words[0]} has no name")
+        raise words.error(f"{kind} has no name")
     if any(joint.name == name for joint in joints):
-        raise lines.error(f"a second joint is called {name}")
-    if lines.next("{") != ["{"]:
-        raise lines.error(f"{{ should follow {name}")
-    joints.append(_Joint(name, parent, np.full(3, np.nan), is_end=words[0].upper() == "END"))
-    return len(joints) - 1
+        raise words.error(f"a second joint is called {name}")
+    if words.next("{") != "{":
+        raise words.error(f"{{ should follow {name}")
+    return _Joint(name, parent, np.full(3, np.nan), is_end=kind == "END")
 
 
-def _channels(lines: Lines, words: list[str]) -> tuple[tuple[str, str], ...]:
-    if len(words) < 2 or not words[1].isdigit() or int(words[1]) != len(words) - 2:
-        raise lines.error("CHANNELS is followed by how many there are, and by their names")
+def _channels(words: _Words) -> tuple[tuple[str, str], ...]:
+    count, *names = words.up_to_keyword() or [""]
+    if not count.isdigit() or int(count) != len(names):
+        raise words.error("CHANNELS is followed by how many there are, and by their names")
     known = {name.lower(): value for name, value in _CHANNELS.items()}
-    for name in words[2:]:
+    for name in names:
         if name.lower() not in known:
-            raise lines.error(f"no channel {name}; there are {', '.join(_CHANNELS)}")
-    if len({name.lower() for name in words[2:]}) != len(words) - 2:
-        raise lines.error("a channel is named twice")
-    return tuple(known[name.lower()] for name in words[2:])
+            raise words.error(f"no channel {name}; there are {', '.join(_CHANNELS)}")
+    if len({name.lower() for name in names}) != len(names):
+        raise words.error("a channel is named twice")
+    return tuple(known[name.lower()] for name in names)
 
 
-def _frames(lines: Lines, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
-    words = lines.next("Frames:")
-    if words[0].lower() not in ("frames:", "frames") or not words[-1].isdigit():
-        raise lines.error("Frames: and their number should follow MOTION")
-    count = int(words[-1])
-    words = lines.next("Frame Time:")
-    if [word.lower().rstrip(":") for word in words[:2]] != ["frame", "time"]:
-        raise lines.error("Frame Time: and seconds should follow Frames:")
-    step = lines.numbers(words[2:], 1, "Frame Time")[0]
+def _frames(words: _Words, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
+    """Return the frame rate [1/s] and one row of numbers per frame."""
+    is_head = words.next("Frames:").lower().rstrip(":") == "frames"
+    count = words.next("the number of frames")
+    if not is_head or not count.isdigit():
+        raise words.error("Frames: and their number should follow MOTION")
+    if [words.next("Frame Time:").lower().rstrip(":") for _ in range(2)] != ["frame", "time"]:
+        raise words.error("Frame Time: and seconds should follow Frames:")
+    step = as_number(words.next("the frame time"))
     if not step > 0.0:
-        raise lines.error("the frame time has to be more than 0 s")
+        raise words.error("the frame time has to be more than 0 s")
     if step > _SLOWEST:
-        raise lines.error("the frame time is in seconds, and from one frame to the next it is less than one")
+        raise words.error("the frame time is in seconds, and from one frame to the next it is less than one")
     if step < _FASTEST:
-        raise lines.error(f"the frame time is {step:g} s; it is {_FASTEST:g} s at least")
-    lines.rewrap(channels, count)
-    rows = [lines.numbers(words, channels, "a frame") for words in lines.rest()]
-    if len(rows) != count or not rows:
-        raise lines.error(f"the file says Frames: {count}, and has {len(rows)}")
+        raise words.error(f"the frame time is {step:g} s; it is {_FASTEST:g} s at least")
+    values = words.frames(int(count), channels)
     fps = 1.0 / step
     # files round the frame time (0.0333333 s), so a rate within 0.01 of an integer is that integer
-    return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), np.array(rows)
+    return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), values
 
 
 def _moves(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -280,84 +271,72 @@ def _scale(path: str, unit: str | float | None, size: float) -> float:
     )
 
 
-def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield each statement with its line number; a line may hold several statements, and a statement may span lines.
-
-    A statement of the tree starts with a keyword. Behind MOTION each line of numbers is one.
-    """
-    statement: list[str] = []
-    began, lines = 1, iter(enumerate(text.splitlines(), 1))
-    for number, line in lines:
-        words = line.replace("{", " { ").replace("}", " } ").split()
-        for i, word in enumerate(words):
-            # names may have spaces and keywords in them, up to the end of their line
-            in_name = bool(statement) and statement[0].upper() in ("ROOT", "JOINT") and number == began
-            keyword = word.upper() in _KEYWORDS or [w.upper() for w in words[i : i + 2]] == ["END", "SITE"]
-            if not statement or word in ("{", "}") or (keyword and not in_name):
-                if statement:
-                    yield began, statement
-                statement, began = [], number
-            statement.append(word)
-            if statement == [word] and word.upper() == "MOTION":
-                yield number, statement
-                yield from _behind_motion(itertools.chain([(number, " ".join(words[i + 1 :]))], lines))
-                return
-    if statement:
-        yield began, statement
-
-
-def _behind_motion(lines: Iterable[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
-    """Yield the statements after MOTION: the number of frames, the frame time, and one row of numbers per frame."""
-    for number, line in lines:
-        words = line.split()
-        starts = [i for i, word in enumerate(words) if word.upper() in _MOTION_KEYWORDS]
-        for start, end in itertools.pairwise([0, *starts, len(words)]):
-            part = words[start:end]
-            size = 3 if [word.upper().rstrip(":") for word in part[:2]] == ["FRAME", "TIME"] else len(part)
-            yield from ((number, some) for some in (part[:size], part[size:]) if some)
-
-
-class Lines:
-    """Iterator over the statements of a BVH file; its errors name the line."""
+class _Words:
+    """Words of a BVH file, read one after the other wherever its lines end; errors name the line read last."""
 
     def __init__(self, path: str, text: str):
-        self.path, self._lines, self._at = path, list(_statements(text)), 0
+        self.path, self._lines, self._at = path, text.splitlines(), 0
+        spaced = (line.replace("{", " { ").replace("}", " } ").split() for line in self._lines)
+        self._words = [(number, word) for number, line in enumerate(spaced, 1) for word in line]
 
-    def next(self, expected: str) -> list[str]:
-        """Return the words of the next statement."""
-        if self._at == len(self._lines):
+    def next(self, expected: str) -> str:
+        """Return the next word."""
+        if self._at == len(self._words):
             raise OsikValueError(f"{self.path} ends where {expected} should come")
         self._at += 1
-        return self._lines[self._at - 1][1]
+        return self._words[self._at - 1][1]
 
-    def rewrap(self, columns: int, count: int) -> None:
-        """Split the remaining ``count * columns`` numbers into rows of ``columns``, wherever the file's lines end."""
-        left = [(number, word) for number, words in self._lines[self._at :] for word in words]
-        even = all(len(words) == columns for _, words in self._lines[self._at :])
-        if not even and len(left) == count * columns:
-            rows = (left[i : i + columns] for i in range(0, len(left), columns))
-            self._lines[self._at :] = [(row[0][0], [word for _, word in row]) for row in rows]
+    def name(self) -> str:
+        """Return the words up to the end of the present line, or up to a brace on it."""
+        line = self._words[self._at - 1][0]
+        return " ".join(self._take(lambda number, word: number == line and word != "{"))
 
-    def error(self, what: str) -> ValueError:
-        """Return an error that names the line read last."""
-        number, words = self._lines[max(self._at - 1, 0)] if self._lines else (1, [])
-        return OsikValueError(f"{self.path}, line {number}: {what}; the line is {' '.join(words)[:60]!r}")
+    def up_to_keyword(self) -> list[str]:
+        """Return the words up to the next keyword."""
+        return self._take(lambda _, word: word.upper() not in _KEYWORDS)
 
-    def rest(self) -> Iterator[list[str]]:
-        """Yield the words of each remaining statement."""
-        while self._at < len(self._lines):
-            yield self.next("a frame")
+    def _take(self, belongs: Callable[[int, str], bool]) -> list[str]:
+        found = [word for _, word in itertools.takewhile(lambda one: belongs(*one), self._words[self._at :])]
+        self._at += len(found)
+        return found
 
-    def numbers(self, words: list[str], count: int, what: str) -> list[float]:
-        """Return words as ``count`` finite numbers, or raise ValueError that names the line read last."""
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            raise self.error(f"{what} is not numbers") from None
-        if len(values) != count:
-            raise self.error(f"{what} has {len(values)} numbers where there should be {count}")
-        if not np.isfinite(values).all():
-            raise self.error(f"{what} is not finite")
-        if max(map(abs, values), default=0.0) > _LARGEST:
-            raise self.error(f"{what} has a number over {_LARGEST:g}, which is no length and no angle")
+    def offset(self) -> Float[np.ndarray, "3"]:
+        """Return the numbers up to the next keyword, which are three."""
+        size = len(self.up_to_keyword())
+        values = self._checked(self._words[self._at - size : self._at], "OFFSET")
+        if size != 3:
+            raise self.error(f"OFFSET has {size} numbers where there should be 3")
         return values
+
+    def frames(self, count: int, columns: int) -> Float[np.ndarray, "F C"]:
+        """Return all remaining words as ``count`` rows of ``columns`` numbers."""
+        left = self._words[self._at :]
+        values = self._checked(left, "a frame")
+        if len(left) != count * columns or not left:
+            for number, own in itertools.groupby(left, key=lambda one: one[0]):
+                size = len(list(own))
+                if size != columns:
+                    raise self.error(f"a frame has {size} numbers where there should be {columns}", number)
+            raise self.error(f"the file says Frames: {count}, and has {len(left) // columns}")
+        return values.reshape(count, columns)
+
+    def _checked(self, words: list[tuple[int, str]], what: str) -> Float[np.ndarray, " n"]:
+        try:
+            values = np.array([float(word) for _, word in words])
+        except ValueError:
+            wrong = next(number for number, word in words if np.isnan(as_number(word)))
+            raise self.error(f"{what} is not numbers", wrong) from None
+        wrong = np.flatnonzero(~(np.abs(values) <= _LARGEST))
+        if wrong.size:
+            number, value = words[wrong[0]][0], values[wrong[0]]
+            if not np.isfinite(value):
+                raise self.error(f"{what} is not finite", number)
+            raise self.error(f"{what} has a number over {_LARGEST:g}, which is no length and no angle", number)
+        return values
+
+    def error(self, what: str, number: int | None = None) -> ValueError:
+        """Return an error that names a line: that of the word read last, or the given one."""
+        read = self._words[max(min(self._at, len(self._words)) - 1, 0)][0] if self._words else 1
+        number = read if number is None else number
+        line = self._lines[number - 1].strip() if self._lines else ""
+        return OsikValueError(f"{self.path}, line {number}: {what}; the line is {line[:60]!r}")

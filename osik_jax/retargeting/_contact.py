@@ -87,12 +87,11 @@ def find_contact(
     ground: float,
     *,
     noise: float = 0.0,
-    height: float = HEIGHT,
 ) -> Bool[np.ndarray, "F k"]:
     """Return whether each point stands on the ground. (F, k).
 
-    A point stands if it is lower than ``height`` [m] above the ground and slower than 0.3 m/s, both since the frame
-    before and until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two of the
+    A point stands if it is lower than 4 cm above the ground and slower than 0.3 m/s, both since the frame before and
+    until the frame after. With noise, each step becomes a window of ``noise_steps``: in at least two of the
     windows that contain a frame, a line fitted to the point's positions must be slow, and noise must explain the
     residuals. So landing and lifting are found to the frame.
 
@@ -101,7 +100,7 @@ def find_contact(
     ``find_noise``) are in metres.
     """
     steps = min(noise_steps(noise, fps), max(len(points) - 1, 1))
-    low = mean_over(points[..., 2], steps) - ground < height
+    low = mean_over(points[..., 2], steps) - ground < HEIGHT
     stands = low & _still(points, fps, noise, steps)
     # a contact lasts two frames at least, also at low rates
     least = max(2, round(_SHORTEST * fps))

@@ -1,11 +1,12 @@
-"""Implementation of ``osik retarget FOLDER``: all clips of a folder, resumable after an interruption."""
+"""Files of ``osik retarget``: of one clip, or of all clips of a folder, resumable after an interruption."""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -15,37 +16,54 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._progress import Progress, reported
-from ..execution._platform import cpu_is_default
-from ..execution._workers import cores
+from .._whole_file import write_text
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
-from ._command import write_json, write_motion
-from ._lanes import Clip, shared_length
-from ._load import Reader, clips_in
-from ._page import write_index
-from ._profile import Limb
-from ._profile_file import find_profile, profile_text, save_profile
+from ._lanes import Clip
+from ._load import clips_in, load_motion
+from ._profile_file import profile_text, save_profile
 from ._report import FIGURES, picked, report
-from ._retarget import Retargeter, Source
+from ._retarget import Retargeter
+from ._retargeted import Retargeted
+from ._up import Up
 
 _JOB = "job.json"
-_COMPILING = 30_000
-"""Frames that a CPU plans in the time of one compilation."""
+
+
+def write_folder(result: Retargeted, name: str, out: Path) -> dict[str, Any]:
+    """Write motion (.npz and .csv), report and profile; return the report."""
+    figures = {"clip": name, **report(result)}
+    _write_motion(result, figures, out)
+    save_profile(result.profile, out / "profile.toml")
+    return figures
+
+
+def _write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
+    result.save(out / "motion.npz")
+    result.motion.save_csv(out / "motion.csv")
+    _write_json(figures, out / "report.json")
+
+
+def _write_json(figures: dict[str, Any], path: Path) -> None:
+    """Write a JSON file, so that a file of this name is always complete."""
+    write_text(path, json.dumps(figures, indent=2, allow_nan=False) + "\n")
 
 
 def retarget_folder(
     retargeter: Retargeter,
     folder: Path,
     out: Path,
-    reader: Reader | None = None,
     *,
+    unit: str | float | None = None,
+    up: Up | None = None,
+    trim: bool = True,
     mapping: Mapping[str, str] | None = None,
     fps: float | None = None,
     chunk: int = 32,
     progress: Progress = True,
-    page: bool = False,
 ) -> dict[str, Any]:
-    """Retarget every ``.bvh``, ``.amc``, ``.npz`` and ``.csv`` file directly inside a folder.
+    """Retarget every ``.bvh``, ``.npz`` and ``.csv`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
     also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with
@@ -56,12 +74,13 @@ def retarget_folder(
         retargeter: the retargeter of the robot.
         folder: folder of the clips; folders inside it are not searched.
         out: output folder.
-        reader: function that reads a clip. None: as ``load_motion`` does.
+        unit: as of ``load_motion``, of the BVH files.
+        up: as of ``load_motion``.
+        trim: as of ``load_motion``.
         mapping: as of ``Retargeter.retarget``, the same for all clips.
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
-        page: whether each clip gets a page, ``report.html``, and ``out`` an ``index.html`` with links to them.
 
     Returns:
         the summary: ``clips`` (number finished), ``frames``, ``worst`` (the largest value of each figure), ``failed``
@@ -73,113 +92,46 @@ def retarget_folder(
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    (files, others), reader = clips_in(folder), Reader() if reader is None else reader
+    files, others = clips_in(folder)
     others = [name for name in others if folder / name != out]
-    if reader.source is not None:
-        retargeter = retargeter._led_by(reader.profile or find_profile(reader.source))
-    job = _job(retargeter, {"mapping": mapping, "fps": fps, **reader.options()})
+    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up, "trim": trim})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
         sources = {name: _source(path, job) for name, path in files.items()}
-        work = _Work(retargeter, out, sources, chunk, page)
-        with reported(len(files), len(work.found), progress, "clips") as advance:
-            # longest first: shorter clips can then use the program compiled for longer ones
-            todo = [name for name in files if name not in work.found]
-            for name in sorted(todo, key=lambda name: -files[name].stat().st_size):
-                advance(work.add(name, partial(reader.in_folder, files[name]), mapping, fps))
-            for done in work.rest():
-                advance(done)
-        summary = {**_summary(work.found, work.failed, [*files]), "no_clips": others}
-        write_json(summary, out / "report.json")
+        finished = {name: _finished(out / name, of) for name, of in sources.items()}
+        found = {name: figures for name, figures in finished.items() if figures is not None}
+        failed: dict[str, str] = {}
+        # longest first, so that no core waits for a long clip at the end
+        todo = sorted((name for name in files if name not in found), key=lambda name: -files[name].stat().st_size)
+
+        def finish(number: int, make: Callable[[], Retargeted]) -> None:
+            name = todo[number]
+            try:
+                result = make()
+            except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
+                failed[name] = _reason(error)
+                return
+            found[name] = {"clip": name, **sources[name], **report(result)}
+            (out / name).mkdir(exist_ok=True)
+            _write_motion(result, found[name], out / name)
+
+        def read(name: str) -> Clip:
+            path = files[name]
+            motion = load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up, trim=trim)
+            return retargeter._prepared(motion, mapping, fps)
+
+        with (
+            reported(len(files), len(found), progress, "clips") as advance,
+            contextlib.closing(retargeter._each([partial(read, name) for name in todo], finish, chunk)) as each,
+        ):
+            for _ in each:
+                advance(1)
+        summary = {**_summary(found, failed, [*files]), "no_clips": others}
+        _write_json(summary, out / "report.json")
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(_index(summary))
-        if page:
-            write_index(summary, out / "index.html")
     return summary
-
-
-class _Work:
-    """Progress of a folder job: finished and failed clips, and clips that wait for others of the same length.
-
-    Attributes:
-        found: reports of finished clips by name.
-        failed: error messages of failed clips by name.
-    """
-
-    def __init__(
-        self,
-        retargeter: Retargeter,
-        out: Path,
-        sources: Mapping[str, dict[str, str]],
-        chunk: int,
-        page: bool,
-    ):
-        self._retargeter, self._out, self._sources, self._page = retargeter, out, sources, page
-        found = {name: _finished(out / name, of, page) for name, of in sources.items()}
-        self.found = {name: own for name, own in found.items() if own is not None}
-        self.failed: dict[str, str] = {}
-        self._lanes = cores() if cpu_is_default() else min(chunk, max(1, len(sources) - len(self.found)))
-        self._lengths = _Lengths()
-        self._waiting: dict[tuple[int, tuple[Limb, ...]], list[tuple[str, Clip]]] = {}
-
-    def add(
-        self,
-        name: str,
-        read: Callable[[], Source],
-        mapping: Mapping[str, str] | None,
-        fps: float | None,
-    ) -> int:
-        """Read a clip; retarget it with the waiting clips once a batch is full; return the number finished."""
-        try:
-            clip = self._retargeter._prepared(read(), mapping, fps)
-        except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
-            self.failed[name] = _reason(error)
-            return 1
-        length = self._lengths.of(shared_length(clip))
-        alike = length, clip.touching
-        waiting = self._waiting.setdefault(alike, [])
-        waiting.append((name, clip))
-        return self._finish(length, self._waiting.pop(alike)) if len(waiting) == self._lanes else 0
-
-    def rest(self) -> Iterator[int]:
-        """Retarget all waiting clips, one batch per length; yield the number finished."""
-        for (length, _), waiting in self._waiting.items():
-            yield self._finish(length, waiting)
-
-    def _finish(self, length: int, clips: list[tuple[str, Clip]]) -> int:
-        made = self._retargeter._solved([clip for _, clip in clips], length, self._lanes)
-        for (name, _), record in zip(clips, made, strict=True):
-            try:
-                result = record()
-            except ValueError as error:
-                self.failed[name] = _reason(error)
-                continue
-            self.found[name] = {"clip": name, **self._sources[name], **report(result)}
-            (self._out / name).mkdir(exist_ok=True)
-            write_motion(result, self.found[name], self._out / name, self._page)
-        return len(clips)
-
-
-class _Lengths:
-    """Frame counts for which programs are compiled.
-
-    A clip uses the next longer compiled length, until the padding of its length adds up to the cost of a compilation.
-    """
-
-    def __init__(self) -> None:
-        self._compiled: set[int] = set()
-        self._wasted: dict[int, int] = {}
-
-    def of(self, own: int) -> int:
-        """Return the number of frames to which a clip of ``own`` frames is padded."""
-        longer = min((length for length in self._compiled if length >= own), default=own)
-        wasted = self._wasted.get(own, 0) + longer - own
-        if wasted > _COMPILING:
-            longer, wasted = own, 0
-        self._wasted[own] = wasted
-        self._compiled.add(longer)
-        return longer
 
 
 def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -206,7 +158,7 @@ def _claim(out: Path, job: dict[str, Any]) -> None:
     changed = differences(old, json.loads(json.dumps(job))) if old else []
     if changed:
         raise OsikValueError(f"{out} has another job in it; name another folder. What differs: {'; '.join(changed)}")
-    write_json(job, path)
+    _write_json(job, path)
 
 
 def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:
@@ -218,15 +170,14 @@ def _source(path: Path, job: dict[str, Any]) -> dict[str, str]:
     return {"source": path.name, "sha256": content, "job": identifier(job)}
 
 
-def _finished(folder: Path, source: dict[str, str], page: bool) -> dict[str, Any] | None:
-    """Return the report of a finished clip, or None if there is none for this file and job, or lacks its ``page``."""
+def _finished(folder: Path, source: dict[str, str]) -> dict[str, Any] | None:
+    """Return the report of a finished clip, or None if there is none for this file and job."""
     figures = _read(folder / "report.json") or {}
     try:
         picked(figures)
     except (KeyError, TypeError):
         return None
-    whole = source.items() <= figures.items() and ((folder / "report.html").exists() or not page)
-    return figures if whole else None
+    return figures if source.items() <= figures.items() else None
 
 
 def _read(path: Path) -> dict[str, Any] | None:

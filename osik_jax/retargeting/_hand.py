@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._home import home_kinematics
@@ -16,7 +14,6 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._goals import Weights
 from ._limbs import ORIGIN, Chain, find_end
-from ._person import palm_axes
 from ._profile import Place, Profile, world_points
 from ._roles import FINGERS
 
@@ -45,8 +42,6 @@ _APART, _SIDE, _FLEXED = 1e-2, 5e-3, 0.3
 """Least distance between the last joints of two fingers of one branch [m], of the thumb from the middle of the other
 knuckles along them [m], and the angle by which fingers are bent to see where the palm is [rad].
 """
-_CLEARLY = 0.1
-"""Least component of the fingers across the palm, over their length, that shows to which side they bend."""
 _LIMB = 100.0
 """Weight of a hand's reaches. With a body's, posture pulls tips off by a millimetre, and the damping of the plan's
 steps (1 at least) outweighs the rows of fingers: a tip out of reach ends the iterations before the others are there.
@@ -152,35 +147,13 @@ def _named(robot: Robot, chains: list[Chain], places: list[Place], tips: np.ndar
     return dict(zip(FINGERS, [thumb, *sorted(others, key=lambda k: -side[k])], strict=False))
 
 
-def _bent(robot: Robot, places: list[Place], by: float = _FLEXED) -> np.ndarray:
-    """Return points in the world [m] with all hinges turned from home into the larger part of their ranges. (k, 3).
-
-    ``by`` is the angle [rad].
-    """
+def _bent(robot: Robot, places: list[Place]) -> np.ndarray:
+    """Return points in the world [m] with all hinges turned from home into the larger part of their ranges. (k, 3)."""
     scalar, index = scalar_layout(robot)
     hinges, q = scalar & np.asarray(robot.tree.turning), np.array(robot.q0)
     room = np.asarray(robot.position_upper) + np.asarray(robot.position_lower) - 2.0 * q[index]
-    q[index[hinges]] += by * np.sign(np.where(np.isfinite(room), room, 0.0))[hinges]
+    q[index[hinges]] += _FLEXED * np.sign(np.where(np.isfinite(room), room, 0.0))[hinges]
     return world_points(robot, forward_kinematics(robot, jnp.asarray(q)), places)
-
-
-def is_other_hand(robot: Robot, profile: Profile, person: Mapping[str, Float[np.ndarray, "F 3"]]) -> bool:
-    """Return whether a person's hand is a left one and the robot's a right one, or the other way round.
-
-    Fingers of both have to bend clearly to one side of the palm; otherwise False.
-    """
-    places = [*profile.keypoints.values()]
-    home, bent = (dict(zip(profile.keypoints, _bent(robot, places, by)[:, None], strict=True)) for by in (0.0, _FLEXED))
-    own, other = _bend(bent) - _bend(home), _bend(person)
-    return min(abs(own), abs(other)) > _CLEARLY and own * other < 0.0
-
-
-def _bend(points: Mapping[str, Float[np.ndarray, "F 3"]]) -> float:
-    """Return the mean component of the fingers along x of ``palm_axes``, over their length; > 0 for a right hand."""
-    fingers = [finger for finger in FINGERS[1:] if {f"{finger}_1", f"{finger}_4"} <= set(points)]
-    along = [points[f"{finger}_4"] - points[f"{finger}_1"] for finger in fingers]
-    x = palm_axes(points)[..., 0]
-    return float(np.mean([np.sum(part * x, -1) / np.linalg.norm(part, axis=-1) for part in along]))
 
 
 def _away(a: np.ndarray, b: np.ndarray) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -12,8 +11,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..execution._platform import cpu_is_default
-from ..execution._workers import cores
 from ..limits import Limit
 from ..scaling import sharded
 from ..scaling._sharded import ShardedFunction
@@ -68,29 +65,15 @@ def shared_length(clip: Clip) -> int:
     return -(-clip.frames // step) * step
 
 
-def even(count: int, most: int) -> int:
-    """Return the largest chunk size up to ``most`` for which ``count`` items split into nearly equal chunks."""
-    return -(-count // -(-count // most))
-
-
 _Lane = tuple[Goals, Array, Bounds, Array]
 
 
 def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
-    """Solve all lanes: on CPUs in one thread per core, elsewhere in one program split over all devices.
+    """Solve all lanes in one program split over all devices.
 
-    XLA programs release Python's lock, so threads run in parallel. ``shared``: the arguments of ``solve_lane`` after
-    the lane.
+    ``shared``: the arguments of ``solve_lane`` after the lane.
     """
-    if not cpu_is_default():
-        return _over_devices(len(shared))(lanes, *shared) if len(jax.devices()) > 1 else solve_lanes(lanes, *shared)
-
-    def one(i: int) -> Solved:
-        return jax.tree.map(np.asarray, solve_lane(jax.tree.map(lambda leaf: leaf[i], lanes), *shared))
-
-    with ThreadPoolExecutor(cores()) as pool:
-        solved = list(pool.map(one, range(len(lanes[1]))))
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *solved)
+    return _over_devices(len(shared))(lanes, *shared) if len(jax.devices()) > 1 else solve_lanes(lanes, *shared)
 
 
 @jax.jit

@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from .._errors import OsikValueError
-from ..robot import Robot
-from ..scaling._fingerprint import fingerprint, identifier
-from ._amc import read_amc
 from ._bvh import read_bvh
 from ._keypoints import read_keypoints
 from ._motion import HumanMotion
-from ._profile import Profile
-from ._profile_file import find_profile, profile_text
-from ._source_motion import SourceMotion
-from ._up import Up, checked_up, find_rest_up, standing_up
+from ._up import Up
 
-ENDINGS = (".bvh", ".amc", ".npz", ".csv")
+ENDINGS = (".bvh", ".npz", ".csv")
 
 
 def load_motion(
     path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
 ) -> HumanMotion:
-    """Read a person's motion: BVH, AMC with its ASF beside it, ``.npz`` or ``.csv``, told apart by the ending.
+    """Read a person's motion: BVH, ``.npz`` or ``.csv``, told apart by the ending.
 
     Args:
         path: the file.
@@ -46,68 +38,22 @@ def load_motion(
     if ending not in ENDINGS and (ending or Path(path).exists()):  # a misspelt folder has no ending, and is missing
         raise OsikValueError(f"{path} is none of {', '.join(ENDINGS)}")
     if unit is not None and ending in ENDINGS and ending != ".bvh":
-        raise OsikValueError("unit goes with BVH files; keypoints are metres, and an .asf says its unit")
+        raise OsikValueError("unit goes with BVH files; keypoints are metres")
     if not Path(path).is_file():
         raise FileNotFoundError(f"no such file: {path}")
     if ending == ".bvh":
         return read_bvh(path, unit=unit, up=up, trim=trim)
-    if ending == ".amc":
-        motion = read_amc(Path(path))
-        return standing_up(str(path), motion, checked_up(up), "y", find_rest_up(motion))
     return read_keypoints(path, up=up)
-
-
-@dataclasses.dataclass(frozen=True)
-class Reader:
-    """Reader for the clips of a job: motions of a person, or of a robot if ``source`` is given."""
-
-    unit: str | float | None = None  # unit of BVH files, as of ``load_motion``
-    up: Up | None = None  # up axis of all files, as of ``load_motion``
-    trim: bool = True  # for BVH files, as of ``load_motion``
-    source: Robot | None = None  # the robot whose motions the files hold; None: the files hold a person's motions
-    profile: Profile | None = None  # profile of ``source``, as of ``SourceMotion.load``
-    fps: float | None = None  # frame rate of CSV files of ``source``, as of ``SourceMotion.load``
-
-    def __call__(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read one clip."""
-        if self.source is not None:
-            return SourceMotion.load(path, self.source, profile=self.profile, fps=self.fps)
-        return load_motion(path, unit=self.unit, up=self.up, trim=self.trim)
-
-    def in_folder(self, path: Path) -> HumanMotion | SourceMotion:
-        """Read one of the clips of a folder, where ``unit`` is that of the BVH files and ``fps`` that of the CSVs."""
-        ending = path.suffix.lower()
-        unit, fps = self.unit if ending == ".bvh" else None, self.fps if ending == ".csv" else None
-        return dataclasses.replace(self, unit=unit, fps=fps)(path)
-
-    def all_in(self, folder: Path) -> list[HumanMotion | SourceMotion]:
-        """Read all clips of a folder in order of name; an error's message starts with the clip's name."""
-        motions = []
-        for name, path in clips_in(folder)[0].items():
-            try:
-                motions.append(self.in_folder(path))
-            except (ValueError, KeyError) as error:
-                raise type(error)(f"{name}: {error.args[0]}") from error
-        return motions
-
-    def options(self) -> dict[str, Any]:
-        """Return the options that change what the reader returns, as numbers and strings."""
-        if self.source is None:
-            return {"unit": self.unit, "up": self.up, "trim": self.trim}
-        profile = find_profile(self.source) if self.profile is None else self.profile
-        source = {"robot": identifier(fingerprint(self.source)), "profile": identifier({"text": profile_text(profile)})}
-        return {"source": source, "source_fps": self.fps}
 
 
 def clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:
     """Return the motion files of a folder by clip name, and the names of what else is in it.
 
-    A clip's name is the file's, without its ending unless two would clash. Skeletons (.asf) and hidden files are not
-    named.
+    A clip's name is the file's, without its ending unless two would clash. Hidden files are not named.
     """
     inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
     files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
-    others = [path.name + "/" * path.is_dir() for path in inside if path not in files and path.suffix.lower() != ".asf"]
+    others = [path.name + "/" * path.is_dir() for path in inside if path not in files]
     if not files:
         seen = shortened([path.name for path in inside]) or "nothing"
         raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen}")

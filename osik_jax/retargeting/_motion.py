@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -149,22 +148,6 @@ def check_rate(fps: float) -> float:
     if not (np.isfinite(fps) and fps > 0.0):
         raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
     return fps
-
-
-def as_number(word: str) -> float:
-    """Return a word as a number; NaN if it is none."""
-    try:
-        return float(word)
-    except ValueError:
-        return np.nan
-
-
-def finite_numbers(path: Path, number: int, words: list[str]) -> list[float]:
-    """Return words of a line of a file as numbers, or raise ValueError that names the line."""
-    values = [as_number(word) for word in words]
-    if not np.isfinite(values).all():
-        raise OsikValueError(f"{path}, line {number}: not finite numbers: {' '.join(words)[:60]}")
-    return values
 
 
 def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:

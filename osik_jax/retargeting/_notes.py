@@ -56,17 +56,12 @@ def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]
 
 
 def _posture(figures: Mapping[str, Any]) -> list[str]:
-    """Return notes on a left hand for a right one, on a trunk that leans, and on joints that rest at an end."""
+    """Return notes on a trunk that leans, and on joints that rest at an end."""
     out, leans = [], figures["tracking"]["trunk_angle_deg"]["hips-shoulders"]
     if leans is not None and leans > _LEANS:
         out.append(
             f"the trunk leans {leans:.0f} deg away from the person's: check which joint of the clip is the chest, and "
             "the range of the waist"
-        )
-    if figures["tracking"]["other_hand"]:
-        out.append(
-            "the clip has a left hand and the robot is a right one, or the other way round: take the other robot, or "
-            "mirror the clip by changing the sign of one coordinate"
         )
     share: Mapping[str, float] = figures["joints"]["at_end_share"]
     rests = sorted((name for name in share if share[name] > _RESTS), key=lambda name: -share[name])

@@ -84,19 +84,17 @@ class OnRobot:
             return find_roles(motion.joint_names, mapping, needed, motion.positions)
         if mapping is not None:
             raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
-        missing = self._lacks(motion.seen)
+        missing = [role for limb in self.profile.followed for role in limb if role not in motion.seen.keypoints]
         if missing:
-            raise OsikValueError(f"the robot that is followed has no {', '.join(missing)}")
+            raise OsikValueError(
+                f"the robot that is followed has no {', '.join(dict.fromkeys(missing))}; give a profile without these "
+                "keypoints"
+            )
         if self.profile.walks and motion.seen.standing != self.profile.standing:
             raise OsikValueError(
                 f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
             )
         return {}
-
-    def _lacks(self, source: Profile) -> tuple[str, ...]:
-        """Return the roles that this robot follows and a source robot does not have."""
-        roles = dict.fromkeys(role for limb in self.profile.followed for role in limb)
-        return tuple(role for role in roles if role not in source.keypoints)
 
     def _bounds(self, dt: float) -> Bounds:
         """Return the joint bounds of a plan with one frame per ``dt`` seconds."""

@@ -11,8 +11,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError, warn
-from ._contact import find_contact, find_noise, mean_over, noise_steps
-from ._floor import Floor, find_floor
+from ._contact import find_contact, find_ground, find_noise, mean_over, noise_steps
 from ._motion import CONTACT_POINTS, HumanMotion, Touch
 from ._profile import Limb
 from ._roles import FINGER_REACHES, FINGERS, LEGS, LIMBS, REACHES, SIDES, chain
@@ -92,7 +91,7 @@ class Measures:
 
     lengths: Mapping[Limb, float]  # lengths of the limbs and reaches with known ends [m]
     ankle: float  # height of the ankles above the floor when standing; 0 if unknown [m]
-    floor: Floor  # the floor under the clip
+    floor: float  # height of the floor [m]
     noise: float  # standard deviation of each coordinate of the standing points [m]
     # per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
     flat: Mapping[str, Mapping[str, np.ndarray]]
@@ -135,13 +134,14 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
     soles = _with_soles(points, flat)
     found = np.stack([soles[name] for name in standing if name in soles] or [np.zeros((motion.frames, 3))], 1)
     noise, seen = find_noise(found), all(name in soles for name in standing) and bool(standing)
-    floor = find_floor(found, motion.fps, noise) if motion.ground is None and seen else Floor(motion.ground or 0.0)
+    detected = find_ground(found, noise_steps(noise, motion.fps)) if seen else 0.0
+    floor = detected if motion.ground is None else motion.ground
     ends = standing if on_four else ("left_ankle", "right_ankle")
     ankle = 0.0
     if set(ends) <= set(points):
-        ankles = floor.leveled(np.stack([points[role] for role in ends], 1), motion.fps)
+        heights = np.stack([points[role][:, 2] for role in ends], 1)
         # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
-        ankle = float(np.percentile(ankles[..., 2].min(1), 5))
+        ankle = float(np.percentile(heights.min(1), 5)) - floor
     return Measures(lengths, ankle, floor, noise, flat, straight)
 
 
@@ -168,11 +168,9 @@ def read_person(
     are the points whose contact with the floor counts (``Profile.standing``).
     """
     known = measure(motion, roles, standing) if measures is None else measures
-    # a drift counts from the first frame of the measured clip, which another clip does not share
-    floor = known.floor if measures is None else dataclasses.replace(known.floor, drift=0.0)
+    down = np.array([0.0, 0.0, known.floor])
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
-    leveled = floor.leveled(np.stack([*points.values()], 1), motion.fps)
-    points = dict(zip(points, np.moveaxis(leveled, 1, 0), strict=True))
+    points = {role: track - down for role, track in points.items()}
     contact = None if standing != CONTACT_POINTS and "left_toe" in roles else motion.contact
     if contact is None and standing and set(standing) <= set(points):
         soles = np.stack([points[name] for name in standing], 1)
@@ -191,10 +189,7 @@ def read_person(
         contact=np.zeros((motion.frames, 4), bool) if contact is None else np.asarray(contact, bool),
         lengths=known.lengths,
         ankle=known.ankle,
-        objects={
-            name: np.concatenate([floor.leveled(poses[:, :3], motion.fps), poses[:, 3:]], -1)
-            for name, poses in motion.objects.items()
-        },
+        objects={name: poses - np.pad(down, (0, 4)) for name, poses in motion.objects.items()},
         touches=motion.touches,
     )
 

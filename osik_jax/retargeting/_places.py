@@ -75,7 +75,8 @@ class CapsuleDistances:
         for c in profile.capsules:
             half = 0.5 * float(np.linalg.norm(np.subtract(c.end, c.start)))
             body = spec.worldbody.add_body(mocap=True)
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[c.radius, half, 0.0])
+            kind = mujoco.mjtGeom.mjGEOM_CAPSULE if half > 0.0 else mujoco.mjtGeom.mjGEOM_SPHERE
+            body.add_geom(type=kind, size=[c.radius, half, 0.0])
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,12 @@ class Foot:
     toe: tuple[Point, Point]  # the front left and the front right corner in that frame [m]
     radius: float = 0.0  # radius of a round foot, whose corners are its centre [m]
 
+    def __post_init__(self) -> None:
+        _check_points(f"heel of {self.frame}", self.heel, (2, 3))
+        _check_points(f"toe of {self.frame}", self.toe, (2, 3))
+        if not self.radius >= 0.0:
+            raise OsikValueError(f"the radius of {self.frame} is {self.radius}; it is a length in metres, 0 or more")
+
 
 @dataclasses.dataclass(frozen=True)
 class Capsule:
@@ -39,6 +45,14 @@ class Capsule:
     start: Point
     end: Point
     radius: float
+
+    def __post_init__(self) -> None:
+        _check_points(f"start of the capsule on {self.frame}", self.start, (3,))
+        _check_points(f"end of the capsule on {self.frame}", self.end, (3,))
+        if not self.radius > 0.0:
+            raise OsikValueError(
+                f"the capsule on {self.frame} has radius {self.radius}; it is a length in metres, over 0"
+            )
 
     def hides(self, other: Capsule) -> bool:
         """Return whether another capsule is inside this one, about the same segment."""
@@ -59,11 +73,6 @@ class Profile:
         scale: factor on the person's path; None: the ratio of leg lengths (arm lengths without legs) times ``stretch``.
         stretch: factor on the ratio of lengths.
         weights: weights of the cost terms.
-        limbs: segments whose directions are tracked, as pairs of roles; None: all between keypoints, if they do not end
-            where a reach does.
-        reaches: pairs of roles whose vector is tracked, direction and length, relative to nominal lengths of robot and
-            person; None: hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of
-            a hand.
         rolls: whether the feet are wheels that roll in any direction: they stay on the floor and move along it.
 
     Raises:
@@ -79,8 +88,6 @@ class Profile:
     scale: float | None = None
     stretch: float = 1.0
     weights: Weights = dataclasses.field(default_factory=Weights)
-    limbs: tuple[Limb, ...] | None = None
-    reaches: tuple[Limb, ...] | None = None
     rolls: bool = False
 
     def __post_init__(self) -> None:
@@ -91,12 +98,10 @@ class Profile:
                 f"the profile has no keypoints {', '.join(dict.fromkeys(missing))}; a limb begins at a hip or a "
                 "shoulder, and there are two hips or none"
             )
-        for role in self.keypoints:
+        for role, (_, point) in self.keypoints.items():
             if role not in (*NEEDED, *HAND):
                 raise unknown_name("keypoint", role, (*NEEDED, *HAND))
-        for role in (role for limb in (*(self.limbs or ()), *(self.reaches or ())) for role in limb):
-            if role not in self.keypoints:
-                raise unknown_name("keypoint", role, tuple(self.keypoints))
+            _check_points(f"the keypoint {role}", point, (3,))
         knuckles = [finger for finger in FINGERS[1:] if f"{finger}_1" in self.keypoints]
         if self.is_hand and (len(knuckles) < 2 or "wrist" not in self.keypoints):
             raise OsikValueError("a hand has a keypoint wrist, and index_1, middle_1, ring_1 or little_1: two of these")
@@ -112,34 +117,19 @@ class Profile:
 
     @property
     def reached(self) -> tuple[Limb, ...]:
-        """Return the reaches that are tracked."""
-        on_four = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
-        return (
-            tuple(limb for limb in on_four if set(limb) <= set(self.keypoints))
-            if self.reaches is None
-            else self.reaches
-        )
+        """Return the pairs of roles whose vector is tracked, direction and length, relative to nominal lengths.
+
+        Hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of a hand.
+        """
+        pairs = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
+        return tuple(pair for pair in pairs if set(pair) <= set(self.keypoints))
 
     @property
     def followed(self) -> tuple[Limb, ...]:
-        """Return all limbs that are tracked, the reaches last."""
-        limbs, reached = self.limbs, self.reached
-        if limbs is None:
-            ends = {role for limb in reached for role in limb}
-            limbs = tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
-        return (*limbs, *reached)
-
-    def without(self, roles: Collection[str]) -> Profile:
-        """Return the profile without some keypoints, and without the limbs and reaches that they belong to."""
-        gone = set(roles)
-        for first, second in LIMBS:  # from the trunk outwards
-            gone |= {second} if first in gone else set()
-        limbs, reaches = (
-            pairs if pairs is None else tuple(pair for pair in pairs if gone.isdisjoint(pair))
-            for pairs in (self.limbs, self.reaches)
-        )
-        keypoints = {role: place for role, place in self.keypoints.items() if role not in gone}
-        return dataclasses.replace(self, keypoints=keypoints, limbs=limbs, reaches=reaches)
+        """Return what is tracked: the limbs between keypoints that do not end where a reach does, then the reaches."""
+        ends = {role for limb in self.reached for role in limb}
+        limbs = (limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
+        return (*limbs, *self.reached)
 
     @property
     def is_hand(self) -> bool:
@@ -200,6 +190,13 @@ def world_points(robot: Robot, kinematics: Kinematics, places: Sequence[Place]) 
     """Return where places of a robot are in the world [m]."""
     positions, rotations = (np.asarray(x) for x in kinematics.frame_poses(robot, [frame for frame, _ in places]))
     return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
+
+
+def _check_points(what: str, points: object, shape: tuple[int, ...]) -> None:
+    """Raise ValueError unless these are points, finite and of a shape."""
+    numbers = np.asarray(points, float)
+    if numbers.shape != shape or not np.isfinite(numbers).all():
+        raise OsikValueError(f"{what} is {points!r}, of shape {numbers.shape}; expected {shape}, finite, in metres")
 
 
 def _middle(a: Point, b: Point) -> Point:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import tomllib
 from collections.abc import Mapping
@@ -18,7 +17,7 @@ from .._whole_file import write_text
 from ..robot import Robot
 from ._goals import Weights
 from ._guess import guess_profile
-from ._profile import Capsule, Foot, Limb, Place, Point, Profile
+from ._profile import Capsule, Foot, Profile
 
 BUNDLED = ("nao", "g1", "talos")
 
@@ -65,8 +64,6 @@ def profile_text(profile: Profile) -> str:
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]
     lines += [] if profile.stretch == 1.0 else [f"stretch = {profile.stretch!r}"]
     lines += ["rolls = true"] if profile.rolls else []
-    given = {name: getattr(profile, name) for name in ("limbs", "reaches")}
-    lines += [f"{name} = {json.dumps(limbs)}" for name, limbs in given.items() if limbs is not None]
     rows = [f'frame = "{c.frame}", start = {_point(c.start)}, end = {_point(c.end)}, radius = {c.radius!r}'
             for c in profile.capsules]  # fmt: skip
     lines += ["capsules = [", *(f"    {{ {row} }}," for row in rows), "]"] if rows else []
@@ -90,85 +87,41 @@ def _point(values: Any) -> str:
 def _parsed(text: str, source: str) -> Profile:
     try:
         data = tomllib.loads(text)
-        known = {field.name for field in dataclasses.fields(Profile)}
+        names = tuple(field.name for field in dataclasses.fields(Profile))
         for name in data:
-            if name not in known:
-                raise unknown_name("entry", name, tuple(sorted(known)))
-        return Profile(
-            keypoints={role: _place(entry, f"keypoints.{role}") for role, entry in _entry(data, "keypoints").items()},
-            pelvis=str(_entry(data, "pelvis")),
-            torso=data.get("torso"),
-            feet={name: _foot(entry, name) for name, entry in data.get("feet", {}).items()},
-            capsules=tuple(_capsule(entry, i) for i, entry in enumerate(data.get("capsules", ()))),
-            scale=data.get("scale"),
-            stretch=data.get("stretch", 1.0),
-            weights=_weights(data.get("weights", {})),
-            limbs=_limbs(data, "limbs"),
-            reaches=_limbs(data, "reaches"),
-            rolls=data.get("rolls", False) is True,
-        )
+            if name not in names:
+                raise unknown_name("entry", name, names)
+        for name in ("keypoints", "pelvis"):
+            if name not in data:
+                raise OsikValueError(f"there is no {name}; there is {', '.join(data) or 'nothing'}")
+        parts: dict[str, Any] = {name: _tuples(value) for name, value in data.items()}
+        origin = (0.0, 0.0, 0.0)
+        parts["keypoints"] = {role: (e["frame"], e.get("point", origin)) for role, e in parts["keypoints"].items()}
+        parts["feet"] = {name: Foot(**entry) for name, entry in parts.get("feet", {}).items()}
+        parts["capsules"] = tuple(Capsule(**entry) for entry in parts.get("capsules", ()))
+        parts["weights"] = _weights(data.get("weights", {}))
+        return Profile(**parts)
     except tomllib.TOMLDecodeError as error:
         raise OsikValueError(f"{source} is no TOML: {error}") from None
     except (ValueError, KeyError, TypeError) as error:
         raise OsikValueError(f"{source}: {error.args[0] if error.args else error}") from None
 
 
-def _entry(data: Mapping[str, Any], name: str) -> Any:
-    if name not in data:
-        raise OsikValueError(f"there is no {name}; there is {', '.join(data) or 'nothing'}")
-    return data[name]
-
-
-def _place(entry: Mapping[str, Any], what: str) -> Place:
-    return str(_entry(entry, "frame")), _as_point(entry.get("point", (0.0, 0.0, 0.0)), what)
-
-
-def _as_point(value: Any, what: str) -> Point:
-    numbers = np.asarray(value)
-    if numbers.shape != (3,) or numbers.dtype.kind not in "fi" or not np.isfinite(numbers).all():
-        raise OsikValueError(f"{what} is {value!r}; a point is three numbers in metres")
-    x, y, z = (float(number) for number in numbers)
-    return x, y, z
-
-
-def _limbs(data: Mapping[str, Any], name: str) -> tuple[Limb, ...] | None:
-    pairs = data.get(name)
-    if pairs is None:
-        return None
-    for pair in pairs:
-        if not (isinstance(pair, list) and len(pair) == 2):
-            raise OsikValueError(f"{name} has {pair!r}; a limb is two roles, from the first to the second")
-    return tuple((str(a), str(b)) for a, b in pairs)
-
-
-def _foot(entry: Mapping[str, Any], name: str) -> Foot:
-    parts = []
-    for part in ("heel", "toe"):
-        points = _entry(entry, part)
-        if len(points) != 2:
-            raise OsikValueError(f"feet.{name}.{part} has {len(points)} points; it is the left and the right corner")
-        parts.append((_as_point(points[0], f"feet.{name}.{part}"), _as_point(points[1], f"feet.{name}.{part}")))
-    radius = float(entry.get("radius", 0.0))
-    if not radius >= 0.0:
-        raise OsikValueError(f"feet.{name}.radius is {radius}; it is a length in metres, 0 or more")
-    return Foot(str(_entry(entry, "frame")), parts[0], parts[1], radius)
-
-
-def _capsule(entry: Mapping[str, Any], number: int) -> Capsule:
-    start, end = (_as_point(_entry(entry, name), f"capsules, number {number}, {name}") for name in ("start", "end"))
-    radius = float(_entry(entry, "radius"))
-    if not radius > 0.0 or start == end:
-        raise OsikValueError(f"capsules, number {number}: the radius and the length have to be more than 0")
-    return Capsule(str(_entry(entry, "frame")), start, end, radius)
+def _tuples(value: Any) -> Any:
+    """Return a value of a TOML file with lists as tuples, and their numbers as floats."""
+    if isinstance(value, dict):
+        return {name: _tuples(one) for name, one in value.items()}
+    if isinstance(value, list):
+        return tuple(float(one) if isinstance(one, int) else _tuples(one) for one in value)
+    return value
 
 
 def _weights(entry: Mapping[str, Any]) -> Weights:
-    names = tuple(field.name for field in dataclasses.fields(Weights))
+    usual: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(Weights)}
     for name, value in entry.items():
-        if name not in names:
-            raise unknown_name("weight", name, names)
-        numbers = np.asarray(value)
-        shape = np.shape(getattr(Weights(), name))
+        if name not in usual:
+            raise unknown_name("weight", name, tuple(usual))
+        numbers, shape = np.asarray(value), np.shape(usual[name])
         if numbers.shape != shape or numbers.dtype.kind not in "fi" or not (numbers >= 0).all():
             raise OsikValueError(
                 f"weights.{name} is {value!r}; it is {'three numbers' if shape else 'a number'}, not < 0"

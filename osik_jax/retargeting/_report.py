@@ -14,7 +14,6 @@ from ..robot._mujoco import model_qpos
 from ..tasks._polygon import hull
 from ._contact import stretches
 from ._facing import facing_at_home
-from ._hand import is_other_hand
 from ._notes import notes
 from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
@@ -27,22 +26,22 @@ an end.
 """
 
 FIGURES = {
-    "off_plan_rad": ("off the plan [rad]", ("off_plan_rad",)),
-    "beyond_range_max": ("beyond joint ranges [rad]", ("joints", "beyond_range_max")),
-    "speed_over_limit_max": ("speed over its limit", ("joints", "speed_over_limit_max")),
-    "acceleration_max": ("acceleration [rad/s²]", ("joints", "acceleration_max")),
-    "acceleration_rms": ("acceleration, rms [rad/s²]", ("joints", "acceleration_rms")),
-    "jerk_rms": ("jerk, rms [rad/s³]", ("joints", "jerk_rms")),
-    "slip_mm_max": ("feet slip [mm]", ("feet", "slip_mm_max")),
-    "float_mm_max": ("feet above floor [mm]", ("feet", "float_mm_max")),
-    "below_floor_mm_max": ("soles below floor [mm]", ("feet", "below_floor_mm_max")),
-    "penetration_mm_max": ("shapes overlap [mm]", ("shapes", "penetration_mm_max")),
-    "limb_error_mm_mean": ("limb error, mean [mm]", ("tracking", "limb_error_mm_mean")),
-    "segment_angle_deg_mean": ("segments off, mean [deg]", ("tracking", "segment_angle_deg_mean")),
-    "pelvis_angle_deg_mean": ("pelvis off, mean [deg]", ("tracking", "trunk_angle_deg", "pelvis")),
-    "chest_angle_deg_mean": ("chest off, mean [deg]", ("tracking", "trunk_angle_deg", "chest")),
+    "off_plan_rad": ("off_plan_rad",),
+    "beyond_range_max": ("joints", "beyond_range_max"),
+    "speed_over_limit_max": ("joints", "speed_over_limit_max"),
+    "acceleration_max": ("joints", "acceleration_max"),
+    "acceleration_rms": ("joints", "acceleration_rms"),
+    "jerk_rms": ("joints", "jerk_rms"),
+    "slip_mm_max": ("feet", "slip_mm_max"),
+    "float_mm_max": ("feet", "float_mm_max"),
+    "below_floor_mm_max": ("feet", "below_floor_mm_max"),
+    "penetration_mm_max": ("shapes", "penetration_mm_max"),
+    "limb_error_mm_mean": ("tracking", "limb_error_mm_mean"),
+    "segment_angle_deg_mean": ("tracking", "segment_angle_deg_mean"),
+    "pelvis_angle_deg_mean": ("tracking", "trunk_angle_deg", "pelvis"),
+    "chest_angle_deg_mean": ("tracking", "trunk_angle_deg", "chest"),
 }
-"""Figures of summaries and pages by name: what a page calls each, and its keys in a report."""
+"""Figures of summaries by name, with their keys in a report."""
 
 
 def report(result: Retargeted) -> dict[str, Any]:
@@ -58,12 +57,11 @@ def report(result: Retargeted) -> dict[str, Any]:
     - ``shapes``: depth of overlaps between the profile's capsules.
     - ``tracking``: keypoint errors per limb, at the scale that fits each limb best; mean angles between the person's
       segments and the robot's; ``trunk_angle_deg``: those of the orientations of pelvis and chest, and of the line from
-      hips to shoulders (None without these); ``other_hand``: whether a left hand follows a right one or the other way
-      round.
+      hips to shoulders (None without these).
     - ``touches``: distance of joints from their place on what they hold.
     - ``notes``: sentences on violated bounds, on clips that are too fast for the joints, on a trunk that leans over 10
-      degrees away from the person's, on joints at an end of their range in most frames, on a left hand that follows a
-      right one, and on clips whose feet stand in less than 20 % of the frames.
+      degrees away from the person's, on joints at an end of their range in most frames, and on clips whose feet stand
+      in less than 20 % of the frames.
     """
     places = find_places(result.robot, result.profile, model_qpos(result.robot, result.q))
     figures = {
@@ -83,7 +81,7 @@ def report(result: Retargeted) -> dict[str, Any]:
 
 def picked(figures: Any) -> dict[str, float | None]:
     """Return the figures of a report that ``FIGURES`` names."""
-    return {name: functools.reduce(operator.getitem, path, figures) for name, (_, path) in FIGURES.items()}
+    return {name: functools.reduce(operator.getitem, path, figures) for name, path in FIGURES.items()}
 
 
 def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -194,7 +192,6 @@ def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:
         "segment_angle_deg": angles,
         "segment_angle_deg_mean": float(np.mean(list(angles.values()))),
         "trunk_angle_deg": _trunk(result, places, person),
-        "other_hand": result.profile.is_hand and is_other_hand(result.robot, result.profile, person),
     }
 
 

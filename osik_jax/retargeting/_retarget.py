@@ -2,35 +2,23 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
+from itertools import starmap
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
 
-from .._errors import OsikValueError, warn
+from .._errors import OsikValueError
 from .._progress import reported
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..numerics._arguments import check_count
 from ..robot import Robot
-from ._body import measured
-from ._guess import describe_profile
-from ._lanes import (
-    LENGTHS,
-    Clip,
-    Solved,
-    as_lane,
-    even,
-    padded,
-    shared_length,
-    solve_lane,
-    solve_side_by_side,
-)
+from ._lanes import LENGTHS, Clip, Solved, as_lane, padded, shared_length, solve_lane, solve_side_by_side
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
 from ._person import read_person, with_path
@@ -75,36 +63,11 @@ class Retargeter(OnRobot):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
         self.smoothness = smoothness
         self.max_iterations = max_iterations
-        self._less: dict[tuple[str, ...], Retargeter] = {}
-
-    def _led_by(self, source: Profile) -> Retargeter:
-        """Return the retargeter without the limbs that a source robot lacks; this one if none or all are lacking.
-
-        An ``OsikWarning`` says which limbs are left out.
-        """
-        lacks = self._lacks(source)
-        limbs = [limb for limb in self.profile.followed if set(lacks).isdisjoint(limb)]
-        whole = len(limbs) == len(self.profile.followed)
-        if whole or not limbs or (self.profile.walks and not set(measured(self.profile)) <= set(limbs)):
-            return self
-        if lacks not in self._less:
-            own = self._less[lacks] = copy.copy(self)
-            own._set_profile(self.profile.without(lacks))
-            warn(
-                f"the source robot has no {', '.join(lacks)}; this is followed: "
-                f"{describe_profile(self.robot, own.profile)}"
-            )
-        return self._less[lacks]
-
-    def _for(self, motion: Source) -> Retargeter:
-        return self if isinstance(motion, HumanMotion) else self._led_by(motion.seen)
 
     def retarget(
         self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """Retarget one clip; see the function ``retarget``."""
-        if (other := self._for(motion)) is not self:
-            return other.retarget(motion, mapping=mapping, fps=fps)
         clip = self._prepared(motion, mapping, fps)
         return self._made(clip, len(clip.start))
 
@@ -135,38 +98,44 @@ class Retargeter(OnRobot):
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
         check_count("chunk", chunk)
-        if any(self._for(motion) is not self for motion in motions):
-            return self._from_sources(motions, mapping=mapping, fps=fps, chunk=chunk, progress=progress)
         checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
-        if cpu_is_default():
-            with ThreadPoolExecutor(cores()) as pool, reported(len(checked), 0, progress, "clips") as advance:
-                made = []
-                for one in pool.map(self._made_by_a_core, checked):
-                    made.append(one)
-                    advance(1)
-            return made
-        clips = [self._read(*motion) for motion in checked]
-        groups: dict[tuple[int, tuple[Limb, ...]], list[int]] = {}
-        for i, clip in enumerate(clips):
-            groups.setdefault((shared_length(clip), clip.touching), []).append(i)
         found: dict[int, Retargeted] = {}
-        with reported(len(clips), 0, progress, "clips") as advance:
-            for (length, _), members in sorted(groups.items()):
-                size = even(len(members), chunk)
-                for first in range(0, len(members), size):
-                    some = members[first : first + size]
-                    made = self._solved([clips[i] for i in some], length, size)
-                    found |= {i: record() for i, record in zip(some, made, strict=True)}
-                    advance(len(some))
-        return [found[i] for i in range(len(clips))]
 
-    def _from_sources(self, motions: Sequence[Source], **options: Any) -> list[Retargeted]:
-        """Retarget clips of which some lack limbs, each by the retargeter of its limbs."""
-        makers, found = [self._for(motion) for motion in motions], {}
-        for own in dict.fromkeys(makers):
-            members = [i for i, maker in enumerate(makers) if maker is own]
-            found |= dict(zip(members, own.retarget_all([motions[i] for i in members], **options), strict=True))
-        return [found[i] for i in range(len(motions))]
+        def keep(number: int, make: Callable[[], Retargeted]) -> None:
+            found[number] = make()
+
+        reads = [partial(self._read, *one) for one in checked]
+        with reported(len(reads), 0, progress, "clips") as advance:
+            for _ in self._each(reads, keep, chunk):
+                advance(1)
+        return [found[number] for number in range(len(reads))]
+
+    def _each(
+        self, reads: Sequence[Callable[[], Clip]], finish: Callable[[int, Callable[[], Retargeted]], None], chunk: int
+    ) -> Generator[None, None, None]:
+        """Retarget clips: on CPUs one clip in a thread of each core, on a GPU batches of ``chunk`` clips.
+
+        Compiled code needs no GIL, so threads run side by side. ``finish`` is called with the number of each clip and a
+        function that returns its result, or raises the error of its reader. Yields after each clip.
+        """
+        if cpu_is_default():
+            makers = [partial(self._read_and_made, read) for read in reads]
+            with ThreadPoolExecutor(cores()) as pool:
+                yield from pool.map(finish, range(len(reads)), makers)
+            return
+        lanes, waiting = min(chunk, len(reads)), dict[tuple[int, tuple[Limb, ...]], list[tuple[int, Clip]]]()
+        for number, read in enumerate(reads):
+            try:
+                clip = read()
+            except Exception as error:  # a broken file may raise anything in a reader
+                yield finish(number, partial(_raise, error))
+                continue
+            alike = shared_length(clip), clip.touching
+            waiting.setdefault(alike, []).append((number, clip))
+            if len(waiting[alike]) == lanes:
+                yield from starmap(finish, self._solved(waiting.pop(alike), alike[0], lanes))
+        for (length, _), clips in waiting.items():
+            yield from starmap(finish, self._solved(clips, length, lanes))
 
     def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """Return a clip as arrays for planning, after checking it."""
@@ -197,36 +166,36 @@ class Retargeter(OnRobot):
         dt = 1.0 / motion.fps
         return Clip(person, motion.frames, goals, start, self._bounds(dt), dt, self._build.touches(person))
 
-    def _solved(self, clips: Sequence[Clip], length: int, lanes: int) -> list[Callable[[], Retargeted]]:
-        """Retarget clips of at most ``length`` frames (``shared_length`` or more) that hold the same.
+    def _solved(
+        self, clips: Sequence[tuple[int, Clip]], length: int, lanes: int
+    ) -> Iterator[tuple[int, Callable[[], Retargeted]]]:
+        """Retarget clips of at most ``length`` frames (``shared_length``) that hold the same, in one program.
 
-        ``lanes``: the batch size of the compiled program, at least the number of clips. Each returned function makes a
-        clip's record; it raises ValueError where the motion is not finite.
+        ``lanes``: the batch size of the program, at least the number of clips. Each function makes a clip's record; it
+        raises ValueError where the motion is not finite.
         """
-        batch = [as_lane(clip, length) for clip in clips]
-        if not cpu_is_default():
-            batch += batch[-1:] * (lanes - len(batch))
+        batch = [as_lane(clip, length) for _, clip in clips]
+        batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
-        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0].touching)))
-        return [
-            partial(self._finished, clip, jax.tree.map(lambda leaf, lane=lane: leaf[lane], results))
-            for lane, clip in enumerate(clips)
-        ]
+        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0][1].touching)))
+        for lane, (number, clip) in enumerate(clips):
+            own = jax.tree.map(lambda leaf, lane=lane: leaf[lane], results)
+            yield number, partial(self._finished, clip, own)
 
     def _shared(self, touching: tuple[Limb, ...]) -> tuple[Any, ...]:
         """Return the arguments of ``solve_lane`` that all lanes share."""
         smoothness = np.asarray(self.smoothness, self._build.start.dtype)
         return self._body_that(touching), self.profile.weights, self.limits, np.asarray(self.max_iterations), smoothness
 
-    def _made_by_a_core(self, checked: _Checked) -> Retargeted:
-        """Retarget one checked clip in one thread; compiled code needs no GIL, so threads take clips side by side."""
-        clip = self._read(*checked)
-        return self._made(clip, shared_length(clip))
-
     def _made(self, clip: Clip, length: int) -> Retargeted:
         """Retarget one clip by a program for ``length`` frames."""
         solved = solve_lane(as_lane(clip, length), *self._shared(clip.touching))
         return self._finished(clip, jax.tree.map(np.asarray, solved))
+
+    def _read_and_made(self, read: Callable[[], Clip]) -> Retargeted:
+        """Retarget one clip by a program for clips of similar length."""
+        clip = read()
+        return self._made(clip, shared_length(clip))
 
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
@@ -236,6 +205,10 @@ class Retargeter(OnRobot):
         return dataclasses.replace(
             made, iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches
         )
+
+
+def _raise(error: Exception) -> NoReturn:
+    raise error
 
 
 def retarget(

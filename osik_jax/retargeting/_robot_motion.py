@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from .._errors import OsikValueError
+from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot._mujoco import model_qpos
 from ..robot._tree import FREE
 from ._keypoints import load_arrays
-from ._motion import check_rate, finite_numbers, instants
+from ._motion import check_rate, instants
 from ._rotations import slerp
 
 
@@ -88,16 +89,12 @@ class RobotMotion:
             raise OsikValueError(f"{source}: a CSV holds numbers alone; say joint_names and fps")
         if not source.is_file():
             raise FileNotFoundError(f"no such file: {source}")
-        lines = enumerate(source.read_text(encoding="utf-8-sig").splitlines(), 1)
-        # a spreadsheet writes an empty line as commas
-        rows = [finite_numbers(source, number, line.split(",")) for number, line in lines if line.strip(" ,")]
         joints = len(joint_names)
-        fixed = bool(rows) and len(rows[0]) == joints
-        ragged = [number for number, row in enumerate(rows, 1) if len(row) != joints + 7 * (not fixed)]
-        if ragged:
-            raise OsikValueError(f"{source}, line {ragged[0]}: {len(rows[ragged[0] - 1])} numbers, not {7 + joints}")
-        values = np.array(rows).reshape(len(rows), -1)
-        base = [] if fixed else [0, 1, 2, 6, 3, 4, 5]
+        columns = read_columns(source, [str(k) for k in range(8 + joints)])  # one more, so that its number is told
+        if len(columns) not in (joints, 7 + joints):
+            raise OsikValueError(f"{source}, line 1: {len(columns)} numbers, not {7 + joints}")
+        values = np.stack([*columns.values()], -1)
+        base = [] if len(columns) == joints else [0, 1, 2, 6, 3, 4, 5]
         return cls(fps, tuple(joint_names), values[:, [*base, *range(len(base), values.shape[1])]])
 
     @property

@@ -10,9 +10,8 @@ import numpy as np
 
 from .._errors import OsikValueError, unknown_name
 from ..robot import Robot
-from ._contact import find_contact, find_noise
+from ._contact import find_contact, find_ground, find_noise, noise_steps
 from ._facing import facing_x
-from ._floor import Floor, find_floor
 from ._person import Person, bone_length, palm_axes, path_of
 from ._places import find_places
 from ._profile import Profile
@@ -105,15 +104,15 @@ class SourceMotion:
         if profile.walks:
             ankle = float(np.mean([upright[role][2] for role in ends]) - found.soles[0, :, 2].mean())
         standing, contact = found.standing[1:], self.motion.contact
-        floor = Floor(0.0)
+        down = np.zeros(3)
         points = {role: track[1:] for role, track in found.keypoints.items()}
         if profile.feet and contact is None:
             noise = find_noise(standing)
-            floor = find_floor(standing, fps, noise)
-            contact = find_contact(floor.leveled(standing, fps), fps, 0.0, noise=noise)
+            down[2] = find_ground(standing, noise_steps(noise, fps))
+            contact = find_contact(standing, fps, down[2], noise=noise)
         if len(profile.feet) == 2:
             points |= {role: standing[:, k] for k, role in enumerate(profile.standing)}
-        points = {role: floor.leveled(track, fps) for role, track in points.items()}
+        points = {role: track - down for role, track in points.items()}
         turns = found.turns[1:] @ np.swapaxes(found.turns[0], -1, -2)
         if profile.is_hand:
             turns[:, :2] = palm_axes(points)[:, None]

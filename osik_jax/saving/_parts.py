@@ -198,14 +198,12 @@ def collision_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, An
 def collision_arguments(given: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
     """Return the constructor's arguments of data, and the pairs that were left out.
 
-    The pairs are those that were kept, so the constructor leaves none out (``q0_distance=-inf``). Data of a session may
-    have globs as pairs and an ``exclude``.
+    The pairs are those that were kept, so the constructor leaves none out (``q0_distance=-inf``).
     """
     arguments = {"q0_distance": -np.inf, **given}
     left_out = tuple((first, second) for first, second in arguments.pop("left_out", ()))
-    for name in ("pairs", "exclude"):
-        if name in arguments:
-            arguments[name] = [tuple(pair) for pair in arguments[name]]
+    if "pairs" in arguments:
+        arguments["pairs"] = [tuple(pair) for pair in arguments["pairs"]]
     arguments["shapes"] = {name: _shape(one) for name, one in arguments.get("shapes", {}).items()}
     return arguments, left_out
 

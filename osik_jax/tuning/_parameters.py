@@ -45,13 +45,6 @@ class Parameter:
     initial: float | None = None
 
 
-class _Slot(eqx.Module):
-    """Place of some entries of the parameter vector: a leaf of the loop, and indices into its raveled array."""
-
-    leaf: int = eqx.field(static=True)
-    places: tuple[int, ...] = eqx.field(static=True)
-
-
 class ParameterSpace(eqx.Module):
     """A loop's parameters as one unbounded vector with entries of similar size.
 
@@ -75,7 +68,7 @@ class ParameterSpace(eqx.Module):
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
-    slots: tuple[_Slot, ...] = eqx.field(static=True)
+    places: tuple[tuple[int, int], ...] = eqx.field(static=True)  # a leaf of the loop and an index into it, raveled
     log: Bool[Array, " p"]
     lower: Float[Array, " p"]
     upper: Float[Array, " p"]
@@ -90,9 +83,8 @@ class ParameterSpace(eqx.Module):
         numbers = [np.asarray(leaf) for leaf in jax.tree.leaves(eqx.filter(loop, is_number))]
         entries = _entries(loop.names, numbers, [_as_parameter(p) for p in parameters])
         self.names = tuple(entry.name for entry in entries)
-        leaves = dict.fromkeys(entry.leaf for entry in entries)
-        self.slots = tuple(_Slot(leaf, tuple(e.place for e in entries if e.leaf == leaf)) for leaf in leaves)
-        dtype = jnp.result_type(*(numbers[leaf].dtype for leaf in leaves))
+        self.places = tuple((entry.leaf, entry.place) for entry in entries)
+        dtype = jnp.result_type(*(numbers[entry.leaf].dtype for entry in entries))
         self.log = jnp.asarray([entry.log for entry in entries])
         self.lower, self.upper, self.scale, start = (
             jnp.asarray([getattr(entry, field) for entry in entries], dtype)
@@ -131,13 +123,11 @@ class ParameterSpace(eqx.Module):
         """Return the loop with the numbers of a vector; differentiable in both."""
         numbers, rest = eqx.partition(loop, is_number)
         leaves, structure = jax.tree.flatten(numbers)
-        values, start = self.numbers(vector), 0
-        for slot in self.slots:
-            own = values[start : start + len(slot.places)]
-            start += len(slot.places)
-            old = jnp.asarray(leaves[slot.leaf])
-            new = old.ravel().at[np.asarray(slot.places)].set(own.astype(old.dtype))
-            leaves[slot.leaf] = new.reshape(old.shape)
+        values, places = self.numbers(vector), np.array(self.places)
+        for leaf in np.unique(places[:, 0]):
+            rows, old = np.flatnonzero(places[:, 0] == leaf), jnp.asarray(leaves[leaf])
+            new = old.ravel().at[places[rows, 1]].set(values[rows].astype(old.dtype))
+            leaves[leaf] = new.reshape(old.shape)
         return eqx.combine(jax.tree.unflatten(structure, leaves), rest)
 
     def by_name(self, vector: Float[Array, " p"]) -> dict[str, float]:
@@ -173,23 +163,14 @@ def _entries(names: tuple[str, ...], numbers: list[np.ndarray], parameters: list
             if leaf in taken:
                 raise OsikValueError(f"{names[leaf]} is tuned twice, by {taken[leaf]!r} and by {parameter.name!r}")
             taken[leaf] = parameter.name
-            entries += _entries_of_leaf(names[leaf], leaf, numbers[leaf], parameter)
+            value = numbers[leaf]
+            for place in np.flatnonzero(np.isfinite(value)).tolist():
+                at = ", ".join(str(i) for i in np.unravel_index(place, value.shape))
+                label = f"{names[leaf]}[{at}]" if value.ndim else names[leaf]
+                entries.append(_entry(label, leaf, place, float(value.ravel()[place]), parameter))
     if not entries:
         raise OsikValueError(f"there is no finite number to tune; numbers: {', '.join(names)}")
-    return sorted(entries, key=lambda entry: list(taken).index(entry.leaf))
-
-
-def _entries_of_leaf(name: str, leaf: int, value: np.ndarray, parameter: Parameter) -> list[_Entry]:
-    places = np.flatnonzero(np.isfinite(value)).tolist()
-    labels = [name if value.ndim == 0 else f"{name}[{_index(place, value.shape)}]" for place in places]
-    return [
-        _entry(label, leaf, place, float(value.ravel()[place]), parameter)
-        for label, place in zip(labels, places, strict=True)
-    ]
-
-
-def _index(place: int, shape: tuple[int, ...]) -> str:
-    return ", ".join(str(i) for i in np.unravel_index(place, shape))
+    return entries
 
 
 def _entry(name: str, leaf: int, place: int, value: float, parameter: Parameter) -> _Entry:
@@ -220,7 +201,7 @@ def _is_log(name: str, start: float, low: float) -> bool:
 
 def overlap(space: ParameterSpace, loop: Loop, values: Mapping[str, Any]) -> None:
     """Raise ValueError if scenarios set a tuned number."""
-    tuned = {slot.leaf for slot in space.slots}
+    tuned = {leaf for leaf, _ in space.places}
     for name in values:
         both = [loop.names[leaf] for leaf in find_leaves(loop.names, name) if leaf in tuned]
         if both:

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -46,7 +46,6 @@ def animate(
     caption: str = "",
     azimuth: float = 28.0,
     elevation: float = 13.0,
-    progress: Callable[[float], None] | None = None,
 ) -> Path:
     """Write a film of a motion as GIF or MP4, by ray casting, without a display.
 
@@ -67,7 +66,6 @@ def animate(
         caption: a line at the top.
         azimuth: of the camera about the vertical, 0 from +x [deg].
         elevation: of the camera above the horizon [deg].
-        progress: called with the part that is done, 0 to 1.
 
     Returns:
         The path written.
@@ -96,7 +94,7 @@ def animate(
         azimuth,
         elevation,
     )
-    pictures = film.pictures(progress or (lambda done: None))
+    pictures = film.pictures()
     if path.suffix == ".gif":
         write_gif(path, pictures, stride * dt)
     else:
@@ -198,14 +196,13 @@ class _Film:
             place = (0.60, bottom, 0.38, 0.29)
             self._panels.append(CurvePanel(self._canvas, place, title, self._time, values, dashed))
 
-    def pictures(self, progress: Callable[[float], None]) -> Iterator[np.ndarray]:
+    def pictures(self) -> Iterator[np.ndarray]:
         """Yield the pictures, (height, width, 3) uint8; the stage is drawn ahead, one picture per core."""
         stages = (self._stage.pose([source]) for source in mujoco_poses(self._robot, self._q))
         layers = (self._floor_layer(frame) for frame in range(len(self._q)))
         for frame, base in enumerate(self._draw(zip(stages, layers, strict=True))):
             self._move(frame)
             yield paint_over(base, self._canvas.picture())
-            progress((frame + 1) / len(self._q))
 
     def _draw(self, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
         """Yield pictures of the stage in order."""

@@ -1,35 +1,15 @@
-"""Size of a robot, its lowest point, and its floor height."""
+"""Lowest point of a robot, and its floor height."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from ..robot import Robot
-from ..robot._mujoco import mujoco_poses
-from ._parts import RobotParts, robot_parts
-
-
-class Outline(NamedTuple):
-    """Dimensions of a robot at one configuration."""
-
-    size: float  # diagonal of a box about all that is drawn of it [m]
-    lowest: float  # height of its lowest point [m]
-    base: float  # height of the lowest point of what is fixed to the world, 0 where nothing of that is drawn [m]
-
-
-def robot_outline(robot: Robot, q: ArrayLike) -> Outline:
-    """Return the dimensions of a robot at a configuration, (nq,)."""
-    shape = robot_parts(robot)
-    data = next(mujoco_poses(robot, q))
-    heights = lowest_points(shape, data)
-    size = float(np.linalg.norm(np.ptp(shape.corners(data), axis=0)))
-    return Outline(size, float(heights.min()), _base_height(shape, heights))
+from ._parts import RobotParts
 
 
 def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
@@ -39,7 +19,8 @@ def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, "
     return position[:, 2] - np.array([part.reach(way) for part, way in zip(shape.parts, down, strict=True)])
 
 
-def _base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> float:
+def base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> float:
+    """Return the height of the lowest point of what is fixed to the world [m]; 0 where nothing of that is drawn."""
     base = heights[shape.model.body_weldid[shape.bodies] == 0]
     return float(base.min()) if len(base) else 0.0
 
@@ -52,4 +33,4 @@ def floor_height(robot: Robot, shape: RobotParts, poses: Iterable[mujoco.MjData]
     first, *others = (lowest_points(shape, data) for data in poses)
     if robot.floating_base:
         return float(first.min())
-    return min(_base_height(shape, first), *(float(heights.min()) for heights in (first, *others)))
+    return min(base_height(shape, first), *(float(heights.min()) for heights in (first, *others)))

@@ -1,7 +1,5 @@
 """The command line: what it prints, and how it refuses."""
 
-import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +18,6 @@ import osik_jax as osik
 from osik_jax import cli
 from osik_jax._progress import spoken
 from osik_jax.cli._pose_file import read_pose_file
-from osik_jax.demo import _demo
 
 ARM_FILE = str(MJCF / "three_joints.xml")
 
@@ -46,7 +43,7 @@ def test_help_names_commands_and_options(capsys):
     with pytest.raises(SystemExit):
         cli.main(["demo", "--help"])
     said = capsys.readouterr().out
-    for option in ("motion", "robot", "frame", "support", "duration", "frequency", "schemes", "out"):
+    for option in ("motion", "physics", "duration", "frequency", "schemes", "out"):
         assert f"--{option}" in said
     assert "--no-animation" in said
 
@@ -73,9 +70,23 @@ def test_info_of_the_system_says_which_core_is_loaded(capsys):
     assert "--system" in refused(capsys, "info")
 
 
+@pytest.mark.slow
+def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    picture = tmp_path / "spheres.png"
+    assert cli.main(["info", "ur5", "--spheres", "--png", str(picture)]) == 0
+    printed = capsys.readouterr().out
+    assert "upper_arm_link:0" in printed and "no surface is uncovered" in printed
+    pixels = np.asarray(Image.open(picture).convert("RGB"), int)
+    orange = (pixels[..., 0] > pixels[..., 2] + 60).mean(0)  # the spheres are in the right half
+    assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
+    assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
+    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
+
+
 def test_missing_and_broken_files_are_named(capsys, tmp_path):
     assert "no such file: gone.urdf" in refused(capsys, "info", "gone.urdf")
-    assert "gone.xml" in refused(capsys, "demo", "--robot", "gone.xml")
+    assert "gone.xml" in refused(capsys, "view", "--robot", "gone.xml")
     broken = tmp_path / "broken.urdf"
     broken.write_text("<robot name='x'><link")
     assert "broken.urdf" in refused(capsys, "info", str(broken))
@@ -88,45 +99,25 @@ def _written(path, text):
 
 
 def test_unknown_frames_are_listed(capsys):
-    line = refused(capsys, "demo", "--robot", ARM_FILE, "--frame", "tol")
+    line = refused(capsys, "ik", ARM_FILE, "--frame", "tol", "--position", "0", "0", "0")
     assert "'tol'" in line and "did you mean 'tool'" in line and "base, a, b, c" in line
-    assert "'foot'" in refused(capsys, "demo", "--robot", ARM_FILE, "--support", "foot")
-    assert "both move and stand" in refused(capsys, "demo", "--robot", ARM_FILE, "--frame", "c", "--support", "c")
 
 
 def test_options_that_make_no_sense_are_explained(capsys):
-    assert "--robot" in refused(capsys, "demo", "--frame", "torso")
     assert "--frequency is 0" in refused(capsys, "demo", "--frequency", "0")
     assert "two control steps" in refused(capsys, "demo", "--duration", "0")
-    line = refused(capsys, "demo", "--robot", ARM_FILE, "--motion", "single-support")
-    assert "--motion single-support is NAO's" in line and "--frame" in line
     assert "--base goes with a file" in refused(capsys, "info", "nao", "--base", "fixed")
 
 
 def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):
     blocked = _written(tmp_path / "file", "")
-    line = refused(capsys, "demo", "--robot", ARM_FILE, "--out", str(blocked / "out"))
+    line = refused(capsys, "demo", "--out", str(blocked / "out"))
     assert str(blocked) in line
-
-
-def test_folders_that_cannot_take_the_files_are_found_before_the_work(capsys, tmp_path, monkeypatch):
-    """No file can be made in /proc, not even by root; a disk with hardly any room is told apart."""
-
-    def worked(*args, **kwargs):
-        raise AssertionError("the work has begun")
-
-    monkeypatch.setattr(_demo, "run_demo", worked)
-    if os.path.isdir("/proc/self"):
-        assert "cannot write to /proc" in refused(capsys, "demo", "--robot", ARM_FILE, "--out", "/proc")
-    free = shutil.disk_usage(tmp_path)._replace(free=3_000_000)
-    monkeypatch.setattr(_demo.shutil, "disk_usage", lambda path: free)
-    line = refused(capsys, "demo", "--robot", ARM_FILE, "--out", str(tmp_path / "out"))
-    assert "has 3.0 MB of room left" in line and "MB are needed" in line
 
 
 def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path):
     """The system refuses to write files of more than 32 kB: smaller than the comparison."""
-    words = ["demo", "--robot", ARM_FILE, "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
+    words = ["demo", "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
     with files_of_at_most(32_000):
         code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
     told = capsys.readouterr().err.strip().splitlines()
@@ -137,7 +128,7 @@ def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path):
 @pytest.mark.slow
 def test_an_interrupt_ends_in_one_line(tmp_path):
     """Ctrl-C once the title has been told."""
-    words = [sys.executable, "-m", "osik_jax.cli", "demo", "--robot", ARM_FILE, "--duration", "60", "--out"]
+    words = [sys.executable, "-m", "osik_jax.cli", "demo", "--duration", "60", "--out"]
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts in the background ignores it
     with subprocess.Popen(
         [*words, str(tmp_path / "out")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, bufsize=1
@@ -146,7 +137,7 @@ def test_an_interrupt_ends_in_one_line(tmp_path):
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
         told = process.stderr.read().strip().splitlines()
-    assert "sways" in first
+    assert "NAO in double support" in first
     assert process.returncode == 130 and len(told) == 1 and told[0].startswith("osik: interrupted")
 
 
@@ -176,18 +167,6 @@ def test_info_lists_joints_limits_frames_and_mass(capsys):
     expected = [robot.joint_qpos_index("LKneePitch"), dof, robot.position_lower[dof], robot.position_upper[dof]]
     np.testing.assert_allclose(numbers[:4], np.asarray(expected, float), atol=5e-5)
     assert numbers[4] == pytest.approx(float(robot.velocity_limit[dof]), abs=5e-5)
-
-
-@pytest.mark.release
-def test_demo_of_a_file_writes_its_folder(capsys, tmp_path):
-    out = tmp_path / "out"
-    words = f"demo --robot {ARM_FILE} --duration 1.0 --frequency 50 --schemes hierarchical --picture --out {out}"
-    assert cli.main(words.split()) == 0
-    written = {"motion.gif", "comparison.png", "motion.npz", "picture.png"}
-    assert {path.name for path in out.iterdir()} >= written
-    assert np.load(out / "motion.npz")["v_hierarchical"].shape[0] == 50
-    printed = capsys.readouterr().out
-    assert "Hierarchical QP" in printed and "hand" in printed
 
 
 def test_ik_finds_a_configuration_or_says_what_stops_it(arm, capsys):
@@ -232,20 +211,6 @@ def test_names_with_brackets_are_printed_as_they_are(tmp_path, capsys):
     assert "j[left]" in said and "[/x]" in said and "u[b].urdf" in said.replace("\n", "")
     assert cli.main(["ik", str(path), "--frame", "[/x]", "--position", "0", "0", "0"]) == 1
     assert "j[left]" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    picture = tmp_path / "spheres.png"
-    assert cli.main(["info", "ur5", "--spheres", "--png", str(picture)]) == 0
-    printed = capsys.readouterr().out
-    assert "upper_arm_link:0" in printed and "no surface is uncovered" in printed
-    pixels = np.asarray(Image.open(picture).convert("RGB"), int)
-    orange = (pixels[..., 0] > pixels[..., 2] + 60).mean(0)  # the spheres are in the right half
-    assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
-    assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
-    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
 
 
 def test_poses_are_read_with_a_head_in_any_order_and_without_one(tmp_path):

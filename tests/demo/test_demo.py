@@ -16,11 +16,9 @@ import osik_jax as osik
 from osik_jax.demo import _nao
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import Figure, comparison, figures, table
-from osik_jax.demo._file import guess_moving_frame
 from osik_jax.demo._motion import Path, Stroke, minimum_jerk
 from osik_jax.demo._observed import observe
 from osik_jax.demo._run import Run, make_scheme, run_scheme
-from osik_jax.robot._feet import guess_feet
 
 DT = 0.005
 FEET = ("l_sole", "r_sole")
@@ -227,12 +225,6 @@ def test_comparison_draws_the_curves_it_gets(tmp_path):
     assert np.ptp(steady.get_ylim()) >= 0.1 and zero.get_ylim() == pytest.approx((1e-5, 1e-3))
     with Image.open(tmp_path / "f.png") as picture:
         assert picture.size == tuple(round(x) for x in page.get_size_inches() * page.dpi)
-
-
-def test_feet_and_hands_are_guessed(nao):
-    assert guess_feet(nao) == ("l_sole", "r_sole")
-    assert guess_moving_frame(nao) == "torso"
-    assert guess_moving_frame(osik.load_robot("arm7")) == "hand"
 
 
 def test_unknown_schemes_are_refused():

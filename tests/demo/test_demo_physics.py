@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from osik_jax import cli
 from osik_jax.demo import _nao
 from osik_jax.demo._demo import run_demo
 from osik_jax.demo._figures import figures
@@ -94,8 +93,3 @@ def test_files_hold_what_was_recorded(lift):
     arrays = np.load(folder / "motion.npz")
     np.testing.assert_array_equal(arrays["q_weighted"], run.recording.q)
     np.testing.assert_array_equal(arrays["contact_forces_weighted"], run.recording.contact_forces)
-
-
-def test_physics_of_a_file_is_refused(capsys, tmp_path):
-    assert cli.main(["demo", "--physics", "--robot", "arm7", "--out", str(tmp_path)]) == 2
-    assert "osik_jax.physics" in capsys.readouterr().err

@@ -1,9 +1,9 @@
 """Files as data sets have them, made here: names, tree, units, axes, rest poses and rates of each.
 
 The conventions are those of: LAFAN1 (ubisoft-laforge-animation-dataset), Bandai-Namco-Research-Motiondataset 1 and 2
-(their BVH files), SOMA (NVIDIA's soma-retargeter and its BVH files), the CMU database (mocap.cs.cmu.edu, ASF and AMC),
-MediaPipe (guide of the pose landmarker, "world landmarks"), Human3.6M (17 joints of VideoPose3D) and Kinect for Windows
-v1 and v2 (documentation of JointType and CameraSpacePoint).
+(their BVH files), SOMA (NVIDIA's soma-retargeter and its BVH files), MediaPipe (guide of the pose landmarker, "world
+landmarks"), Human3.6M (17 joints of VideoPose3D) and Kinect for Windows v1 and v2 (documentation of JointType and
+CameraSpacePoint).
 """
 
 import dataclasses
@@ -22,7 +22,6 @@ from motion_files import (
     with_rest,
     write_bvh,
 )
-from scipy.spatial.transform import Rotation
 from small_robots import quietly, robot_of
 
 import osik_jax as osik
@@ -263,105 +262,3 @@ def test_the_path_of_noisy_poses_is_smooth_and_feet_stand():
     assert np.abs(np.diff(person.root - middle, axis=0)).max() < 0.03
     assert (person.contact == truth.contact).mean() > 0.9
     np.testing.assert_allclose(person.contact.mean(0), truth.contact.mean(0), atol=0.06)
-
-
-CMU_TREE = {  # bones of the CMU database's skeletons: parent and degrees of freedom
-    "lhipjoint": ("root", ""), "lfemur": ("lhipjoint", "rx ry rz"),
-    "ltibia": ("lfemur", "rx"),
-    "lfoot": ("ltibia", "rx rz"), "ltoes": ("lfoot", "rx"),
-    "rhipjoint": ("root", ""), "rfemur": ("rhipjoint", "rx ry rz"),
-    "rtibia": ("rfemur", "rx"), "rfoot": ("rtibia", "rx rz"),
-    "rtoes": ("rfoot", "rx"), "lowerback": ("root", "rx ry rz"),
-    "upperback": ("lowerback", "rx ry rz"), "thorax": ("upperback", "rx ry rz"),
-    "lowerneck": ("thorax", "rx ry rz"), "upperneck": ("lowerneck", "rx ry rz"),
-    "head": ("upperneck", "rx ry rz"), "lclavicle": ("thorax", "ry rz"),
-    "lhumerus": ("lclavicle", "rx ry rz"), "lradius": ("lhumerus", "rx"),
-    "lwrist": ("lradius", "ry"), "lhand": ("lwrist", "rx rz"), "lfingers": ("lhand", "rx"),
-    "lthumb": ("lhand", "rx rz"), "rclavicle": ("thorax", "ry rz"),
-    "rhumerus": ("rclavicle", "rx ry rz"), "rradius": ("rhumerus", "rx"),
-    "rwrist": ("rradius", "ry"), "rhand": ("rwrist", "rx rz"), "rfingers": ("rhand", "rx"),
-    "rthumb": ("rhand", "rx rz"),
-}  # fmt: skip
-CMU_BONES = {  # of a person of the same height as the figure: vector to the end of the bone [m], axes [deg]
-    "lhipjoint": ((0.09, -0.08, 0.03), (0, 0, 0)), "lfemur": ((0.14, -0.39, 0.0), (0, 0, 20)),
-    "ltibia": ((0.13, -0.36, 0.0), (0, 0, 20)), "lfoot": ((0.01, -0.03, 0.13), (-90, 7, 20)),
-    "ltoes": ((0.0, 0.0, 0.06), (-90, 7, 20)), "lowerback": ((0.0, 0.11, 0.0), (0, 0, 0)),
-    "upperback": ((0.0, 0.11, 0.01), (0, 0, 0)), "thorax": ((0.0, 0.11, 0.0), (0, 0, 0)),
-    "lowerneck": ((0.0, 0.08, 0.0), (0, 0, 0)), "upperneck": ((0.0, 0.08, 0.01), (0, 0, 0)),
-    "head": ((0.0, 0.08, 0.0), (0, 0, 0)), "lclavicle": ((0.17, 0.04, 0.0), (0, 0, 0)),
-    "lhumerus": ((0.27, 0.0, 0.0), (180, 30, 90)), "lradius": ((0.16, 0.0, 0.0), (180, 30, 90)),
-    "lwrist": ((0.09, 0.0, 0.0), (180, 30, 90)), "lhand": ((0.04, 0.0, 0.0), (180, 30, 90)),
-    "lfingers": ((0.04, 0.0, 0.0), (180, 30, 90)), "lthumb": ((0.03, 0.0, 0.03), (-90, 60, 0)),
-}  # fmt: skip
-
-
-def cmu_bone(name):
-    if name in CMU_BONES:
-        return CMU_BONES[name]
-    (x, y, z), (a, b, c) = CMU_BONES["l" + name[1:]]
-    return (-x, y, z), (a, -b, -c)
-
-
-def test_cmu(tmp_path):
-    """A walk-like motion in ASF and AMC as the database has them, beside SciPy's rotations bone by bone."""
-    unit, rng, frames = 0.0254 / 0.45, np.random.default_rng(5), 6
-    asf = ["# AST/ASF file", ":version 1.10", ":name VICON", ":units", "  mass 1.0", "  length 0.45", "  angle deg",
-           ":documentation", "   made for a test", ":root", "   order TX TY TZ RX RY RZ", "   axis XYZ",
-           "   position 0 0 0", "   orientation 0 0 0", ":bonedata"]  # fmt: skip
-    for number, name in enumerate(CMU_TREE, 1):
-        along, axes = cmu_bone(name)
-        length = np.linalg.norm(along)
-        asf += ["  begin", f"     id {number}", f"     name {name}",
-                f"     direction {' '.join(repr(float(x / length)) for x in along)}",
-                f"     length {float(length) / unit!r}", f"     axis {' '.join(map(str, axes))}  XYZ"]  # fmt: skip
-        dofs = CMU_TREE[name][1].split()
-        if dofs:
-            asf += [
-                f"    dof {' '.join(dofs)}",
-                f"    limits {'(-160.0 20.0)'}",
-                *["           (-70.0 70.0)"] * (len(dofs) - 1),
-            ]
-        asf += ["  end"]
-    asf += [":hierarchy", "  begin"]
-    for parent in dict.fromkeys(("root", *(parent for parent, _ in CMU_TREE.values()))):
-        asf.append(" ".join(["    " + parent, *(name for name, own in CMU_TREE.items() if own[0] == parent)]))
-    (tmp_path / "07.asf").write_text("\n".join([*asf, "  end"]) + "\n")
-    amc, truth = ["#!OML:ASF F:\\VICON\\07.ASF", ":FULLY-SPECIFIED", ":DEGREES"], {name: [] for name in CMU_TREE}
-    for frame in range(frames):
-        place, hips = np.array([0.0, 0.95, 0.1 * frame]), rng.uniform(-8, 8, 3)
-        amc += [str(frame + 1), " ".join(["root", *map(repr, (place / unit).tolist()), *map(repr, hips.tolist())])]
-        turns, ends = {"root": Rotation.from_euler("xyz", hips, degrees=True)}, {"root": place}
-        for name, (parent, dofs) in CMU_TREE.items():
-            values = dict(zip(dofs.split(), rng.uniform(-15, 15, 3), strict=False))
-            along, axes = cmu_bone(name)
-            own = Rotation.from_euler("xyz", axes, degrees=True)
-            local = Rotation.from_euler("xyz", [values.get(f"r{axis}", 0.0) for axis in "xyz"], degrees=True)
-            turns[name] = turns[parent] * own * local * own.inv()
-            truth[name].append(ends[parent])
-            ends[name] = ends[parent] + turns[name].apply(along)
-            amc += [" ".join([name, *map(repr, map(float, values.values()))])] if dofs else []
-    (tmp_path / "07_01.amc").write_text("\n".join(amc) + "\n")
-    motion = load_motion(tmp_path / "07_01.amc")
-    for name, track in truth.items():
-        np.testing.assert_allclose(motion.track(name), np.array(track)[:, [2, 0, 1]], atol=1e-9, err_msg=name)
-    roles = find_roles(motion.joint_names)
-    parts = dict(hip="femur", knee="tibia", ankle="foot", toe="toes", shoulder="humerus", elbow="radius", wrist="wrist")
-    expected = {f"{side}_{part}": side[0] + name for side in SIDES.values() for part, name in parts.items()}
-    assert roles == expected | dict(pelvis="root", chest="upperback", neck="lowerneck", head="head")
-    person = seen(motion)
-    assert 1.2 < person.points["head"][:, 2].max() < 1.7 and (person.pelvis[:, 2, 2] > 0.9).all()
-    assert (person.points["left_hip"] - person.points["right_hip"] > 0.1)[:, 1].all()
-    assert motion.fps == 120.0
-    file = tmp_path / "07_01.amc"
-    text = file.read_text()
-    for changed, message in (
-        (text.replace("lfemur ", "lfemur x ", 1), "line 1?[0-9]: lfemur with 4"),
-        (":DEGREES\n", "has no frames"),
-        (text.replace("ltibia", "nothing", 1), "nothing with 1 numbers is not expected here"),
-    ):
-        file.write_text(changed)
-        with pytest.raises(ValueError, match=message):
-            load_motion(file)
-    (tmp_path / "07.asf").unlink()
-    with pytest.raises(ValueError, match=r"needs its skeleton, an .asf file beside it; there are 0"):
-        load_motion(file)

@@ -21,7 +21,6 @@ from osik_jax.retargeting import (
     report,
     save_profile,
 )
-from osik_jax.retargeting._hand import is_other_hand
 from osik_jax.retargeting._person import palm_axes
 from osik_jax.retargeting._roles import FINGERS, HAND
 from osik_jax.retargeting._skeletons import find_roles
@@ -199,34 +198,6 @@ def test_fingers_are_found_and_reach_what_a_search_reaches(names, options, axes)
         own = np.sqrt((errors[frame] ** 2).mean())
         # a search frame by frame may jump, so it may be better where tips are out of reach
         assert own < 1.2 * best + 5e-4
-
-
-def mirrored(motion):
-    """The other hand's motion, carried as a whole."""
-    turn = Rotation.from_euler("xyz", [40, -20, 70], degrees=True).as_matrix()
-    return dataclasses.replace(motion, positions=motion.positions * [-1.0, 1.0, 1.0] @ turn.T)
-
-
-@pytest.mark.parametrize("names", [{f: f for f in FINGERS}, {f: f"link_{k}" for k, f in enumerate(FOUR)}, SHADOW])
-def test_the_hand_of_the_other_side_is_told(names):
-    robot = hand_of(names, wrist=WRIST if names is SHADOW else "")
-    profile = quietly(guess_profile, robot)
-    for motion in (person((0.8, 0.9, 0.5)), person((0.2, 0.1, 0.0))):
-        for clip, is_other in ((motion, False), (mirrored(motion), True)):
-            points = {name: clip.positions[:, k] for k, name in enumerate(clip.joint_names)}
-            assert is_other_hand(robot, profile, points) is is_other
-    flat = person((0.0, 0.0, 0.0))  # of a flat hand nobody knows
-    points = {name: flat.positions[:, k] for k, name in enumerate(flat.joint_names)}
-    for finger in FINGERS:
-        way = points[f"{finger}_1"] - points["wrist"]
-        points |= {f"{finger}_{k}": points[f"{finger}_1"] + 0.3 * (k - 1) * way for k in (2, 3, 4)}
-    assert not is_other_hand(robot, profile, points)
-
-
-def test_the_note_on_the_other_hand(hand, profile):
-    for motion, told in ((person((0.8, 0.9, 0.5)), 0), (mirrored(person((0.8, 0.9, 0.5))), 1)):
-        figures = report(Retargeter(hand, profile=profile, max_iterations=3).retarget(motion))
-        assert sum("mirror the clip" in note for note in figures["notes"]) == told
 
 
 def test_what_is_no_hand():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from osik_jax.retargeting._contact import HEIGHT, find_contact, find_ground, find_noise, noise_steps
-from osik_jax.retargeting._floor import Floor, find_floor
 
 RATES = (30.0, 60.0, 120.0)
 STANCE, SWING, STRIDE, LIFT = 0.6, 0.4, 0.8, 0.12
@@ -79,34 +78,3 @@ def test_clips_of_few_frames():
     assert find_noise(one) == 0.0 and not find_contact(one, 30.0, 0.0, noise=0.01).any()
     few = np.zeros((3, 4, 3))
     assert find_contact(few, 30.0, 0.0, noise=0.01).all()
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.005])
-@pytest.mark.parametrize("fps", RATES)
-@pytest.mark.parametrize(("slope", "drift"), [((0.0175, 0.0), 0.0), ((0.0, 0.0), 0.03), ((-0.03, 0.0), 0.02)])
-def test_a_floor_that_tilts_or_drifts_is_found_by_what_stands_on_it(noise, fps, slope, drift):
-    points, truth = steps(fps)
-    # what tilts along the way of a straight walk and what drifts as it goes on are one thing: here it turns back
-    half = len(points) // 2
-    back = np.concatenate([points[:half], points[: len(points) - half][::-1]])
-    stands = np.concatenate([truth[:half], truth[: len(points) - half][::-1]])
-    real = Floor(0.3, slope, drift)
-    moved = back + 0.0
-    moved[..., 2] += real.under(back, fps)
-    moved += noise * np.random.default_rng(0).standard_normal(moved.shape)
-    found = find_floor(moved, fps, find_noise(moved))
-    np.testing.assert_allclose(found.under(back, fps), real.under(back, fps) + 0.01, atol=0.25 * HEIGHT)
-    contact = find_contact(found.leveled(moved, fps), fps, 0.0, noise=find_noise(moved))
-    assert (contact & stands).sum() > 0.9 * stands.sum()
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.01])
-def test_a_floor_is_flat_where_that_explains_what_stands(noise):
-    points = steps(60.0)[0]
-    points = points + noise * np.random.default_rng(0).standard_normal(points.shape)
-    level = find_noise(points)
-    assert find_floor(points, 60.0, level) == Floor(find_ground(points, noise_steps(level, 60.0)))
-    # somebody who lies with the feet up and then stands has a flat floor, though what is still gets lower
-    points[:180, :, :] = points[0] + [0.0, 0.0, 0.5]
-    floor = find_floor(points, 60.0, level)
-    assert floor.slope == (0.0, 0.0) and floor.drift == 0.0

@@ -327,12 +327,13 @@ def test_a_table_comes_back(tmp_path):
         (lambda t: [t[0].replace("time", "seconds"), *t[1:]], "line 1: no column is called time"),
         (lambda t: [*t[:3], t[3].replace(",", ";", 1), *t[4:]], "line 4: 10 values, but there are 11 headings"),
         (lambda t: [*t[:3], t[3].rsplit(",", 1)[0] + ",yes", *t[4:]], "line 4, column contact.right_toe: 'yes'"),
-        (lambda t: [*t[:3], *t[4:]], "line 4: the time steps by 0.04 s"),
-        (lambda t: t[:1], "has 1 lines"),
-        (lambda t: [], "has 0 lines"),
-        (lambda t: [line.replace(",", ";") for line in t], "line 1: no column is called time"),
+        (lambda t: [*t[:3], *t[4:]], "frame 2: the time steps by 0.04 s"),
+        (lambda t: t[:1], "a head with different names and at least one line of numbers"),
+        (lambda t: [], "a head with different names and at least one line of numbers"),
+        (lambda t: t[:2], "has one frame; it needs two"),
+        (lambda t: [line.replace(",", ";") for line in t], "line 2, column time;hip.x;"),
         (lambda t: [*t[:3], '"' + t[3], *t[4:]], "line 4: 1 values, but there are 11 headings"),
-        (lambda t: [*t[:3], t[2], *t[4:]], "line 4: the time steps by 0 s, elsewhere by 0.02 s"),
+        (lambda t: [*t[:3], t[2], *t[4:]], "frame 2: the time steps by 0 s, elsewhere by 0.02 s"),
     ],
 )
 def test_a_broken_table_says_which_line_and_column(tmp_path, edit, message):
@@ -368,7 +369,7 @@ def test_positions_in_millimetres_are_told(tmp_path):
 def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_motion(tmp_path / "none.npz")
-    with pytest.raises(ValueError, match=r"none of \.bvh, \.amc, \.npz, \.csv"):
+    with pytest.raises(ValueError, match=r"none of \.bvh, \.npz, \.csv"):
         load_motion(tmp_path / "clip.fbx")
     with pytest.raises(FileNotFoundError, match="no such file: .*clips"):
         load_motion(tmp_path / "clips")

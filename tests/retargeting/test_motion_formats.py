@@ -1,4 +1,4 @@
-"""Files of other programs, made here: poses of SMPL as AMASS has them, and tables of OptiTrack's Motive."""
+"""Files of other programs, made here: poses of SMPL as AMASS has them, and tables that a spreadsheet saved."""
 
 import numpy as np
 import pytest
@@ -91,58 +91,6 @@ def test_broken_poses_are_told(tmp_path, change, message):
         load_motion(tmp_path / "broken.npz")
 
 
-BONES = {"Hips": "Hip", "Spine": "Ab", "Neck": "Neck", "Head": "Head"}
-BONES |= {
-    f"{side}{own}": f"{side[0]}{theirs}"
-    for side in ("Left", "Right")
-    for own, theirs in {
-        "Arm": "UArm", "ForeArm": "FArm", "Hand": "Hand", "UpLeg": "Thigh", "Leg": "Shin", "Foot": "Foot",
-        "ToeBase": "Toe",
-    }.items()
-}  # fmt: skip
-
-
-def motive_table(figure, unit="Millimeters", scale=1e-3, turns=True):
-    """The lines of a table as Motive writes it: a skeleton's bones, and a marker that does not count."""
-    positions, matrices = figure.forward()
-    quaternions = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat().reshape(*matrices.shape[:2], 4)
-    columns = [
-        ("Bone", f"Me:{BONES[name]}", kind, axis)
-        for name, _, _ in figure.joints
-        for kind, axes in ((("Rotation", "XYZW"),) if turns else ()) + (("Position", "XYZ"),)
-        for axis in axes
-    ]
-    columns += [("Marker", "Me:m1", "Position", axis) for axis in "XYZ"]  # fmt: skip
-    head = f"Format Version,1.23,Take Name,dance,Capture Frame Rate,{figure.fps},Export Frame Rate,{figure.fps},"
-    lines = [f"{head}Rotation Type,Quaternion,Length Units,{unit},Coordinate Space,Global", ""]
-    lines += [",".join(["", first, *(column[i] for column in columns)]) for i, first in ((0, "Type"), (1, "Name"))]
-    lines.append(",".join(["", "ID", *["1"] * len(columns)]))
-    lines.append(",".join(["", "", *(column[2] for column in columns)]))
-    lines.append(",".join(["Frame", "Time (Seconds)", *(column[3] for column in columns)]))
-    for f in range(len(positions)):
-        numbers = [x for j in range(len(figure.joints))
-                   for x in ([*quaternions[f, j]] if turns else []) + [*(positions[f, j] / scale)]]  # fmt: skip
-        lines.append(",".join([str(f), repr(f / figure.fps), *map(repr, map(float, numbers)), "", "", ""]))
-    return lines
-
-
-@pytest.mark.parametrize(("unit", "scale", "turns"), [("Millimeters", 1e-3, True), ("Meters", 1.0, False)])
-def test_tables_of_motive(tmp_path, unit, scale, turns):
-    figure = dancer(12)
-    file = tmp_path / "take.csv"
-    file.write_text("\n".join(motive_table(figure, unit, scale, turns)) + "\n")
-    motion = load_motion(file)
-    positions, matrices = figure.forward()
-    z_up = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # facing z becomes facing x
-    np.testing.assert_allclose(motion.positions, positions @ z_up.T, atol=1e-9)
-    assert motion.fps == figure.fps and len(find_roles(motion.joint_names)) >= 12
-    assert (motion.rotations is not None) == turns
-    if motion.rotations is not None:
-        turned = Rotation.from_quat(motion.rotations.reshape(-1, 4), scalar_first=True)
-        expected = z_up @ matrices.reshape(-1, 3, 3) @ z_up.T
-        np.testing.assert_allclose(turned.as_matrix(), expected, atol=1e-9)
-
-
 def as_saved_by_a_spreadsheet(lines):
     """All lines with as many cells as the longest: empty lines are commas, also after the last."""
     width = max(line.count(",") for line in lines)
@@ -151,15 +99,15 @@ def as_saved_by_a_spreadsheet(lines):
 
 def test_tables_that_a_spreadsheet_saved(tmp_path):
     file, figure = tmp_path / "take.csv", dancer(6)
-    for lines in (motive_table(figure), keypoint_table(figure)):
-        file.write_text("\n".join(lines) + "\n")
-        motion = load_motion(file)
-        saved = as_saved_by_a_spreadsheet([*lines, ",,"])
-        assert any(line and not line.strip(",") for line in saved)
-        file.write_text("\r\n".join(saved) + "\r\n", encoding="utf-8-sig")
-        again = load_motion(file)
-        assert again.joint_names == motion.joint_names and again.fps == motion.fps
-        np.testing.assert_array_equal(again.positions, motion.positions)
+    lines = keypoint_table(figure)
+    file.write_text("\n".join(lines) + "\n")
+    motion = load_motion(file)
+    saved = as_saved_by_a_spreadsheet([*lines, ",,"])
+    assert any(line and not line.strip(",") for line in saved)
+    file.write_text("\r\n".join(saved) + "\r\n", encoding="utf-8-sig")
+    again = load_motion(file)
+    assert again.joint_names == motion.joint_names and again.fps == motion.fps
+    np.testing.assert_array_equal(again.positions, motion.positions)
     robot = ["0,0,1,0,0,0,1,0.5", "0,0,1,0,0,0,1,0.6"]
     file.write_text("\r\n".join([*robot, ",,,,,,,"]) + "\r\n", encoding="utf-8-sig")
     np.testing.assert_array_equal(RobotMotion.load(file, joint_names=("knee",), fps=30.0).qpos[:, 7], [0.5, 0.6])
@@ -173,19 +121,3 @@ def keypoint_table(figure):
         [np.arange(len(positions)) / figure.fps, positions[..., [2, 0, 1]].reshape(len(positions), -1)]
     )
     return [",".join(headings), *(",".join(map(repr, row.tolist())) for row in rows)]
-
-
-def test_gaps_and_wrong_headings_of_motive_are_told(tmp_path):
-    lines, file = motive_table(dancer(5)), tmp_path / "take.csv"
-    cells = lines[8].split(",")
-    cells[6] = ""
-    for changed, message in (
-        ([*lines[:8], ",".join(cells), *lines[9:]], "line 9, column 7: no finite number; fill gaps"),
-        ([lines[0].replace("Millimeters", "Feet"), *lines[1:]], "line 1: Length Units is Feet"),
-        ([lines[0].replace("Global", "Local"), *lines[1:]], "line 1: Coordinate Space is Local; export it as Global"),
-        ([line.replace("Bone", "Marker") for line in lines], "has no bones; export a skeleton's bones"),
-        ([line for line in lines if not line.startswith("Frame")], "no line of headings that begins with Frame"),
-    ):
-        file.write_text("\n".join(changed) + "\n")
-        with pytest.raises(ValueError, match=message):
-            load_motion(file)

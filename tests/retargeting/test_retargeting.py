@@ -43,7 +43,7 @@ from osik_jax.retargeting._contact import find_contact, find_ground
 from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._fit import LOSS, _Setting
-from osik_jax.retargeting._folder import _Lengths, retarget_folder
+from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._link_shapes import shrunk
 from osik_jax.retargeting._notes import notes
 from osik_jax.retargeting._person import read_person
@@ -219,7 +219,7 @@ def test_the_centre_of_mass_stays_over_the_feet_where_that_is_asked_for(nao, lea
     alone = [retarget(nao, dataclasses.replace(leaning, contact=one_foot), balance=b).q for b in (None, 0.01)]
     np.testing.assert_allclose(alone[0], alone[1], atol=1e-9)
     out = tmp_path / "out"
-    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02", "--no-animation"]) == 0
+    assert cli.main(["retarget", str(dance), "--out", str(out), "--balance", "0.02"]) == 0
     assert json.loads((out / "report.json").read_text())["balance"]["com_margin_mm_min"] > 20.0 - 0.05
     capsys.readouterr()
 
@@ -251,11 +251,15 @@ def test_many_clips_give_what_each_gives_alone(nao, dance, danced, monkeypatch):
     np.testing.assert_allclose(together[0].q, danced.q, atol=1e-5)
     np.testing.assert_array_equal(together[2].q, together[0].q)
     np.testing.assert_allclose(together[1].q, own.retarget(short).q, atol=1e-5)
-    for one, other in zip(own.retarget_all([motion, short, motion], progress=False), together, strict=True):
+    alone = [own._made(own._prepared(clip, None, None), 32) for clip in (motion, short, motion)]
+    by_cores = own.retarget_all([motion, short, motion], progress=False)
+    for one, other, batched in zip(by_cores, alone, together, strict=True):
         np.testing.assert_array_equal(one.q, other.q)
         assert (one.iterations, one.cost) == (other.iterations, other.cost)
-    filled_up = own._solved([own._prepared(short, None, None)], 32, 2)[0]()
-    np.testing.assert_allclose(filled_up.q, together[1].q, atol=1e-12)
+        assert one.iterations == batched.iterations
+        np.testing.assert_allclose(one.q, batched.q, atol=1e-12)
+    ((_, filled_up),) = own._solved([(0, own._prepared(short, None, None))], 32, 2)
+    np.testing.assert_allclose(filled_up().q, together[1].q, atol=1e-12)
     with pytest.raises(ValueError, match="chunk is 0"):
         own.retarget_all([motion], chunk=0, progress=False)
     with pytest.raises(ValueError, match="short: .*it takes three"):
@@ -271,7 +275,7 @@ from osik_jax.retargeting import Retargeter, _lanes, _retarget, load_motion
 motion, own = load_motion(sys.argv[1]), Retargeter(osik.load_robot("nao"), max_iterations=3)
 motions = [motion, dataclasses.replace(motion, positions=motion.positions[::-1], rotations=None), motion]
 alone = [own.retarget(clip) for clip in motions]
-_lanes.cpu_is_default = _retarget.cpu_is_default = lambda: False  # as where there are GPUs
+_retarget.cpu_is_default = lambda: False  # as where there are GPUs
 over = []
 solve = _lanes._over_devices(5)
 _lanes._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
@@ -332,12 +336,13 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), monkeypatch.context() as one_core:
-        one_core.setattr("osik_jax.retargeting._folder.cores", lambda: 1)
+        one_core.setattr("osik_jax.retargeting._retarget.cores", lambda: 1)
         retarget_folder(Retargeter(nao), clips, out, progress=kill)
-    (first,) = out.glob("*/report.json")  # the longest, or the file that cannot be read
+    first = out / "dance" / "report.json"  # the longest
     before = first.stat().st_mtime_ns
     assert cli.main(["retarget", str(clips), "--out", str(out)]) == 1
     told, wrong = capsys.readouterr()
+    assert "no clips, and not read: notes.txt\n" in told
     assert "2 clips, 51 frames" in told and "osik: 1 of 3 clips failed" in wrong
     assert "broken: " in wrong and "line 1: a joint has the three columns NAME.x, NAME.y and NAME.z" in wrong
     assert first.stat().st_mtime_ns == before
@@ -352,7 +357,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     np.testing.assert_allclose(RobotMotion.load(out / "dance" / "motion.npz").qpos, danced.motion.qpos, atol=1e-5)
     # what is there is not made again, but where its file is another one now
     made = []
-    monkeypatch.setattr(Retargeter, "_solved", lambda own, clips, *more: made.append(len(clips)) or [])
+    monkeypatch.setattr(Retargeter, "_made", lambda own, clip, length: made.append(length))
     again = retarget_folder(Retargeter(nao), clips, out, progress=False)
     assert again == summary and made == []
 
@@ -364,7 +369,7 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     assert f"the same command goes on where it was ({out})" in capsys.readouterr().err
     with pytest.raises(ValueError, match=r"another job in it.*smoothness was 0\.0, is 0\.1"):
         retarget_folder(Retargeter(nao, smoothness=0.1), clips, out, progress=False)
-    with pytest.raises(ValueError, match=r"has no clips \(.bvh, .amc, .npz, .csv\); in it: dance, short"):
+    with pytest.raises(ValueError, match=r"has no clips \(.bvh, .npz, .csv\); in it: dance, short"):
         (out / "job.json").unlink()
         for path in [*out.glob("*.*")]:
             path.unlink()
@@ -380,7 +385,7 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     many.mkdir()
     names = np.array(motion.joint_names)
     np.savez(many / "dance.npz", fps=FPS, positions=motion.positions, joint_names=names, **held)
-    arguments = ["--no-animation", "--out", str(tmp_path / "out")]
+    arguments = ["--out", str(tmp_path / "out")]
     assert cli.main(["retarget", str(many / "dance.npz"), *arguments]) == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     figures = json.loads((tmp_path / "out" / "report.json").read_text())
@@ -395,13 +400,6 @@ def test_the_last_lines_say_what_gave_way_and_that_feet_hardly_stand(dance, danc
     assert cli.main(["retarget", str(many), *arguments[:-1], str(tmp_path / "all")]) == 0
     told = " ".join(capsys.readouterr().out.split())
     assert "note: dance: a bound gave way: " in told
-
-
-def test_clips_share_a_longer_program_until_that_costs_more_than_compiling():
-    lengths = _Lengths()
-    assert lengths.of(1024) == 1024
-    assert [lengths.of(64) for _ in range(33)] == [*[1024] * 31, 64, 64]  # 31 * 960 < 30,000 < 32 * 960
-    assert lengths.of(48) == 64 and lengths.of(896) == 1024 and lengths.of(2048) == 2048
 
 
 def test_the_last_pass_keeps_limits_whatever_the_plan(nao):
@@ -436,9 +434,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     out = tmp_path / "out"
     assert cli.main(["retarget", str(dance), "--out", str(out)]) == 0
     assert "written to" in capsys.readouterr().out
-    assert {path.name for path in out.iterdir()} == {
-        "motion.npz", "motion.csv", "motion.gif", "report.json", "profile.toml"
-    }  # fmt: skip
+    assert {path.name for path in out.iterdir()} == {"motion.npz", "motion.csv", "report.json", "profile.toml"}
     figures = json.loads((out / "report.json").read_text())
     assert figures["clip"] == "dance" and figures["feet"]["slip_mm_max"] < 0.01
     motion = RobotMotion.load(out / "motion.npz")
@@ -450,7 +446,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
 def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
     clip = write_bvh(tmp_path / "clip.bvh", with_first(2, dancer(30)))
     out = tmp_path / "out"
-    assert cli.main(["retarget", str(clip), "--no-trim", "--no-animation", "--out", str(out)]) == 0
+    assert cli.main(["retarget", str(clip), "--no-trim", "--out", str(out)]) == 0
     assert len(RobotMotion.load(out / "motion.npz").qpos) == 32
 
 
@@ -465,7 +461,6 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         ),
         (["DANCE", "--smooth", "-1"], "smoothness is -1.0; it is a time in seconds, 0 or more"),
         (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),
-        (["DANCE", "--smooth", "0.1", "--live"], "--smooth goes with whole clips, not with --live"),
         (["DANCE", "--robot", "none.urdf"], "no such file: none.urdf"),
         (["DANCE", "--robot", "arm7"], "--base floating"),
         (["DANCE", "--profile", "none.toml"], "profiles that come with the package: nao, g1, talos"),
@@ -473,18 +468,7 @@ def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
         (["DANCE", "--mapping", "left_hip"], "--mapping takes ROLE=NAME; got left_hip"),
         (["DANCE", "--mapping", "left_hip=Hip"], "no joint of the clip 'Hip'"),
         (["DANCE", "--unit", "yard"], "no unit 'yard'"),
-        (["DANCE", "--fit", "robot.toml"], "--fit takes a folder of clips"),
-        (["DANCE", "--fit", "robot.toml", "--source", "g1"], "--source goes with motions, not with --fit, which takes"),
-        (
-            ["DANCE", "--fit", "robot.toml", "--fps", "30", "--report"],
-            "--fps, --report go with motions, not with --fit",
-        ),
-        (["DANCE", "--look-ahead", "0.1", "--budget", "0.01"], "--look-ahead, --budget go with --live"),
-        (["m.npz", "--source", "nao", "--unit", "cm", "--no-trim"], "--unit, --trim go with a person's clip, not with"),
-        (["DANCE", "--source-fps", "30"], "--source-fps goes with --source"),
-        (["-", "--live", "--up", "y"], "--up goes with a file, not with -"),
         (["NPZ", "--unit", "cm"], "unit goes with BVH files"),
-        (["NPZ", "--source", "nao", "--source-fps", "30"], "joint_names and fps go with a CSV"),
         (["DANCE", "--base", "fixed"], "--base goes with a file; nao is what it is"),
     ],
 )
@@ -742,8 +726,11 @@ def test_guessed_capsules_of_hands_cover_thumbs_and_wrists(part):
 def test_links_without_a_size_get_no_capsule():
     path = example_urdf("g1").parents[2] / "icub_description/robots/icub_reduced.urdf"
     icub = osik.Robot.from_urdf(path, floating_base=True)
-    capsules = {capsule.frame: capsule.radius for capsule in guess_profile(icub).capsules}
+    profile = guess_profile(icub)
+    capsules = {capsule.frame: capsule.radius for capsule in profile.capsules}
     assert "l_ankle_2" not in capsules and min(capsules.values()) > 1e-3
+    assert any(capsule.start == capsule.end for capsule in profile.capsules)  # balls
+    assert Retargeter(icub, profile=profile)._pairs
 
 
 @pytest.mark.variants(slow=["romeo_description/urdf/romeo.urdf-LHipPitchLink-ends1"])
@@ -841,7 +828,7 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
         ("scale = 0.8", "scale = 0.0", "scale is 0.0"),
         ("stretch = 1.1", "stretch = 0.0", "stretch is 0.0"),
         ("[feet.left]", "[feet.left", "is no TOML"),
-        ("radius = ", "radius = -", "radius and the length have to be more than 0"),
+        ("radius = ", "radius = -", "has radius -.*; it is a length in metres, over 0"),
     ):
         assert old in text
         (tmp_path / "broken.toml").write_text(text.replace(old, new))

@@ -1,8 +1,5 @@
 """Retargeting frame by frame: beside the whole clip, and with a stream that is noisy and has holes."""
 
-import dataclasses
-import io
-import json
 from functools import partial
 from typing import Any
 
@@ -14,10 +11,9 @@ from motion_files import bent_forward, dancer, write_bvh
 from small_robots import nao_soles
 
 import osik_jax as osik
-from osik_jax import cli
+from benchmarks.replayed import replay
 from osik_jax.retargeting import LiveRetargeter, load_motion, report, retarget
 from osik_jax.retargeting._live import LiveStatus
-from osik_jax.retargeting._live_command import replay, stream
 from osik_jax.retargeting._stance import Stance, hold_feet
 from osik_jax.retargeting._terms import soles
 
@@ -61,14 +57,14 @@ def test_the_centre_of_mass_stays_over_the_feet_frame_by_frame(nao, motion):
     margins = []
     for balance in (None, 0.01):
         make = partial(LiveRetargeter, nao, look_ahead=LOOK_AHEAD / FPS, balance=balance, budget=1.0)
-        margins.append(report(replay(make, bent_forward(motion), paced=False)[0])["balance"]["com_margin_mm_min"])
+        margins.append(report(replay(make, bent_forward(motion))[0])["balance"]["com_margin_mm_min"])
     assert margins[0] < -5.0 and margins[1] > 10.0 - 0.5
 
 
 @pytest.mark.slow
 def test_frame_by_frame_is_near_the_whole_clip(nao, motion, live):
     whole = retarget(nao, motion)
-    result, frames = replay(lambda _: live, motion, paced=False)
+    result, frames = replay(lambda _: live, motion)
     assert len(frames) == motion.frames and live.latency == pytest.approx(LOOK_AHEAD / motion.fps)
     assert {frame.status for frame in frames} == {LiveStatus.FOLLOWED}
     apart = np.degrees(np.abs(joints_of(nao, frames) - joints_of(nao, [Frame(q) for q in whole.q])))
@@ -207,41 +203,3 @@ def test_short_streams_and_wrong_frames(nao, motion, live):
     ):
         with pytest.raises(ValueError, match=message):
             LiveRetargeter(live.robot, motion, **wrong)
-
-
-def lines_of(motion):
-    yield json.dumps({"fps": motion.fps, "joint_names": motion.joint_names, "standing": motion.positions[0].tolist()})
-    for f, row in enumerate(motion.positions.tolist()):
-        seen = [None if f == 5 and j == 2 else point for j, point in enumerate(row)]
-        yield "null" if f == 3 else json.dumps({"positions": seen})
-
-
-def test_json_lines_in_json_lines_out(motion, live):
-    short = dataclasses.replace(motion, positions=motion.positions[:12], rotations=None)
-    live.reset()
-    out = io.StringIO()
-    assert stream(lambda _: live, lines_of(short), out) == 12
-    head, *rows = (json.loads(line) for line in out.getvalue().splitlines())
-    assert head["latency"] == live.latency and "HeadYaw" in head["joint_names"]
-    assert [row["frame"] for row in rows] == list(range(12))
-    assert all(len(row["qpos"]) == 7 + len(head["joint_names"]) for row in rows)
-    assert [row["status"] for row in rows][3] == "filled" and [row["status"] for row in rows][5] == "filled"
-    for lines, message in (
-        (["{}"], "line 1 has to be an object with fps and joint_names"),
-        (["{"], "line 1 is no JSON"),
-        ([next(lines_of(short)), "[1]"], "line 2: a frame is an object with positions, or null"),
-    ):
-        live.reset()
-        with pytest.raises(ValueError, match=message):
-            stream(lambda _: live, lines, io.StringIO())
-
-
-def test_the_command_replays_a_clip(tmp_path, capsys):
-    clip = write_bvh(tmp_path / "short.bvh", dancer(12), 0.01)
-    arguments = [str(clip), "--live", "--look-ahead", str(LOOK_AHEAD / FPS), "--no-animation"]
-    arguments += ["--iterations", "3", "--budget", "1.0", "--out", str(tmp_path / "out")]
-    assert cli.main(["retarget", *arguments]) == 0
-    told = capsys.readouterr().out
-    assert "5 frames of look-ahead are 167 ms" in " ".join(told.split())
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"motion.npz", "motion.csv", "report.json", "profile.toml"}

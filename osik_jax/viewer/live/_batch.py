@@ -99,7 +99,6 @@ class BatchView(Driving):
         self._state, self._timing = gui.add_markdown(""), gui.add_markdown("")
         buttons = gui.add_button_group("", ("Pause", "Reset"))
         self._together = gui.add_checkbox("A handle moves those of all robots", initial_value=True)
-        record, motion = gui.add_button("Start recording"), gui.add_button("Stop, and download motion.npz")
         self._errors = gui.add_markdown("")
 
         @buttons.on_click
@@ -108,16 +107,6 @@ class BatchView(Driving):
                 self.loop.reset()
             else:
                 self.loop.resume() if self.loop.snapshot.paused else self.loop.pause()
-
-        record.on_click(lambda _: self.loop.record())
-        motion.on_click(self._send_motion)
-
-    def _send_motion(self, event: GuiEvent[Any]) -> None:
-        """Send the recording to the visitor, in the format of ``osik demo``."""
-        recording = self.loop.recorded()
-        if len(recording.time) and event.client is not None:
-            runs = {f"q_{name}": recording.q[:, lane] for lane, name in enumerate(self.names)}
-            event.client.send_file_download("motion.npz", recording.to_npz(**runs), save_immediately=True)
 
     def _run(self) -> None:
         count = 0

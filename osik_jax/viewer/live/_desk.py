@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -13,15 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..._errors import OsikValueError, unknown_name
-from ...collision import CollisionShape
-from ...limits import CollisionAvoidanceLimit, VelocityLimit
 from ...saving._parts import decode, encode
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
-from .._parts import RobotParts
-from ._covers import link_covers
 from ._loop import ControlLoop
-from ._obstacles import PARKED, Obstacle, free_slot, keeps_off_world, moved, obstacles_in, own_limit, world_limit
+from ._obstacles import Obstacle, moved, obstacles_in
 from ._session import Session
 from ._step import Controller, targets_here, with_targets
 
@@ -43,9 +38,9 @@ class Desk:
         loop: runs the session's controller.
     """
 
-    def __init__(self, session: Session, shapes: RobotParts) -> None:
-        """Take the initial session and the visual shapes of its robot; the loop does not run yet."""
-        self._session, self._lock, self._shapes = session, threading.RLock(), shapes
+    def __init__(self, session: Session) -> None:
+        """Take the initial session; the loop does not run yet."""
+        self._session, self._lock = session, threading.RLock()
         self._seen: tuple[Any, dict[str, Obstacle]] = ((), {})
         controller = session.controller()
         self._told = (controller, session, session)
@@ -80,6 +75,8 @@ class Desk:
                 here = targets_here(session.robot, self.loop.snapshot.q, session.tasks, [name])
                 moved = with_targets(Controller({name: session.tasks[name]}, session.scheme, ()), here)
                 self._put(name, moved.tasks[name], off=session.off - {name})
+            elif len(session.active_tasks) == 1:
+                raise OsikValueError("one task at least stays on")
             else:
                 self.edit(off=session.off | {name})
 
@@ -122,59 +119,20 @@ class Desk:
             off = self._session.limits_off
             self.edit(limits_off=off - {number} if on else off | {number})
 
-    def slow_down(self, share: float) -> None:
-        """Set speed limits to a share of the robot's own."""
-        with self._lock:
-            own = np.asarray(self._session.robot.velocity_limit)
-            limits = [
-                limit.replace(velocity=own * share) if type(limit) is VelocityLimit else limit
-                for limit in self._session.limits
-            ]
-            self.edit(limits=tuple(limits))
-
     @property
     def obstacles(self) -> dict[str, Obstacle]:
-        """Return the obstacles in use, by name."""
+        """Return the obstacles by name."""
         with self._lock:
             if self._seen[0] is not self._session.limits:
                 self._seen = self._session.limits, obstacles_in(self._session.limits)
             return self._seen[1]
 
-    def add_obstacle(self, kind: str, position: Float[np.ndarray, "3"], size: float) -> str:
-        """Add a ball or box at a position [m] and return its name; the first one adds the limit for obstacles."""
+    def move_obstacle(self, name: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """Set position and rotation of an obstacle without compiling."""
         with self._lock:
-            if not any(map(keeps_off_world, self._session.limits)):
-                self._put_limit(world_limit(self._session.robot, self._covers, size))
-            name = free_slot(self._session.limits, kind)
-            if name is None:
-                count = sum(one.kind == kind for one in self.obstacles.values())
-                raise OsikValueError(f"there are {count} of these already; remove one, or drag it")
-            self.move_obstacle(name, position=position)
-            return name
-
-    def move_obstacle(self, name: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Set position, rotation or size of an obstacle without compiling."""
-        with self._lock:
-            self._session = dataclasses.replace(self._session, limits=moved(self._session.limits, name, **changes))
-            self.loop.place(name, **changes)
-
-    def remove_obstacle(self, name: str) -> None:
-        """Move an obstacle out of use."""
-        self.move_obstacle(name, position=PARKED)
-
-    def avoid_itself(self) -> None:
-        """Add the limit that avoids self-collision."""
-        with self._lock:
-            session = self._session
-            self._put_limit(own_limit(session.robot, self._covers, session.q))
-
-    @cached_property
-    def _covers(self) -> dict[str, CollisionShape]:
-        """Return the collision shape of each link, by link."""
-        return link_covers(self._session.robot, self._shapes)
-
-    def _put_limit(self, limit: CollisionAvoidanceLimit) -> None:
-        self.edit(limits=(*self._session.limits, limit))
+            limits = moved(self._session.limits, name, position, rotation)
+            self._session = dataclasses.replace(self._session, limits=limits)
+            self.loop.place(name, position, rotation)
 
     def load(self, session: Session) -> None:
         """Replace the session by another one of the same robot, at the current configuration."""

@@ -51,8 +51,8 @@ def export_html(
     return write_page(robot, _motion(robot, trajectory, dt), Path(path), title=title)
 
 
-def write_page(robot: Robot, motion: Motion, out: Path, *, title: str, beside: str | None = None) -> Path:
-    """Write the page of an already loaded motion; ``beside`` is HTML that is shown beside it."""
+def write_page(robot: Robot, motion: Motion, out: Path, *, title: str) -> Path:
+    """Write the page of an already loaded motion."""
     server = open_server("127.0.0.1", 0, title)
     try:
         cast = Cast(server, robot, motion, panel=False)
@@ -65,9 +65,6 @@ def write_page(robot: Robot, motion: Motion, out: Path, *, title: str, beside: s
     finally:
         close_server(server)
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title, quote=False)}</title>", 1)
-    if beside is not None:
-        start, end = page.rsplit("</body>", 1)
-        page = f"{start}{beside}</body>{end}"
     out.write_text(page, encoding="utf-8")
     return out
 

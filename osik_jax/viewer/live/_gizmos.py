@@ -105,13 +105,13 @@ class Gizmos(Handles):
 
 
 class ObstacleNodes(Handles):
-    """Obstacles as nodes of a page's scene, with handles to drag, turn and resize them."""
+    """Obstacles as nodes of a page's scene, with handles to drag and turn them."""
 
     def __init__(self, scene: SceneApi, size: float, move: Callable[..., None]) -> None:
-        """Take the size of the robot [m] and ``move(obstacle, position=, rotation=)``, which a drag calls."""
+        """Take the size of the robot [m] and ``move(obstacle, position, rotation)``, which a drag calls."""
 
         def dragged(name: str, pose: Pose, *_: object) -> None:
-            move(name, position=pose[0], rotation=rotation_matrix(pose[1]))
+            move(name, pose[0], rotation_matrix(pose[1]))
 
         super().__init__(scene, dragged)
         self._scale = 0.1 * size

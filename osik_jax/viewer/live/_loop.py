@@ -13,17 +13,16 @@ from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ... import control
 from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
-from ._compiler import Compiler
 from ._obstacles import moved
-from ._snapshot import Recorder, Recording, Snapshot
-from ._step import Controller, Program, State, targets_here, with_targets
+from ._snapshot import Snapshot
+from ._step import Controller, laid_out, lane_of, targets_here, with_targets
 from ._timing import CONTROL, Stopwatch, Timing, be_nice
 
 _LATE = 5
@@ -34,17 +33,6 @@ _HALF_A_MICROSECOND = 5e-7
 """Offset [s] added to the switch interval, which Python truncates to whole microseconds."""
 _loops: set[int] = set()
 """Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
-_FADES = 0.15
-"""Time in which a push falls to 1/e [s]."""
-_OVER = 1e-4
-"""Push below which it ends [m/s or rad/s]."""
-
-
-class _Job(NamedTuple):
-    """A compiled program and its numbers, as the control thread runs them."""
-
-    program: Program
-    numbers: list[Array]
 
 
 class _Lease(NamedTuple):
@@ -57,15 +45,13 @@ class _Lease(NamedTuple):
 class ControlLoop:
     """Controller running at a fixed rate in its own thread.
 
-    All methods may be called from any thread. Numbers (targets, weights, gains, limits) take effect in the next step.
-    Another structure (another task, scheme, priority or limit) is compiled in the background, while the present
-    controller goes on and follows new targets. The new one then starts at the current configuration.
-
-    The robot stands still while nothing is compiled yet, while paused, and after an answer that is not finite. If the
+    All methods may be called from any thread, and take effect in the next step. The first step of another structure
+    (another task, scheme, priority or limit) takes some milliseconds, or the seconds of a compilation where the core
+    does not have it; the robot stands still meanwhile, as while paused and after an answer that is not finite. If the
     owner of a target (``aim``) leaves or its timeout passes, the target becomes the robot's current pose.
 
-    A batch of B robots runs in one program: q0 is (B, nq), and each number of the controller has a leading axis B. So
-    have targets, snapshots and recordings.
+    Of a batch of B robots, q0 is (B, nq), and each number of the controller has a leading axis B. So have targets
+    and snapshots.
 
     Attributes:
         robot: the robot.
@@ -90,40 +76,35 @@ class ControlLoop:
             robot.check_configuration(row, "q0")
         still = np.zeros((*self._start.shape[:-1], robot.nv), self._start.dtype)
         self._lock = threading.RLock()
-        self._wanted = self._running = controller
+        self._wanted: Controller = controller
+        self._laid: Controller | None = None
+        self._refused: Controller | None = None
+        self._steps: list[control.Controller] = []
         self._leases: dict[str, _Lease] = {}
-        self._job: _Job | None = None
-        self._is_behind, self._problem = False, ""
+        self._problem = ""
         self._orders: deque[Callable[[], None]] = deque()
-        self._stopwatch, self._recorder, self._push = Stopwatch(), Recorder(self.dt), Push(still, self.dt)
+        self._stopwatch = Stopwatch()
         self._snapshot = Snapshot(0.0, self._start, still, preparing=True)
-        self._state: State = (jnp.asarray(self._start), jnp.asarray(still), None)
-        self._program: Program | None = None
         self._stop = threading.Event()
-        batch = len(self._start) if self._batched else None
-        self._compiler = Compiler(robot, self.dt, batch, self._compiled, self._not_compiled)
         self._thread = threading.Thread(target=self._run, name="osik-control", daemon=True)
 
     def start(self) -> Self:
-        """Start the threads; the first step is compiled in the background.
+        """Start the thread.
 
         While it runs, Python's threads change places every 0.05 ms, not every 5: the control thread would wait that
-        long for each of the others that computes. What was there when a program was compiled is left out of
-        garbage collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
+        long for each of the others that computes. What was there when a step was laid out is left out of garbage
+        collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
         """
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
         _loops.add(id(self))
         # a thread that is inside XLA when Python ends may crash the process
         atexit.register(self.stop)
-        # the compiler starts first: the control thread needs its program
-        self._compiler.thread.start()
-        self._compiler.ask(self._wanted)
         self._thread.start()
         return self
 
     def stop(self) -> None:
-        """End the threads, after the current compilation: no thread may be inside XLA when Python ends."""
+        """End the thread, after the current step: no thread may be inside XLA when Python ends."""
         atexit.unregister(self.stop)
         self._stop.set()
         if self._thread.is_alive():
@@ -132,7 +113,6 @@ class ControlLoop:
             _loops.discard(id(self))
             if not _loops:
                 gc.unfreeze()
-        self._compiler.stop()
 
     def __enter__(self) -> Self:
         return self.start()
@@ -147,7 +127,7 @@ class ControlLoop:
 
     @property
     def controller(self) -> Controller:
-        """Return the requested controller, which runs as soon as it is compiled; the same object until it changes."""
+        """Return the requested controller, which runs from the next step on; the same object until it changes."""
         return self._wanted
 
     @property
@@ -159,7 +139,8 @@ class ControlLoop:
         """Wait until the requested controller runs; return False if it does not within the timeout [s]."""
         end = time.monotonic() + timeout
         while time.monotonic() < end:
-            if self._job is not None and not self._is_behind:
+            laid, wanted = self._laid, self._wanted
+            if laid is not None and (laid is wanted or laid.structure() == wanted.structure()):
                 return True
             time.sleep(0.005)
         return False
@@ -172,15 +153,9 @@ class ControlLoop:
         """
         with self._lock:
             self._wanted, self._problem = edit(self._wanted), ""
-            self._is_behind = self._wanted.structure() != self._running.structure()
-            if not self._is_behind:
-                self._running = self._wanted
-                self._refresh()
-            if self._is_behind or self._job is None:
-                self._compiler.ask(self._wanted)
 
     def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
-        """Set the target of a task, also while another structure is being compiled.
+        """Set the target of a task.
 
         Args:
             name: of the task.
@@ -205,12 +180,12 @@ class ControlLoop:
             self._leases.pop(name, None)
             if owner is not None or timeout is not None:
                 self._leases[name] = _Lease(owner, until)
-            self._edit_both(lambda controller: with_targets(controller, {name: new}))
+            self._wanted = with_targets(self._wanted, {name: new})
 
-    def place(self, obstacle: str, **changes: Float[np.ndarray, "..."]) -> None:
-        """Set position, rotation or size of an obstacle (``CollisionAvoidanceLimit.moved``) in all controllers."""
+    def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
+        """Set position and rotation of an obstacle."""
         with self._lock:
-            self._edit_both(lambda own: replace(own, limits=moved(own.limits, obstacle, **changes)))
+            self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, position, rotation))
 
     def let_go(self, owner: Hashable) -> None:
         """Keep the targets where their owner left them, without a timeout."""
@@ -224,10 +199,6 @@ class ControlLoop:
         if left:
             self._orders.append(lambda: self._hold(left))
 
-    def push(self, velocity: Float[np.ndarray, " nv"]) -> None:
-        """Add a velocity disturbance [m/s, rad/s] that fades within a second; the controller corrects it."""
-        self._orders.append(lambda: self._push.start(velocity))
-
     def pause(self) -> None:
         """Stop the robot from the next step on."""
         self._orders.append(lambda: self._show(paused=True))
@@ -239,46 +210,6 @@ class ControlLoop:
     def reset(self) -> None:
         """Move the robot to its start configuration at once; targets stay."""
         self._orders.append(self._reset)
-
-    def record(self) -> None:
-        """Start a recording of at most ten minutes; a running one is discarded."""
-        self._orders.append(lambda: self._recorder.start(self._snapshot.q))
-
-    def recorded(self) -> Recording:
-        """End the recording and return it; empty if none ran."""
-        return self._recorder.stop()
-
-    def _refresh(self) -> None:
-        """Copy the controller's numbers to the running program; the caller holds the lock."""
-        if self._job is not None:
-            self._job = self._job._replace(numbers=self._running.numbers())
-
-    def _edit_both(self, edit: Callable[[Controller], Controller]) -> None:
-        """Change numbers of the running and of the requested controller; the caller holds the lock."""
-        is_one = self._wanted is self._running
-        self._wanted = edit(self._wanted)
-        self._running = self._wanted if is_one else edit(self._running)
-        self._refresh()
-
-    def _compiled(self, controller: Controller, program: Program) -> None:
-        """Run a compiled program unless another controller has been requested since."""
-        if not self._stop.is_set():
-            # a collection over all of JAX's objects takes up to 0.1 s, several periods of the loop
-            gc.freeze()
-        with self._lock:
-            if controller.structure() == self._wanted.structure():
-                # numbers may have changed during compilation, so the wanted controller runs, not the compiled one
-                self._running, self._is_behind = self._wanted, False
-                self._job = _Job(program, self._running.numbers())
-        if not self._stop.is_set():
-            self._here(list(controller.tasks))  # compiled here, so that the control thread need not
-
-    def _not_compiled(self, controller: Controller, error: Exception) -> None:
-        """Return to the running controller and report the error."""
-        with self._lock:
-            if controller.structure() == self._wanted.structure():
-                self._wanted, self._is_behind = self._running, False
-                self._problem = " ".join(str(error).split())
 
     def _run(self) -> None:
         """Run the control thread."""
@@ -299,37 +230,74 @@ class ControlLoop:
         while self._orders:
             self._orders.popleft()()
         self._hold(self._abandoned())
-        job = self._job
-        self._show(ready=job is not None, preparing=job is None or self._is_behind, problem=self._problem)
-        if job is None or self._snapshot.paused:
+        self._lay_out()
+        self._show(problem=self._problem)
+        if self._laid is None or self._snapshot.paused:
             # periods across a pause would count as late
             self._stopwatch.clear()
             return
-        self._step(job)
+        try:
+            self._step()
+        except Exception as error:  # numbers that a step refuses, such as a gain that is too large for its time
+            self._problem = " ".join(str(error).split())
+            self._show(velocity=np.zeros_like(self._snapshot.velocity), failures=self._snapshot.failures + 1)
         self._stopwatch.add(begin, time.perf_counter() - begin)
 
-    def _step(self, job: _Job) -> None:
-        """Run one step; if its answer is unusable, stop the robot and cold-start the solver."""
-        if job.program is not self._program:
-            self._program, self._state = job.program, (*self._state[:2], job.program.cold)
-        state, status, errors = job.program.run(job.numbers, self._state, self._push.now())
-        before, codes = self._snapshot, np.asarray(status)
-        q, velocity = np.asarray(state[0]), np.asarray(state[1])
+    def _lay_out(self) -> None:
+        """Take the requested controller; return to the one that runs, and tell why, if its step raises."""
+        wanted, laid = self._wanted, self._laid
+        if wanted is laid or wanted is self._refused:
+            return
+        lanes = [lane_of(wanted, lane) for lane in range(len(self._start))] if self._batched else [wanted]
+        if laid is not None and wanted.structure() == laid.structure():
+            for own, new in zip(self._steps, lanes, strict=True):
+                own.tasks, own.scheme, own.limits = dict(new.tasks), new.scheme, new.limits
+            self._laid = wanted
+            return
+        self._show(preparing=True)
+        try:
+            steps = [laid_out(self.robot, new, self.dt) for new in lanes]
+            for own, q in zip(steps, self._rows(self._snapshot.q), strict=True):
+                own.step(q)  # compiles what is not the core's, and raises what a task of somebody's own raises
+                own.forget()
+        except Exception as error:
+            with self._lock:
+                self._refused, self._problem = wanted, " ".join(str(error).split())
+                if laid is not None and self._wanted is wanted:
+                    self._wanted = laid
+            self._show(preparing=laid is None)
+            return
+        self._laid, self._steps = wanted, steps
+        self._here(list(wanted.tasks))  # compiled now, so that no step waits for it
+        # a collection over all of JAX's objects takes up to 0.1 s, several periods of the loop
+        gc.freeze()
+        self._show(ready=True, preparing=False)
+
+    def _rows(self, values: np.ndarray) -> np.ndarray:
+        """Return a row for each robot."""
+        return values if self._batched else values[None]
+
+    def _step(self) -> None:
+        """Run one step; a robot whose answer is unusable stands still."""
+        before = self._snapshot
+        found = [own.step(q) for own, q in zip(self._steps, self._rows(before.q), strict=True)]
+        moved = [
+            own.integrate(at, answer.velocity)
+            for own, at, answer in zip(self._steps, self._rows(before.q), found, strict=True)
+        ]
+        one: Any = jax.tree.map(lambda *rows: np.stack(rows) if self._batched else rows[0], *found)
+        q, codes = np.stack(moved) if self._batched else moved[0], np.asarray(one.status)
         usable = np.isfinite(q).all(-1, keepdims=True) & (codes != Status.NUMERICAL_ERROR)[..., None]
-        if usable.all():
-            self._state = state
-        else:
-            # in a batch, robots with usable answers go on
-            q, velocity = np.where(usable, q, before.q), np.where(usable, velocity, 0.0)
-            self._state = (jnp.asarray(q), jnp.asarray(velocity), job.program.cold)
+        for own, is_usable in zip(self._steps, usable.ravel(), strict=True):
+            if not is_usable:
+                own.forget()
         self._show(
             time=before.time + self.dt,
-            q=q,
-            velocity=velocity,
+            q=np.where(usable, q, before.q),
+            velocity=np.where(usable, one.velocity, 0.0),
             status=int(codes.max()),
-            errors={name: np.asarray(error) for name, error in errors.items()},
+            errors=one.error,
             failures=before.failures + int(np.sum(~usable)),
-            recording=self._recorder.add(q),
         )
 
     def _show(self, **changes: Any) -> None:
@@ -337,11 +305,9 @@ class ControlLoop:
 
     def _reset(self) -> None:
         """Move the robot to the start, at rest."""
-        still = np.zeros_like(self._snapshot.velocity)
-        cold = None if self._program is None else self._program.cold
-        self._state = (jnp.asarray(self._start), jnp.asarray(still), cold)
-        self._push.stop()
-        self._show(time=0.0, q=self._start, velocity=still, failures=0)
+        for own in self._steps:
+            own.forget()
+        self._show(time=0.0, q=self._start, velocity=np.zeros_like(self._snapshot.velocity), failures=0)
 
     def _abandoned(self) -> list[str]:
         """Return the tasks whose target is older than allowed."""
@@ -355,40 +321,14 @@ class ControlLoop:
         here = self._here(names)
         with self._lock:
             self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
-            self._edit_both(lambda controller: with_targets(controller, here))
+            self._wanted = with_targets(self._wanted, here)
 
     def _here(self, names: list[str]) -> dict[str, Any]:
         """Return the targets that tasks meet at the robot's current configuration."""
-        q, tasks = self._snapshot.q, {name: self._running.tasks[name] for name in names if name in self._running.tasks}
+        wanted = self._wanted.tasks
+        q, tasks = self._snapshot.q, {name: wanted[name] for name in names if name in wanted}
         if not self._batched:
             return targets_here(self.robot, q, tasks, names)
         own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
         each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
         return jax.tree.map(lambda *rows: np.stack(rows), *each)
-
-
-class Push:
-    """Fading velocity added to that of the controller."""
-
-    def __init__(self, still: Float[np.ndarray, "*batch nv"], dt: float) -> None:
-        """Take velocities of 0 (nv,) and the period [s]."""
-        self._share, self._velocity = float(np.exp(-dt / _FADES)), still.copy()
-        self._none = jnp.asarray(still)
-
-    def start(self, velocity: Float[np.ndarray, "*batch nv"]) -> None:
-        """Start a push."""
-        self._velocity = np.asarray(velocity, float).copy()
-
-    def stop(self) -> None:
-        """End the push."""
-        self._velocity[:] = 0.0
-
-    def now(self) -> Float[Array, "*batch nv"]:
-        """Return the velocity of this step [m/s or rad/s], and reduce it for the next. (nv,)."""
-        if not self._velocity.any():
-            return self._none
-        pushed = jnp.asarray(self._velocity, self._none.dtype)
-        self._velocity *= self._share
-        if np.abs(self._velocity).max() < _OVER:
-            self.stop()
-        return pushed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from jaxtyping import Array, Float
 from ..._errors import OsikValueError, warn
 from ..._npz import open_npz
 from ...kinematics import forward_kinematics
+from ...limits import Limit
 from ...reachability import load_map
 from ...robot import Robot
 from ...robot._hands import find_hands
@@ -41,7 +43,9 @@ soles.
 """
 
 
-def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: str, port: int) -> LiveView:
+def open_robot(
+    robot: Robot, source: RobotSource, feet: Sequence[str], *, limits: tuple[Limit, ...] = (), host: str, port: int
+) -> LiveView:
     """Open a page with a robot to drag; ``feet`` are the frames that stand on the ground."""
     for foot in feet:
         robot.tree.frame(foot)
@@ -51,7 +55,7 @@ def open_robot(robot: Robot, source: RobotSource, feet: Sequence[str], *, host: 
     q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
     session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
-    return serve(session, host=host, port=port)
+    return serve(dataclasses.replace(session, limits=(*session.limits, *limits)), host=host, port=port)
 
 
 def is_map(path: Path) -> bool:

@@ -44,7 +44,7 @@ class LiveView(Driving):
         super().__init__(host, port, "osik-jax")
         robot = session.robot
         shapes, data = robot_parts(robot), next(mujoco_poses(robot, session.q))
-        self._desk = Desk(session, shapes)
+        self._desk = Desk(session)
         self.loop = self._desk.loop
         seen, floor = shapes.corners(data), floor_height(robot, shapes, [data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
@@ -53,7 +53,7 @@ class LiveView(Driving):
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
         self._obstacles = ObstacleNodes(self._server.scene, size, self._desk.move_obstacle)
-        self._panel = Panel(self._server, self._desk, seen)
+        self._panel = Panel(self._server, self._desk)
         self._polygon: SupportPolygon | None = None
         self._drawn: Session | None = None
         self._server.on_client_disconnect(self._gone)

@@ -6,41 +6,32 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float
 
-from ..._errors import OsikValueError
-from ...limits import CollisionAvoidanceLimit, Limit, NoLimits
+from ...limits import Limit, NoLimits
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
-from ._obstacles import SLOTS, keeps_off_world
-from ._readout import error_table, joint_table, state_text, timing_text
+from ._readout import error_table, state_text, timing_text
 from ._server import show_texts
 from ._session import session_from_json
 
 if TYPE_CHECKING:
-    from viser import GuiDropdownHandle, GuiEvent, ViserServer
+    from viser import GuiEvent, ViserServer
 
 _LIMIT_WORDS = {
     "ConfigurationLimit": "joint ranges",
     "VelocityLimit": "joint speeds",
     "AccelerationLimit": "joint accelerations",
+    "CollisionAvoidanceLimit": "collisions",
 }
-_ITSELF, _WORLD = "collisions with itself", "collisions with obstacles"
-_SCENE = "collisions with itself and with the scene"
-_PLURALS = {"ball": "balls", "box": "boxes"}
-_NONE: str = "none"
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
-_PUSH = 0.6
-"""Speed of a push, in sizes of the robot per second."""
 
 
 class Panel:
     """Controls and readouts of a page."""
 
-    def __init__(self, server: ViserServer, desk: Desk, seen: Float[np.ndarray, "n 3"]) -> None:
-        """Add the panel to the page of a robot that occupies these points [m]."""
-        self._server, self._desk, self._seen = server, desk, seen
-        self._size = float(np.linalg.norm(np.ptp(seen, axis=0)))
+    def __init__(self, server: ViserServer, desk: Desk) -> None:
+        """Add the panel to a page."""
+        self._server, self._desk = server, desk
         gui = server.gui
         self._state = gui.add_markdown("")
         self._timing = gui.add_markdown("")
@@ -50,12 +41,9 @@ class Panel:
             self._add_tasks()
         with tabs.add_tab("Limits"):
             self._add_limits()
-        with tabs.add_tab("Obstacles"):
-            self._add_obstacles()
         with tabs.add_tab("Session"):
             self._add_session()
         self.refill()
-        self._fill_obstacles(None)
 
     def tell(self) -> None:
         """Show the current state of the loop."""
@@ -64,7 +52,6 @@ class Panel:
             (self._state, state_text(snapshot)),
             (self._timing, timing_text(snapshot, self._desk.loop.timing)),
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
-            (self._joints, joint_table(session.robot, snapshot.q, snapshot.velocity)),
         )
         show_texts(texts)
 
@@ -86,25 +73,14 @@ class Panel:
 
     def _add_buttons(self) -> None:
         gui, loop = self._server.gui, self._desk.loop
-        moves = ("Pause", "Reset", "Push") if self._desk.session.robot.floating_base else ("Pause", "Reset")
-        buttons = gui.add_button_group("", moves)
+        buttons = gui.add_button_group("", ("Pause", "Reset"))
 
         @buttons.on_click
         def _(event: GuiEvent[Any]) -> None:
-            match event.target.value:
-                case "Pause":
-                    loop.resume() if loop.snapshot.paused else loop.pause()
-                case "Reset":
-                    loop.reset()
-                case "Push":
-                    loop.push(self._shove())
-
-    def _shove(self) -> np.ndarray:
-        """Return a velocity of the base in a random horizontal direction, shape (nv,)."""
-        angle = np.random.default_rng().uniform(0.0, 2.0 * np.pi)
-        velocity = np.zeros(self._desk.session.robot.nv)
-        velocity[:2] = _PUSH * self._size * np.array([np.cos(angle), np.sin(angle)])
-        return velocity
+            if event.target.value == "Reset":
+                loop.reset()
+            else:
+                loop.resume() if loop.snapshot.paused else loop.pause()
 
     def _add_tasks(self) -> None:
         gui = self._server.gui
@@ -134,13 +110,9 @@ class Panel:
         gui = self._server.gui
         self._limits = gui.add_folder("On and off")
         self._limit_boxes: list[Any] = []
-        speed = gui.add_slider("Speeds, share", 0.05, 1.0, step=0.05, initial_value=1.0)
-        speed.on_update(self._guarded(lambda event: self._desk.slow_down(event.target.value)))
-        gui.add_markdown("**Nearest to a limit**")
-        self._joints = gui.add_markdown("")
 
     def _fill_limits(self) -> None:
-        """Add a switch for each limit, and one for self-collision if the session has no such limit."""
+        """Add a switch for each limit."""
         session = self._desk.session
         for box in self._limit_boxes:
             box.remove()
@@ -150,115 +122,28 @@ class Panel:
                 if isinstance(limit, NoLimits):
                     continue
                 self._switch_limit(_words(limit), number not in session.limits_off, number)
-            if _ITSELF not in map(_words, session.limits):
-                self._switch_limit(_ITSELF, False, None)
 
-    def _switch_limit(self, words: str, on: bool, number: int | None) -> None:
-        """Add a switch for a limit; None stands for a limit that switching on creates."""
-
-        def switch(event: GuiEvent[Any]) -> None:
-            if number is not None:
-                self._desk.switch_limit(number, event.target.value)
-            elif event.target.value:
-                event.target.value = False
-                self._desk.avoid_itself()
-                self._fill_limits()
-
+    def _switch_limit(self, words: str, on: bool, number: int) -> None:
+        """Add a switch for a limit."""
         box = self._server.gui.add_checkbox(words, initial_value=on)
-        box.on_update(self._guarded(switch))
+        box.on_update(self._guarded(lambda event: self._desk.switch_limit(number, event.target.value)))
         self._limit_boxes.append(box)
-
-    def _add_obstacles(self) -> None:
-        gui = self._server.gui
-        most = " and ".join(f"{count} {_PLURALS[kind]}" for kind, count in SLOTS.items())
-        gui.add_markdown(f"The robot keeps off what is here: up to {most}. For the first one, a program is compiled.")
-        kinds = gui.add_button_group("Add", tuple(SLOTS))
-        kinds.on_click(self._guarded(lambda event: self._add_obstacle(event.target.value)))
-        nothing: list[str] = [_NONE]
-        self._obstacle: GuiDropdownHandle[str] = gui.add_dropdown("Chosen", nothing)
-        self._obstacle.on_update(lambda _: self._show_obstacle())
-        most_edge = float(np.round(self._size, 2))
-        self._edges = [
-            gui.add_slider(f"Size {axis} [m]", 0.01, most_edge, step=0.005, initial_value=0.01) for axis in "xyz"
-        ]
-        for edge in self._edges:
-            edge.on_update(self._guarded(lambda _: self._resize()))
-        remove = gui.add_button("Remove the one chosen")
-        remove.on_click(self._guarded(lambda _: self._remove_obstacle()))
-        self._show_obstacle()
-
-    def _add_obstacle(self, kind: str) -> None:
-        """Add an obstacle in front of the robot, at half its height."""
-        low, high = self._seen.min(0), self._seen.max(0)
-        place = 0.5 * (low + high) + np.array([0.5 * (high - low)[0] + 0.2 * self._size, 0.0, 0.0])
-        count = len(self._desk.obstacles)
-        place[1] += 0.2 * self._size * ((count + 1) // 2) * (-1.0) ** count
-        name = self._desk.add_obstacle(kind, place, self._size)
-        self._fill_limits()
-        self._fill_obstacles(name)
-
-    def _remove_obstacle(self) -> None:
-        if self._obstacle.value in self._desk.obstacles:
-            self._desk.remove_obstacle(self._obstacle.value)
-            self._fill_obstacles(None)
-
-    def _fill_obstacles(self, chosen: str | None) -> None:
-        """Update the names of obstacles to choose from."""
-        names = tuple(self._desk.obstacles) or (_NONE,)
-        self._obstacle.options = names
-        self._obstacle.value = chosen if chosen is not None and chosen in names else names[-1]
-        self._show_obstacle()
-
-    def _show_obstacle(self) -> None:
-        """Set the sliders to the sizes of the chosen obstacle; for a ball, its diameter."""
-        one = self._desk.obstacles.get(self._obstacle.value)
-        for axis, edge in enumerate(self._edges):
-            edge.visible = one is not None and (one.kind == "box" or axis == 0)
-            edge.label = "Diameter [m]" if one is not None and one.kind == "ball" else f"Size {'xyz'[axis]} [m]"
-            if one is not None and edge.visible:
-                edge.value = float(np.clip(2.0 * one.size[axis], edge.min, edge.max))
-
-    def _resize(self) -> None:
-        one = self._desk.obstacles.get(self._obstacle.value)
-        if one is not None:
-            half = [0.5 * edge.value if edge.visible else 0.0 for edge in self._edges]
-            self._desk.move_obstacle(one.name, size=np.array(half))
 
     def _add_session(self) -> None:
         gui = self._server.gui
-        record, motion = gui.add_button("Start recording"), gui.add_button("Stop, and download motion.npz")
-        gui.add_divider()
         save = gui.add_button("Download session.json")
         load = gui.add_upload_button("Load a session", mime_type="application/json")
-        python = gui.add_button("Show the Python lines")
-        record.on_click(lambda _: self._desk.loop.record())
-        motion.on_click(self._guarded(self._send_motion))
-        save.on_click(
-            self._guarded(lambda event: self._send(event, "session.json", self._desk.session.to_json().encode()))
-        )
+        save.on_click(self._guarded(self._send))
         load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
-        python.on_click(self._guarded(lambda event: self._show_python(event)))
 
     def _load(self, content: bytes) -> None:
         self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
         self.refill()
-        self._fill_obstacles(None)
 
-    def _send_motion(self, event: Any) -> None:
-        """Send the recording to the visitor, in the format of ``osik demo``."""
-        recording = self._desk.loop.recorded()
-        if not len(recording.time):
-            raise OsikValueError("nothing was recorded")
-        self._send(event, "motion.npz", recording.to_npz(q_live=recording.q))
-
-    def _send(self, event: Any, name: str, content: bytes) -> None:
-        """Send a file to the visitor who asked for it."""
-        (event.client or self._server).send_file_download(name, content, save_immediately=True)
-
-    def _show_python(self, event: Any) -> None:
-        with event.client.gui.add_modal("The same controller in Python") as modal:
-            event.client.gui.add_markdown(f"```python\n{self._desk.session.to_python()}```")
-            event.client.gui.add_button("Close").on_click(lambda _: modal.close())
+    def _send(self, event: Any) -> None:
+        """Send the session to the visitor who asked for it."""
+        content = self._desk.session.to_json().encode()
+        event.client.send_file_download("session.json", content, save_immediately=True)
 
     @property
     def _name(self) -> str:
@@ -298,13 +183,12 @@ class Panel:
             except (KeyError, ValueError, TypeError, OSError, ImportError) as error:
                 text = str(error.args[0]) if error.args else str(error)
                 event.client.add_notification("That does not work", " ".join(text.split()), color="red")
+                self.refill()
 
         return answer
 
 
 def _words(limit: Limit) -> str:
     """Return the label of a limit's switch."""
-    if isinstance(limit, CollisionAvoidanceLimit):
-        return _SCENE if limit.scene is not None else _WORLD if keeps_off_world(limit) else _ITSELF
     kind = type(limit).__name__
     return _LIMIT_WORDS.get(kind, kind)

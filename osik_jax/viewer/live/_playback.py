@@ -56,7 +56,7 @@ class Motion:
 
 
 def read_motion(path: str | os.PathLike[str], robot: Robot) -> Motion:
-    """Read a motion from ``osik demo``, ``osik retarget``, a view, or ``numpy.savez(path, q=rollout.q, time=...)``.
+    """Read a motion from ``osik demo``, ``osik retarget``, or ``numpy.savez(path, q=rollout.q, time=...)``.
 
     Runs are arrays (T, nq) called ``q`` or ``q_NAME``; times are ``time_NAME`` or ``time``, one fewer where they are
     those of the steps; without any, there are 200 configurations a second. What ``osik retarget`` writes is ``qpos``

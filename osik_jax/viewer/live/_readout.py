@@ -7,14 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ...robot import Robot
-from ...robot._joint_selection import scalar_layout
 from ...solvers import Status
 from ...tasks import Task
 from ._snapshot import Snapshot
 from ._timing import Timing
 
-_NEAREST = 5
 _VISIBLE = 5e-4
 """Distance [m or rad] outside of bounds below which an error counts as inside: it would read as 0 mm outside."""
 
@@ -28,8 +25,6 @@ def state_text(snapshot: Snapshot) -> str:
     doing = "**paused**" if snapshot.paused else "**running**"
     if snapshot.preparing:
         doing += " · compiling the change …"
-    if snapshot.recording is not None:
-        doing += f" · recording {snapshot.recording:.1f} s"
     return doing
 
 
@@ -70,22 +65,3 @@ def _length_text(task: Task, error: Float[np.ndarray, " m"]) -> str:
     lengths = task.are_lengths(len(error))
     parts = [f"{1e3 * np.linalg.norm(error[lengths]):.1f} mm"] if lengths.any() else []
     return ", ".join([*parts, *([] if lengths.all() else [f"{np.rad2deg(np.linalg.norm(error[~lengths])):.1f}°"])])
-
-
-def joint_table(robot: Robot, q: Float[np.ndarray, " nq"], velocity: Float[np.ndarray, " nv"]) -> str:
-    """Return a table of the joints nearest to their limits: remaining share of the range, and speed."""
-    scalar, index = (np.asarray(part) for part in scalar_layout(robot))
-    lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
-    limited = scalar & np.isfinite(upper - lower) & (upper > lower)
-    if not limited.any():
-        return "No joint has a range."
-    left = np.full(robot.nv, np.inf)
-    value, span = q[index[limited]], (upper - lower)[limited]
-    left[limited] = np.minimum(value - lower[limited], upper[limited] - value) / span
-    top = np.asarray(robot.velocity_limit)
-    names = {robot.joint_dof_index(name): name for name in robot.joint_names}
-    rows = []
-    for dof in np.argsort(left)[: min(_NEAREST, int(limited.sum()))]:
-        speed = f"{100.0 * abs(velocity[dof]) / top[dof]:.0f} %" if np.isfinite(top[dof]) and top[dof] > 0.0 else "free"
-        rows.append(f"| {names.get(int(dof), dof)} | {100.0 * max(left[dof], 0.0):.1f} % | {speed} |")
-    return "\n".join(["| joint | range left | of top speed |", "|:--|--:|--:|", *rows])

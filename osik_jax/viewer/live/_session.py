@@ -1,4 +1,4 @@
-"""Session: a robot by its source, its controller and its switched-off parts, as a file and as Python."""
+"""Session: a robot by its source, its controller and its switched-off parts, as a file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ from jaxtyping import Float
 
 from ..._errors import OsikValueError
 from ..._whole_file import write_text
-from ...limits import ConfigurationLimit, Limit, VelocityLimit, no_limits, with_own_limits
+from ...limits import Limit, no_limits, with_own_limits
 from ...robot import Robot
-from ...robot._load_robot import is_file, read_robot
-from ...robot.loading import is_mjcf
+from ...robot._load_robot import read_robot
 from ...saving._parts import decode_parts, encode_parts
 from ...schemes import Scheme
 from ...tasks import Task
-from ._python import python
 from ._step import Controller
 
 _FORMAT = "osik-jax session 1"
@@ -76,13 +74,8 @@ class Session:
         return (no_limits, *on) if self.limits_off else on
 
     def controller(self) -> Controller:
-        """Return the controller, in which switched-off tasks have weight 0 and switched-off limits are infinite.
-
-        So a switch compiles nothing. A switched-off limit that cannot be infinite is left out.
-        """
-        tasks = {name: task.replace(weight=0.0) if name in self.off else task for name, task in self.tasks.items()}
-        limits = [_loose(limit) if n in self.limits_off else limit for n, limit in enumerate(self.limits)]
-        return Controller(tasks, self.scheme, (no_limits, *(limit for limit in limits if limit is not None)))
+        """Return the controller of what is switched on."""
+        return Controller(self.active_tasks, self.scheme, self.active_limits)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the session to a file for ``load_session``.
@@ -111,34 +104,6 @@ class Session:
             "off": sorted(self.off),
         } | encode_parts(self.robot, self.tasks, self.scheme, self.limits)
         return json.dumps(content, indent=1) + "\n"
-
-    def to_python(self) -> str:
-        """Return a program that makes the same controller and takes one step, without switched-off parts.
-
-        Raises:
-            ValueError: as in ``save``.
-        """
-        if self.source is None:
-            raise OsikValueError("where the robot comes from is not known, so no program can load it: give source=")
-        tasks = {name: python(task, self.robot, name) for name, task in self.active_tasks.items()}
-        limits = [python(limit, self.robot) for limit in self.active_limits]
-        lines = [
-            "import jax",
-            "import numpy as np",
-            "import osik_jax as osik",
-            "",
-            'jax.config.update("jax_enable_x64", True)',
-            "",
-            f"robot = {self.source.python()}",
-            f"q = np.array({np.asarray(self.q).tolist()})",
-            "tasks = {",
-            *(f"    {name!r}: {text}," for name, text in tasks.items()),
-            "}",
-            f"limits = ({''.join(f'{text}, ' for text in limits).rstrip(' ')})",
-            f"scheme = {python(self.scheme, self.robot)}",
-            f"solution = osik.solve(robot, q, tasks, scheme=scheme, limits=limits, dt={self.dt!r})",
-        ]
-        return "\n".join(lines) + "\n"
 
 
 def load_session(path: str | os.PathLike[str]) -> Session:
@@ -178,16 +143,6 @@ def _session(content: Mapping[str, Any]) -> Session:
     return Session(robot, *decode_parts(content, robot), float(content["dt"]), q, **off, source=source)
 
 
-def _loose(limit: Limit) -> Limit | None:
-    """Return the limit with numbers that bound nothing, or None if it has no such numbers."""
-    if type(limit) is ConfigurationLimit:
-        free = np.full(limit.lower.shape, np.inf)
-        return limit.replace(lower=-free, upper=free)
-    if type(limit) is VelocityLimit:
-        return limit.replace(velocity=np.full(limit.velocity.shape, np.inf))
-    return None
-
-
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
     """Robot given by name or file."""
@@ -198,10 +153,3 @@ class RobotSource:
     def load(self) -> Robot:
         """Return the robot."""
         return read_robot(self.robot, floating_base=self.floating_base)
-
-    def python(self) -> str:
-        """Return the expression that loads it, in a program with ``import osik_jax as osik``."""
-        base = "" if self.floating_base is None else f", floating_base={self.floating_base}"
-        if not is_file(self.robot):
-            return f"osik.load_robot({self.robot!r}{base})"
-        return f"osik.Robot.{'from_mjcf' if is_mjcf(self.robot) else 'from_urdf'}({self.robot!r}{base})"

@@ -1,9 +1,10 @@
-"""Control step, compiled once: targets, gains and weights are arguments, so new ones compile nothing."""
+"""Controller of a live view: what a page edits, and the step that runs it."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -11,21 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from ..._errors import OsikTypeError, OsikValueError
-from ...control._checks import checked_limits
-from ...control._rollout import remembering
-from ...control._step import in_type_of
-from ...control._step import step as one_step
-from ...kinematics import forward_kinematics, integrate
+from ... import control
+from ..._errors import OsikTypeError, OsikValueError, OsikWarning
+from ...kinematics import forward_kinematics
 from ...limits import Limit
 from ...robot import Robot
 from ...schemes import Scheme
 from ...tasks import Task
-
-State = tuple[Array, Array, Any]
-"""State passed from step to step: configuration (nq,), velocity (nv,) and warm start."""
 
 
 class Controller(eqx.Module):
@@ -41,12 +36,8 @@ class Controller(eqx.Module):
     scheme: Scheme
     limits: tuple[Limit, ...]
 
-    def numbers(self) -> list[Array]:
-        """Return the numbers that may change without compiling, in a fixed order."""
-        return [leaf if isinstance(leaf, jax.Array) else jnp.asarray(leaf) for leaf in jax.tree.leaves(self)]
-
     def structure(self) -> tuple[Any, ...]:
-        """Return a key of the compiled program: controllers with equal structure share a program."""
+        """Return what two controllers have in common that differ in numbers alone."""
         leaves, tree = jax.tree.flatten(self)
         return (tree, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
 
@@ -77,38 +68,19 @@ def _aimed(task: Any, target: Any) -> Task:
     return eqx.tree_at(lambda own: own.target, task, new)
 
 
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """Compiled control step."""
+def laid_out(robot: Robot, controller: Controller, dt: float) -> control.Controller:
+    """Return the step of a controller for loops in plain Python.
 
-    # from the controller's numbers, the state and a push (nv,) to the next state, status and task errors
-    run: Callable[[list[Array], State, Array], tuple[State, Array, dict[str, Array]]]
-    cold: Any  # the warm start of a first step
-
-
-def compile_step(robot: Robot, controller: Controller, dt: float, batch: int | None = None) -> Program:
-    """Compile one step of a controller in the calling thread; takes seconds.
-
-    The push is a velocity (nv,) that is added to the controller's. For a batch, all numbers, states and pushes have a
-    leading axis.
+    Its warnings are left out: that a weighted scheme ignores priorities is no news in a page with a menu of schemes.
     """
-    tree = jax.tree.structure(controller)
-    numbers, lead = controller.numbers(), () if batch is None else (batch,)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", OsikWarning)
+        return control.Controller(robot, controller.tasks, scheme=controller.scheme, limits=controller.limits, dt=dt)
 
-    def step(numbers: list[Array], state: State, push: Array) -> tuple[State, Array, dict[str, Array]]:
-        own = jax.tree.unflatten(tree, numbers)
-        q, velocity, warm_start = state
-        tasks, limits = remembering((own.tasks, own.limits), velocity, True)
-        # not `solve`, which warns of a weighted scheme's ignored priorities: the page has a menu of schemes
-        answer = one_step(robot, q, tasks, own.scheme, checked_limits(robot, limits), in_type_of(dt, q), warm_start)
-        moved = integrate(robot, q, answer.velocity + push, dt)
-        return (moved, answer.velocity, answer.warm_start), answer.status, answer.error
 
-    run = step if batch is None else jax.vmap(step)
-    q, still = jnp.broadcast_to(robot.q0, (*lead, robot.nq)), jnp.zeros((*lead, robot.nv), robot.q0.dtype)
-    traced = jax.eval_shape(run, numbers, (q, still, None), still)
-    cold = jax.tree.map(jnp.zeros_like, traced[0][2])
-    return Program(jax.jit(run).lower(numbers, (q, still, cold), still).compile(), cold)
+def lane_of(controller: Controller, lane: int) -> Controller:
+    """Return the controller of one robot of a batch."""
+    return jax.tree.map(lambda leaf: leaf[lane], controller)
 
 
 def stacked(controllers: Sequence[Controller]) -> Controller:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from ..kinematics import forward_kinematics, frame_jacobian, integrate
-from ..robot import Robot
-from ..robot._joint_selection import scalar_layout
-from ..robot._tree import SLIDE
-from ..viewer._outline import Outline
-from ._motion import Goal, Path, Rows, Stroke, follow
+from osik_jax.demo._motion import Goal, Path, Rows, Stroke, follow
+from osik_jax.kinematics import forward_kinematics, frame_jacobian, integrate
+from osik_jax.robot import Robot
+from osik_jax.robot._joint_selection import scalar_layout
+from osik_jax.robot._mujoco import mujoco_poses
+from osik_jax.robot._tree import SLIDE
+from osik_jax.viewer._outline import base_height, lowest_points
+from osik_jax.viewer._parts import robot_parts
 
 SWAY = 0.05
 """Distance of the frame's motion [m] for a robot sized between ``_SMALL`` and ``_LARGE``; the same share of the size
@@ -34,6 +37,23 @@ _CANDIDATES, _REACH, _MARGIN = 256, 0.8, 0.1
 """Configurations to choose from, their distance from home in strides, and the share of its range by which a joint stays
 off its limits, so that the motion has room.
 """
+
+
+class Outline(NamedTuple):
+    """Dimensions of a robot at one configuration."""
+
+    size: float  # diagonal of a box about all that is drawn of it [m]
+    lowest: float  # height of its lowest point [m]
+    base: float  # height of the lowest point of what is fixed to the world, 0 where nothing of that is drawn [m]
+
+
+def robot_outline(robot: Robot, q: ArrayLike) -> Outline:
+    """Return the dimensions of a robot at a configuration, (nq,)."""
+    shape = robot_parts(robot)
+    data = next(mujoco_poses(robot, q))
+    heights = lowest_points(shape, data)
+    size = float(np.linalg.norm(np.ptp(shape.corners(data), axis=0)))
+    return Outline(size, float(heights.min()), base_height(shape, heights))
 
 
 def sway_of(size: float) -> float:

@@ -8,14 +8,13 @@ from mujoco_states import mujoco_at
 from task_checks import kinematics_at
 
 import osik_jax as osik
+from benchmarks.demonstrated import file_motion, guess_moving_frame
+from benchmarks.swaying import JointPath, robot_outline, strides, sway_of
 from osik_jax.demo._figures import figures
-from osik_jax.demo._file import file_motion
 from osik_jax.demo._run import run_scheme
-from osik_jax.demo._sway import JointPath, strides, sway_of
 from osik_jax.robot._feet import guess_feet
 from osik_jax.robot._mujoco import mujoco_frame_pose
 from osik_jax.viewer._crouch import crouched
-from osik_jax.viewer._outline import robot_outline
 
 LINK = """<link name="{0}"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>
 </inertial><visual><origin xyz="0 0 {1}"/><geometry><cylinder radius="{2}" length="{3}"/></geometry></visual></link>"""
@@ -154,4 +153,9 @@ def test_a_walker_stands_on_the_floor():
     assert robot_outline(robot, motion.q0).lowest == pytest.approx(0.0, abs=1e-9)
     heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
     assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
-    assert motion.notes == ()
+
+
+def test_feet_and_hands_are_guessed(nao):
+    assert guess_feet(nao) == ("l_sole", "r_sole")
+    assert guess_moving_frame(nao) == "torso"
+    assert guess_moving_frame(osik.load_robot("arm7")) == "hand"

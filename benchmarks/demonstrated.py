@@ -1,4 +1,4 @@
-"""Waist or hand motion for a user's robot."""
+"""Waist or hand motion of any robot, for the demonstrations of ``contact_sheet``."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from .._errors import OsikValueError
-from ..kinematics import forward_kinematics
-from ..physics._world import contact_corners
-from ..robot import Robot
-from ..robot._feet import guess_feet
-from ..robot._hands import find_hands
-from ..tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
-from ..viewer._crouch import crouched
-from ..viewer._outline import robot_outline
-from ._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
-from ._sway import SWAY, dexterous_start, sway, sway_of
+from osik_jax._errors import OsikValueError
+from osik_jax.demo._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tracking
+from osik_jax.kinematics import forward_kinematics
+from osik_jax.physics._world import contact_corners
+from osik_jax.robot import Robot
+from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._hands import find_hands
+from osik_jax.tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
+from osik_jax.viewer._crouch import crouched
+
+from .swaying import SWAY, dexterous_start, robot_outline, sway, sway_of
 
 
 def file_motion(
@@ -66,19 +66,11 @@ def file_motion(
     }
     # weak and slow: the posture only decides between motions that serve the other tasks
     still["posture"] = PostureTask(robot, target=q0, weight=1e-2, gain=1.0, priority=4)
-    corners, notes = {foot: _corners(robot, foot) for foot in standing}, []
+    corners = {foot: _corners(robot, foot) for foot in standing}
     balanced = sum(len(points) for points in corners.values()) >= 3
     if balanced:
         polygon = support_polygon(robot, q0, standing, margin=MARGIN, corners=corners)
         still["com"] = ComTask(robot, polygon=polygon, weight=1e3, gain=GAIN, priority=2)
-    elif standing:
-        known = f"no contact corners are known of {', '.join(standing)} (sites NAME_corner_0, NAME_corner_1, ...)"
-        notes.append(f"{known}, so balance is neither asked for nor reported")
-    look = robot.holder.look
-    if look is not None and look.read.missing:
-        first, *others = look.read.missing
-        more = f" and {len(others)} more" if others else ""
-        notes.append(f"the pictures do without mesh files that cannot be read: {first}{more}")
     goal = sway(robot, q0, moving, size=outline.size, duration=duration)
     follower, label = tracking(robot, goal, weight=1e2, priority=3), "waist" if robot.floating_base else "hand"
     return Motion(
@@ -91,7 +83,6 @@ def file_motion(
         stances=tuple(Stance(foot, points, flat=rows == "pose") for foot, points in corners.items()),
         goals={label: goal},
         balanced=balanced,
-        notes=tuple(notes),
         scale=sway_of(outline.size) / SWAY,
     )
 
@@ -102,11 +93,11 @@ def _check_frames(robot: Robot, moving: str, standing: Sequence[str]) -> None:
         robot.tree.frame(chosen)
     if robot.floating_base and not standing:
         raise OsikValueError(
-            "the base floats and none of the frames looks like a foot: say which ones stand with --support NAME..., or "
-            f"--base fixed; frames: {', '.join(robot.frame_names)}"
+            "the base floats and none of the frames looks like a foot: name those that stand; "
+            f"frames: {', '.join(robot.frame_names)}"
         )
     if moving in standing:
-        raise OsikValueError(f"frame {moving!r} cannot both move and stand; choose another --frame or --support")
+        raise OsikValueError(f"frame {moving!r} cannot both move and stand; choose another")
 
 
 def _corners(robot: Robot, foot: str) -> Float[np.ndarray, "k 3"]:
