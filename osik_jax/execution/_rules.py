@@ -156,6 +156,56 @@ ad.primitive_jvps[_ruled] = _differentiate
 batching.primitive_batchers[_ruled] = _batch
 
 
+def by_platform(kernels: dict[str, Callable[..., Any]], otherwise: Callable[..., Any], *args: Any) -> Any:
+    """Return the result of the function of the platform that a program is lowered for, as ``lax.platform_dependent``.
+
+    ``otherwise`` is for other platforms and is traced only if a program is lowered for one of them: half of the time
+    until a first answer. It needs all arrays as arguments, and returns arrays of the same types as the kernels.
+
+    Args:
+        kernels: functions by platform, at least one.
+        otherwise: the function for all other platforms.
+        args: pytrees of arrays.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    traced = [jax.make_jaxpr(kernel, return_shape=True)(*args) for kernel in kernels.values()]
+    doubles = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+    def late(*leaves: ArrayLike) -> list[ArrayLike]:
+        with jax.enable_x64(doubles):
+            return jax.tree.leaves(otherwise(*tree.unflatten(leaves)))
+
+    bodies = tuple(body for body, _ in traced)
+    results = _by_platform.bind(*leaves, platforms=tuple(kernels), bodies=bodies, otherwise=late)
+    return jax.tree.unflatten(jax.tree.structure(traced[0][1]), results)
+
+
+_by_platform = Primitive("by_platform")
+_by_platform.multiple_results = True
+
+
+def _lower_for(platform: str | None, context: Any, *operands: Any, platforms: Any, bodies: Any, otherwise: Any) -> Any:
+    body = dict(zip(platforms, bodies, strict=True)).get(platform)
+    function = otherwise if body is None else jaxpr_as_fun(body)
+    return mlir.lower_fun(function, multiple_results=True)(context, *operands)
+
+
+def _batch_all(
+    leaves: Sequence[ArrayLike], axes: Sequence[int | None], *, platforms: Any, bodies: Any, otherwise: Any
+) -> tuple[list[ArrayLike], list[int]]:
+    wide = [jax.vmap(f, in_axes=tuple(axes)) for f in (*map(jaxpr_as_fun, bodies), otherwise)]
+    results = by_platform(dict(zip(platforms, wide, strict=False)), wide[-1], *leaves)
+    return results, [0] * len(results)
+
+
+_by_platform.def_impl(lambda *leaves, **given: jax.jit(partial(_by_platform.bind, **given))(*leaves))
+_by_platform.to_lojax = _by_platform.bind
+_by_platform.def_abstract_eval(lambda *_, bodies, **__: bodies[0].out_avals)
+for _platform in ("cpu", "cuda", None):
+    mlir.register_lowering(_by_platform, partial(_lower_for, _platform), platform=_platform)
+batching.primitive_batchers[_by_platform] = _batch_all
+
+
 def not_exported(tree: Any) -> Any:
     """Return the arrays unchanged; a program that contains them cannot be exported by ``jax.export``.
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from osik_jax.execution._rules import blocked, custom_jvp
+from osik_jax.execution._rules import blocked, by_platform, custom_jvp
 
 X = np.linspace(-1.0, 1.0, 23 * 3 * 2).reshape(23, 3, 2)
 
@@ -178,3 +178,24 @@ def test_what_is_given_by_keyword_is_static():
         for f in (lambda x: scaled(x, by=3.0), lambda x: 3.0 * jnp.sin(x))
     )
     np.testing.assert_allclose(ours, plainly, rtol=1e-14)
+
+
+def test_what_is_for_other_platforms_is_traced_only_for_them():
+    traced = []
+
+    def otherwise(x):
+        traced.append(x.dtype)
+        return jnp.cos(x)
+
+    def function(x):
+        return by_platform({"cpu": jnp.sin}, otherwise, x)
+
+    x = X[:, 0, 0]
+    for way in (function, jax.jit(function), jax.jit(jax.vmap(function))):
+        np.testing.assert_array_equal(way(x), jnp.sin(x))
+    programs = [jax.jit(way).trace(x) for way in (function, jax.vmap(function))]
+    assert traced == []
+    with jax.enable_x64(False):
+        texts = [program.lower(lowering_platforms=("cuda",)).as_text() for program in programs]
+    assert traced == [np.float64] * 2
+    assert all("stablehlo.cosine" in text and "sine %" not in text.replace("cosine", "") for text in texts)
