@@ -46,12 +46,17 @@ def drawn(robot: osik.Robot, q: Any) -> dict[int, np.ndarray]:
     return {body: np.concatenate(points) for body, points in out.items()}
 
 
-@pytest.fixture(scope="module")
-def desk() -> Iterator[Desk]:
-    """An arm that keeps off itself and has a ball."""
+def with_a_ball() -> Desk:
+    """Return an arm that keeps off itself and has a ball; nothing runs yet."""
     desk = Desk(default_session(ARM, source=RobotSource("arm7")), robot_parts(ARM))
     desk.avoid_itself()
     assert desk.add_obstacle("ball", np.array([0.0, 2.0, 0.5]), 1.0) == "ball 1"
+    return desk
+
+
+@pytest.fixture(scope="module")
+def desk() -> Iterator[Desk]:
+    desk = with_a_ball()
     with desk.loop as loop:
         assert loop.wait_until_ready(300.0)
         yield desk
@@ -174,8 +179,8 @@ def test_adding_moving_and_removing_compiles_nothing(desk: Desk) -> None:
     assert len(off.limits) == 4 and off.structure() != desk.session.controller().structure()
 
 
-def test_obstacles_are_kept_by_sessions_and_lines_of_python(desk: Desk) -> None:
-    now = desk.session
+def test_obstacles_are_kept_by_sessions_and_lines_of_python() -> None:
+    now = with_a_ball().session
     again = session_from_json(now.to_json())
     assert eqx.tree_equal(now.limits, again.limits)
     names: dict[str, Any] = {}
