@@ -195,9 +195,13 @@ def _bind_late(function: Callable[..., Any], args: Any, platforms: Any, bodies: 
     leaves, tree = jax.tree.flatten(args)
     doubles = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
-    def late(*leaves: ArrayLike) -> list[ArrayLike]:
+    def late(*leaves: ArrayLike) -> list[jax.Array]:
         with jax.enable_x64(doubles):
-            return jax.tree.leaves(function(*tree.unflatten(leaves)))
+            results = [jnp.asarray(a) for a in jax.tree.leaves(function(*tree.unflatten(leaves)))]
+        found, wanted = ([(a.shape, a.dtype) for a in arrays] for arrays in (results, types))
+        if found != wanted:
+            raise TypeError(f"a function traced late returns {found}; its program takes {wanted}")
+        return results
 
     return _late.bind(*leaves, late=late, platforms=platforms, bodies=bodies, types=tuple(types))
 

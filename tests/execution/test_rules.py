@@ -216,3 +216,5 @@ def test_what_is_traced_when_it_is_lowered_is_traced_once():
         np.testing.assert_array_equal(way(x), 2.0 * jnp.sin(x))
     assert traced == [x.shape, x.shape, (), ()]
     assert jax.eval_shape(jax.vmap(shifted), x).shape == x.shape and len(traced) == 4
+    with pytest.raises(TypeError, match="a function traced late returns"):
+        jax.jit(lambda x: when_lowered(lambda x: x[0], x, x))(x)
