@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from mujoco_states import mujoco_at
 from refusals import refuses
 from task_checks import kinematics_at
 
@@ -24,13 +23,6 @@ def tasks(arm):
 def pose(arm):
     position, rotation = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
     return position + 0.05, rotation @ jaxlie.SO3.from_z_radians(0.3).as_matrix()
-
-
-def test_frame_pose_is_that_of_mujoco(arm):
-    position, rotation = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
-    site = mujoco_at(arm, arm.q0).site("hand")
-    np.testing.assert_allclose(position, site.xpos, atol=1e-12)
-    np.testing.assert_allclose(rotation, site.xmat.reshape(3, 3), atol=1e-12)
 
 
 class TestTargetsOfSolve:
