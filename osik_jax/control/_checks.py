@@ -248,8 +248,9 @@ def _warn_of_idle_tasks(robot: Robot, q: Array, tasks: Mapping[str, Task], schem
     if named in _said_idle:
         return
     _said_idle.add(named)
-    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
-        rows = {name: np.asarray(own) for name, own in _equality_rows(robot, q, dict(tasks)).items()}
+    # the call may stand inside a program that has these numbers as constants: a compiled one runs there too
+    given = robot, q, dict(tasks)
+    rows = {name: np.asarray(own) for name, own in _equality_rows.lower(*given).compile()(*given).items()}
     for name, others in above.items():
         first = [rows[other] for other in others if other in rows]
         if first and _span(np.concatenate(first), rows[name]):

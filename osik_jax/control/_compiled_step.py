@@ -11,14 +11,14 @@ every step, searched or not, which costs more than the call.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from ..core import _library
 from ..execution._backends import cuda_is_default, on_platforms, takes
@@ -33,10 +33,11 @@ from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ..schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
-from ..solvers.hqp import Tolerances
+from ..solvers.hqp import Tolerances, WorkingSet
 from ..tasks import AdaptiveGain, PostureTask, Task, TaskRows
 from ..tasks._rows import rows_of
 from ..tasks._task import GIVEN, POSTURE, CoreCard
+from ._checks import check_rows
 from ._solution import Solution
 
 _LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
@@ -149,6 +150,7 @@ def given_rows(
     kinematics = kinematics_by(getattr(scheme, "backend", "jax"), robot, q)
     of_limits = limit_rows(robot, kinematics, q, with_rows, dt)
     rows = rows_of(robot, kinematics, q, {name: task.during(dt) for name, task in given.items()}) if given else {}
+    check_rows(rows, given, robot)
     return {name: _of_full_shape(own) for name, own in rows.items()}, of_limits
 
 
@@ -368,8 +370,8 @@ def _placed(
 
     for name, own in rows.items():
         upper, jacobian = (None if own.is_equality else own.upper), (None if own.dofs is not None else own.jacobian)
-        fields = own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None
-        found[name] = [add(part) for part in fields]
+        numbers = own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None
+        found[name] = [add(part) for part in numbers]
     limit_rows = [] if of_limits is None else [add(part) for part in jax.tree.leaves(of_limits)]
     return found, limit_rows, parts
 
@@ -401,11 +403,10 @@ def compiled(plain: Step) -> Step:
 
 def _steps(plain: Step, *given: Any) -> Solution:
     """Return the steps of all lanes; every array has a leading axis, of the lanes or of length 1."""
-    one = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), given)
-    like, packed = jax.eval_shape(plain, *one), _Arrays(given)
+    packed = _Arrays(given)
 
     def by_core(*arrays: Array) -> Solution:
-        return _unpacked(like, *_by_core(packed, *arrays))
+        return _by_core(packed, *arrays)
 
     def elsewhere(*arrays: Array) -> Solution:
         return over_lanes(plain)(*packed.leaves(arrays))
@@ -413,8 +414,8 @@ def _steps(plain: Step, *given: Any) -> Solution:
     return on_platforms({"core": by_core}, elsewhere, *packed.arrays)
 
 
-def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
-    """Return all numbers and all integers of the solutions, those of a lane one after another."""
+def _by_core(packed: _Arrays, *arrays: Array) -> Solution:
+    """Return the solutions of all lanes."""
     robot, q, tasks, scheme, limits, dt, warm_start = packed.leaves(arrays)
     rows, of_limits = over_lanes(given_rows)(robot, q, tasks, scheme, limits, dt)
     layout, numbered = Layout(robot, tasks, scheme, rows, row_count(of_limits)), packed.numbered()
@@ -435,15 +436,34 @@ def _by_core(packed: _Arrays, *arrays: Array) -> tuple[Array, Array]:
     labels = sum(int(np.prod(shape)) for shape in layout.labels)
     shapes = ((packed.lanes, robot.tree.nv + 2 + 2 * layout.rows), float), ((packed.lanes, 3 + labels), int)
     numbers, integers = _library.call("step", shapes, integers, *guesses, *given, layout.constants(q.dtype))
-    return numbers, integers
-
-
-def _unpacked(like: Solution, numbers: Float[Array, "lanes k"], integers: Array) -> Solution:
-    """Return the solutions of all lanes, from what ``_by_core`` returns; ``like`` has the shapes of one."""
-    leaves, tree = jax.tree.flatten(like)
+    # the numbers of a lane stand one after another
+    leaves, tree = jax.tree.flatten(solution_shapes(type(scheme), robot.tree.nv, layout.count, layout.labels))
     parts = [(integers, numbers)[kind][:, place] for kind, place in leaf_places(leaves)]
     found = [part.reshape(-1, *leaf.shape).astype(leaf.dtype) for part, leaf in zip(parts, leaves, strict=True)]
     return jax.tree.unflatten(tree, found)
+
+
+def solution_shapes(
+    scheme: type[Scheme], nv: int, rows: Mapping[str, int], labels: Sequence[tuple[int, ...]]
+) -> Solution:
+    """Return the solution of one step with shapes and types in place of arrays.
+
+    Args:
+        scheme: class of the scheme.
+        nv: length of the velocity.
+        rows: number of rows of each task.
+        labels: shapes of the warm start's arrays.
+    """
+    number, integer = (partial(jax.ShapeDtypeStruct, dtype=kind) for kind in (jnp.result_type(float), np.int32))
+    own: list[Any] = [integer(shape) for shape in labels]
+    by_name = {name: number((count,)) for name, count in rows.items()}
+    # without its constructor, which wants arrays
+    like, names = object.__new__(Solution), (field.name for field in fields(Solution))
+    warm_start = own[0] if scheme is WeightedQP else WorkingSet(*own) if scheme is HierarchicalQP else None
+    status = jax.ShapeDtypeStruct((), jnp.result_type(int))
+    values = number((nv,)), status, *[integer(())] * 2, *[number(())] * 2, by_name, by_name, warm_start
+    vars(like).update(zip(names, values, strict=True))
+    return like
 
 
 def leaf_places(leaves: Sequence[Any]) -> list[tuple[bool, slice]]:

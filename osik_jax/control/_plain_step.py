@@ -6,12 +6,11 @@ they are recognised by their identity, and only the configuration and what is ne
 
 from __future__ import annotations
 
-import dataclasses
 import operator
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -22,12 +21,11 @@ from ..core._plain import functions
 from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, with_own_limits
 from ..numerics._host import float_now, is_traced
 from ..robot import Robot
-from ..schemes import HierarchicalQP, Scheme, WeightedQP
+from ..schemes import Scheme
 from ..schemes._default import scheme_for
-from ..solvers.hqp import WorkingSet
 from ..tasks import Task
 from ._checks import LARGEST_GAIN, plain_configuration
-from ._compiled_step import is_compiled, leaf_places, missing_part
+from ._compiled_step import is_compiled, leaf_places, missing_part, solution_shapes
 from ._packed_step import pack
 from ._plain_rows import PlainRows, with_plain_rows
 from ._solution import Solution
@@ -414,15 +412,7 @@ def _makers(
         rows: names of the tasks in their order, with the number of rows of each.
         labels: shapes of the warm start's arrays.
     """
-    number, integer = (partial(jax.ShapeDtypeStruct, dtype=kind) for kind in (np.float64, np.int32))
-    own: list[Any] = [integer(shape) for shape in labels]
-    by_name = {name: number((count,)) for name, count in rows}
-    # without its constructor, which wants arrays
-    like, fields = object.__new__(Solution), (field.name for field in dataclasses.fields(Solution))
-    warm_start = own[0] if scheme is WeightedQP else WorkingSet(*own) if scheme is HierarchicalQP else None
-    values = number((nv,)), *[integer(())] * 3, *[number(())] * 2, by_name, by_name, warm_start
-    vars(like).update(zip(fields, values, strict=True))
-    leaves, structure = jax.tree.flatten(like)
+    leaves, structure = jax.tree.flatten(solution_shapes(scheme, nv, dict(rows), labels))
     # numbers by their index: a slice and its shape take longer
     places = [
         (kind, place if leaf.shape else place.start)

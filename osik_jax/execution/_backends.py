@@ -39,7 +39,7 @@ import jax
 from .._errors import OsikValueError
 from ..core import _cuda, _library
 from ._platform import cuda_is_default, default_platform, is_symbolic
-from ._rules import KERNEL_IN_EXPORT, not_exported
+from ._rules import KERNEL_IN_EXPORT, by_platform, not_exported
 
 Backend = Literal["auto", "jax", "core"]
 BACKENDS: tuple[str, ...] = get_args(Backend)
@@ -82,7 +82,8 @@ def takes(backend: Backend, kernel: str, *, fits: bool) -> bool:
 def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., Any], *args: Any) -> Any:
     """Call a kernel's function on the kernel's platform, and the search on other platforms.
 
-    The functions are not differentiated. One program may be lowered for several platforms.
+    The functions are not differentiated, and take all traced arrays as arguments. One program may be lowered for
+    several platforms.
     """
     if not kernels:
         return search(*args)
@@ -92,6 +93,4 @@ def on_platforms(kernels: dict[str, Callable[..., Any]], search: Callable[..., A
     def kept_here(kernel: Callable[..., Any]) -> Callable[..., Any]:
         return lambda *given: kernel(*not_exported(given))
 
-    return jax.lax.platform_dependent(
-        *args, default=search, **{_PLATFORM[name]: kept_here(kernel) for name, kernel in kernels.items()}
-    )
+    return by_platform({_PLATFORM[name]: kept_here(kernel) for name, kernel in kernels.items()}, search, *args)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from ._backends import CPU_KERNELS, on_platforms
 from ._platform import cpu_is_default
+from ._rules import when_lowered
 
 
 class Candidates(NamedTuple):
@@ -17,7 +18,7 @@ class Candidates(NamedTuple):
 
     # function of the problems that returns the kernel's candidates, each with a flag: certified or not
     certified: Callable[..., Any]
-    # function of these and the problems that returns the answers; it searches for the other problems
+    # function of these and the problems that returns answers of the same types; it searches for the other problems
     search_rest: Callable[..., Any]
 
     def answers(self, *problems: Any) -> Any:
@@ -33,7 +34,7 @@ def certified_or_searched(
 ) -> Any:
     """Solve a batch by the kernel of the platform and the search, or by the search alone.
 
-    If the only kernel is for CPUs and JAX's default backend is a CPU, the search is traced once for all platforms. On
+    If the only kernel is for CPUs and JAX's default backend is a CPU, one search is traced, for all platforms. On
     platforms without the kernel it begins with ``no_candidates``. The search may omit methods that the kernel has
     tried, so a program for such a platform is faster with ``backend="jax"``. ``kernels`` has the functions of each
     kernel by backend; ``no_candidates`` returns uncertified candidates, by default zeros.
@@ -45,4 +46,5 @@ def certified_or_searched(
     def zeros(*problems: Any) -> Any:
         return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(certified, *problems))
 
-    return search_rest(on_platforms({name: certified}, no_candidates or zeros, *problems), *problems)
+    candidates = on_platforms({name: certified}, no_candidates or zeros, *problems)
+    return when_lowered(search_rest, candidates, candidates, *problems)

@@ -156,6 +156,88 @@ ad.primitive_jvps[_ruled] = _differentiate
 batching.primitive_batchers[_ruled] = _batch
 
 
+def by_platform(kernels: dict[str, Callable[..., Any]], otherwise: Callable[..., Any], *args: Any) -> Any:
+    """Return the result of the function of the platform that a program is lowered for, as ``lax.platform_dependent``.
+
+    ``otherwise`` is for other platforms and is traced only if a program is lowered for one of them: half of the time
+    until a first answer. It needs all arrays as arguments, and returns arrays of the same types as the kernels.
+
+    Args:
+        kernels: functions by platform, at least one.
+        otherwise: the function for all other platforms.
+        args: pytrees of arrays.
+    """
+    traced = [jax.make_jaxpr(kernel, return_shape=True)(*args) for kernel in kernels.values()]
+    bodies = tuple(body for body, _ in traced)
+    results = _bind_late(otherwise, args, tuple(kernels), bodies, bodies[0].out_avals)
+    return jax.tree.unflatten(jax.tree.structure(traced[0][1]), results)
+
+
+def when_lowered(function: Callable[..., Any], like: Any, *args: Any) -> Any:
+    """Return the function's result, traced only when the program is lowered; it is not differentiated.
+
+    Batches and derivatives trace functions again and again, and lower one of these traces.
+
+    Args:
+        function: needs all arrays as arguments.
+        like: arrays with the shapes and types of its results.
+        args: pytrees of arrays.
+    """
+    leaves, tree = jax.tree.flatten(like)
+    return jax.tree.unflatten(tree, _bind_late(function, args, (), (), tuple(map(_strong_type, leaves))))
+
+
+def _strong_type(a: Any) -> Any:
+    return jax.typeof(a).update(weak_type=False)
+
+
+def _bind_late(function: Callable[..., Any], args: Any, platforms: Any, bodies: Any, types: Any) -> list[Any]:
+    leaves, tree = jax.tree.flatten(args)
+    doubles = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+
+    def late(*leaves: ArrayLike) -> list[jax.Array]:
+        with jax.enable_x64(doubles):
+            results = [jnp.asarray(a) for a in jax.tree.leaves(function(*tree.unflatten(leaves)))]
+        found, wanted = ([(a.shape, a.dtype) for a in arrays] for arrays in (results, types))
+        if found != wanted:
+            raise TypeError(f"a function traced late returns {found}; its program takes {wanted}")
+        return results
+
+    return _late.bind(*leaves, late=late, platforms=platforms, bodies=bodies, types=tuple(types))
+
+
+_late = Primitive("late")
+_late.multiple_results = True
+
+
+def _lower_late(
+    platform: str | None, context: Any, *operands: Any, late: Any, platforms: Any, bodies: Any, **_: Any
+) -> Any:
+    body = dict(zip(platforms, bodies, strict=True)).get(platform)
+    function = late if body is None else jaxpr_as_fun(body)
+    return mlir.lower_fun(function, multiple_results=True)(context, *operands)
+
+
+def _batch_late(
+    leaves: Sequence[ArrayLike], axes: Sequence[int | None], *, late: Any, platforms: Any, bodies: Any, types: Any
+) -> tuple[list[ArrayLike], list[int]]:
+    wide = [jax.vmap(f, in_axes=tuple(axes)) for f in (*map(jaxpr_as_fun, bodies), late)]
+    if bodies:
+        results = by_platform(dict(zip(platforms, wide, strict=False)), wide[-1], *leaves)
+    else:
+        size = next(jnp.shape(a)[axis] for a, axis in zip(leaves, axes, strict=True) if axis is not None)
+        results = when_lowered(wide[-1], [jnp.zeros((size, *own.shape), own.dtype) for own in types], *leaves)
+    return results, [0] * len(results)
+
+
+_late.def_impl(lambda *leaves, **given: jax.jit(partial(_late.bind, **given))(*leaves))
+_late.to_lojax = _late.bind
+_late.def_abstract_eval(lambda *_, types, **__: types)
+for _platform in ("cpu", "cuda", None):
+    mlir.register_lowering(_late, partial(_lower_late, _platform), platform=_platform)
+batching.primitive_batchers[_late] = _batch_late
+
+
 def not_exported(tree: Any) -> Any:
     """Return the arrays unchanged; a program that contains them cannot be exported by ``jax.export``.
 

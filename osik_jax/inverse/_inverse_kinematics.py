@@ -21,7 +21,7 @@ from ..control._checks import check_setting, checked_limits, checked_start
 from ..kinematics._pose_forms import PoseLike
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
 from ..numerics._arguments import check_count, concrete
-from ..numerics._host import is_traced
+from ..numerics._host import is_traced, untraced
 from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
 from ..robot._configuration import check_configuration
@@ -183,7 +183,7 @@ def inverse_kinematics(
         return found if many or not (all or is_traced(found)) else jax.tree.map(lambda a: a[0], found)
     most, by_core = once * (1 + restarts), not traced and whole_is_possible(route, every=nearest or all)
     # inside jit, operations on numbers would be traced too
-    with nullcontext() if traced else jax.ensure_compile_time_eval():
+    with nullcontext() if traced else untraced():
         if by_core and not problem.many:
             at_once = found_at_once(*given, most, steps, how, route=route)
             if at_once is not None and all:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
 
 if TYPE_CHECKING:
@@ -31,6 +33,19 @@ def module_of(array: Any) -> ModuleType:
 def is_traced(tree: Any) -> bool:
     """Return whether a leaf of the tree is traced."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
+def untraced() -> AbstractContextManager[None]:
+    """Return a context in which operations on numbers are run, also where a program is being traced.
+
+    ``jax.ensure_compile_time_eval`` alone would also run what is constant in programs that are first called in it: each
+    operation is a program of its own, and an inverse by tasks has hundreds.
+    """
+    return nullcontext() if get_opaque_trace_state("flax") == _OUTSIDE else jax.ensure_compile_time_eval()
+
+
+_OUTSIDE = get_opaque_trace_state("flax")
+"""The state of JAX where nothing is traced; another one if this module is first imported inside a program."""
 
 
 def to_host(value: Any, dtype: Any = None) -> np.ndarray:

@@ -374,7 +374,7 @@ def test_locked_joints_and_excludes_of_the_model_make_no_pairs():
     assert named(with_lock) & pair_set("upper hand", "floor middle") == pair_set("floor middle")
 
 
-def test_mistakes_arenamed(arm, avoidance):
+def test_mistakes_are_named(arm, avoidance):
     refuses(ValueError, "all 5 pairs are nearer than 9", osik.CollisionAvoidanceLimit, arm, q0_distance=9.0)
     refuses(ValueError, "detection_distance", osik.CollisionAvoidanceLimit, arm, detection_distance=0.0)
     refuses(ValueError, "max_pairs", osik.CollisionAvoidanceLimit, arm, max_pairs=0)

@@ -143,7 +143,7 @@ def test_derivatives_are_central_differences(scheme):
     assert_slopes_are_differences(cost, q, jnp.array([0.4, 0.1, 0.5]), jnp.asarray(3.0))
 
 
-@pytest.mark.variants(release=["hierarchy", "null-space", "saturated"])
+@pytest.mark.variants(slow=["weighted"], release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_share(scheme):
     robot = osik.load_robot("arm7")

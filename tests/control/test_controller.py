@@ -288,8 +288,9 @@ def test_wrong_arguments_are_named(arm: osik.Robot) -> None:
     refuses(TypeError, "has no 'target'", osik.Controller(arm, bounded, dt=DT).step, arm.q0, {"speed": arm.q0})
 
 
-def test_few_steps_are_kept(arm: osik.Robot) -> None:
-    tasks = {"posture": osik.PostureTask(arm)}
-    for k in range(_plain_step._MOST + 3):
-        osik.solve(arm, arm.q0, {f"posture {k}": tasks["posture"]})
-    assert len(_plain_step._kept) <= _plain_step._MOST
+def test_few_steps_are_kept(arm: osik.Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_plain_step, "_MOST", 4)
+    _plain_step._kept.clear()
+    for k in range(7):
+        osik.solve(arm, arm.q0, {f"posture {k}": osik.PostureTask(arm)})
+    assert [next(iter(kept._seen)) for kept in _plain_step._kept.values()] == [f"posture {k}" for k in range(3, 7)]

@@ -37,7 +37,7 @@ def test_the_right_active_set_takes_one_factorisation(qps):
     np.testing.assert_allclose(warm.x, cold.x, rtol=0, atol=1e-13)
 
 
-@pytest.mark.variants(slow=["pinned"], release=["mixed", "duplicated_rows"])
+@pytest.mark.variants(slow=["pinned", "scaled_altogether"], release=["mixed", "duplicated_rows"])
 @pytest.mark.parametrize("family", ["mixed", "duplicated_rows", "pinned", "scaled_altogether"])
 def test_random_active_sets_with_rows(family, rng):
     p = PLANTED[family](rng, 500)

@@ -250,5 +250,7 @@ def test_beside_a_gpu_too_the_kernel_and_the_search_return_the_same_types(monkey
     solve = partial(cast(Any, solved).__wrapped__, backend="core", method="saturated")
     jax.clear_caches()
     with jax.enable_x64(precision == "float64"):
-        jax.make_jaxpr(solve)(jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES["damped inequalities"]))
+        given = jax.tree.map(lambda a: jnp.asarray(a, precision), FAMILIES["damped inequalities"])
+        for platform in ("cpu", "cuda"):  # each traces what runs there
+            jax.jit(solve).trace(given).lower(lowering_platforms=(platform,))
     jax.clear_caches()

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from osik_jax.execution._rules import blocked, custom_jvp
+from osik_jax.execution._rules import blocked, by_platform, custom_jvp, when_lowered
 
 X = np.linspace(-1.0, 1.0, 23 * 3 * 2).reshape(23, 3, 2)
 
@@ -178,3 +178,43 @@ def test_what_is_given_by_keyword_is_static():
         for f in (lambda x: scaled(x, by=3.0), lambda x: 3.0 * jnp.sin(x))
     )
     np.testing.assert_allclose(ours, plainly, rtol=1e-14)
+
+
+def test_what_is_for_other_platforms_is_traced_only_for_them():
+    traced = []
+
+    def otherwise(x):
+        traced.append(x.dtype)
+        return jnp.cos(x)
+
+    def function(x):
+        return by_platform({"cpu": jnp.sin}, otherwise, x)
+
+    x = X[:, 0, 0]
+    for way in (function, jax.jit(function), jax.jit(jax.vmap(function))):
+        np.testing.assert_array_equal(way(x), jnp.sin(x))
+    programs = [jax.jit(way).trace(x) for way in (function, jax.vmap(function))]
+    assert traced == []
+    with jax.enable_x64(False):
+        texts = [program.lower(lowering_platforms=("cuda",)).as_text() for program in programs]
+    assert traced == [np.float64] * 2
+    assert all("stablehlo.cosine" in text and "sine %" not in text.replace("cosine", "") for text in texts)
+
+
+def test_what_is_traced_when_it_is_lowered_is_traced_once():
+    traced = []
+
+    def function(x):
+        traced.append(x.shape)
+        return {"sine": jnp.sin(x)}
+
+    def shifted(x):
+        return 2.0 * when_lowered(function, {"sine": x}, x)["sine"]
+
+    x = X[:, 0, 0]
+    for way in (shifted, jax.jit(shifted), jax.jit(jax.vmap(shifted)), lambda x: jax.lax.map(shifted, x)):
+        np.testing.assert_array_equal(way(x), 2.0 * jnp.sin(x))
+    assert traced == [x.shape, x.shape, (), ()]
+    assert jax.eval_shape(jax.vmap(shifted), x).shape == x.shape and len(traced) == 4
+    with pytest.raises(TypeError, match="a function traced late returns"):
+        jax.jit(lambda x: when_lowered(lambda x: x[0], x, x))(x)

@@ -9,7 +9,11 @@ SCRIPT = """
 import json, sys, warnings
 import jax, numpy as np
 import osik_jax as osik
-loaded = [name for name in ("mujoco.mjx", "scipy.spatial", "matplotlib", "optax") if name in sys.modules]
+heavy = "mujoco.mjx", "scipy.spatial", "optax", "matplotlib", "tyro", "rich"
+heavy += "osik_jax.viewer", "osik_jax.demo", "osik_jax.cli"
+loaded = [name for name in heavy if name in sys.modules]
+import osik_jax.viewer
+loaded += [name for name in ("matplotlib.pyplot",) if name in sys.modules]
 from every_class import all_limits, all_tasks
 
 warnings.simplefilter("ignore")

@@ -214,7 +214,12 @@ def test_pure_form_is_differentiable_and_batched(arm, rng):
         options |= dict(position_tolerance=1e-8, orientation_tolerance=1e-8)
         return osik.inverse_kinematics(arm, {"hand": (position, rotation)}, q0=start, **options).q
 
-    both = jax.jit(jax.vmap(lambda p, q: (find(p, q), jax.jacfwd(find)(p, q), jax.jacrev(find)(p, q))))
+    @jax.jit
+    @jax.vmap
+    def both(position, start):
+        q, backward = jax.vjp(lambda position: find(position, start), position)
+        return q, jax.jacfwd(find)(position, start), jax.vmap(backward)(jnp.eye(arm.nq))[0]
+
     positions = jnp.asarray(mujoco_pose(arm, np.asarray(arm.q0), "hand")[0] + rng.uniform(-0.1, 0.1, (2, 3)))
     q, forward, reverse = both(positions, jnp.stack([arm.q0 + 0.1, arm.q0 - 0.1]))
     np.testing.assert_allclose(forward, reverse, atol=1e-10)

@@ -35,7 +35,7 @@ def nearest_in_cap(target: np.ndarray, angle: float) -> np.ndarray:
     return CENTER + LENGTH * np.array([*(np.sin(tilt) * across), np.cos(tilt)])
 
 
-@pytest.mark.variants(slow=["WeightedQP-75.0"], release=["HierarchicalQP-12.0", "WeightedQP-12.0"])
+@pytest.mark.variants(slow=["HierarchicalQP-75.0"], release=["HierarchicalQP-12.0", "WeightedQP-12.0"])
 @pytest.mark.parametrize("degrees", [12.0, 75.0])
 @pytest.mark.parametrize("scheme", [osik.WeightedQP, osik.HierarchicalQP])
 def test_no_step_leaves_the_range_and_the_nearest_point_is_reached(degrees: float, scheme: type):

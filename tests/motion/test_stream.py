@@ -72,13 +72,15 @@ def test_a_chunk_that_cannot_be_kept_within_limits_is_not_taken(rng) -> None:
     np.testing.assert_array_equal(found.at(time), own.at(time))
 
 
+@pytest.mark.slow
 def test_many_streams_are_those_of_a_loop(rng) -> None:
     walks = np.stack([walk(rng) for _ in range(3)])
     nows = np.array([0.0, 0.0, 0.02])
     own = push(stream(), walk(rng), TIMES - 0.3, -0.3)
-    found = jax.vmap(lambda points, now: own.push(points, TIMES, now).at(jnp.linspace(0.1, 0.9, 9)))(walks, nows)
+    time = jnp.linspace(0.1, 0.9, 9)
+    found = jax.jit(jax.vmap(lambda points, now: own.push(points, TIMES, now).at(time)))(walks, nows)
     for points, now, states in zip(walks, nows, found, strict=True):
-        np.testing.assert_allclose(states, push(own, points, TIMES, now).at(np.linspace(0.1, 0.9, 9)), atol=1e-9)
+        np.testing.assert_allclose(states, push(own, points, TIMES, now).at(time), atol=1e-9)
 
 
 def test_what_cannot_be_is_refused() -> None:

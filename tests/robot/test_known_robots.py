@@ -28,6 +28,8 @@ ROBOTS = {
     "tiago": ("tiago_description/robots/tiago.urdf", True),
     "tiago_pro": ("tiago_pro_description/robots/tiago_pro.urdf", True),
 }
+SLOW = {"talos", "romeo", "solo12", "tiago"}
+"""Robots whose files have nothing that the others lack."""
 CONFIGURATIONS = 4
 ARRAYS = ("position", "rotation", "jacobian", "com", "com_jacobian", "mass_matrix", "momentum")
 
@@ -196,7 +198,9 @@ def pinocchio_evaluate(robot: osik.Robot, model: pin.Model, description: Descrip
     )
 
 
-@pytest.fixture(scope="module", params=ROBOTS)
+@pytest.fixture(
+    scope="module", params=[pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in ROBOTS]
+)
 def case(request: pytest.FixtureRequest) -> Case:
     name = request.param
     path, floating = urdf_path(name), ROBOTS[name][1]

@@ -244,7 +244,7 @@ def test_contradictions_stay_in_their_lane(arm, lanes, spoiled, name):
         assert 0.5 < ours.box_violation[3] <= 1.0 + 1e-9
 
 
-@pytest.mark.variants(slow=["saturated"])
+@pytest.mark.variants(slow=["saturated", "hierarchical"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_nothing_to_do_is_no_contradiction(arm, lanes, name):
     """Where all is met to rounding the velocity is rounding, and what it misses of the constraints as large."""

@@ -15,6 +15,9 @@ def products_of(jaxpr: Any) -> Iterator[Any]:
             (contracted, _), (batched, _) = equation.params["dimension_numbers"]
             if contracted and all(v.aval.ndim > len(contracted) + len(batched) for v in equation.invars):
                 yield equation.params["precision"]
+        if "late" in equation.params:  # what is traced only where a program is for another platform
+            given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
+            yield from products_of(jax.make_jaxpr(equation.params["late"])(*given).jaxpr)
         for value in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):

@@ -52,13 +52,11 @@ def plainly(tasks: Any, scheme: Any, *rest: Any) -> tuple[Any, ...]:
 
 def by_core(robot: osik.Robot, q: Any, *rest: Any) -> tuple[osik.Solution, np.ndarray]:
     """The core's answers for lanes of q, and which are certified."""
-    lanes = in_plain_jax.eval_shape(robot, q, *plainly(*rest))
-    like = jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape[1:], a.dtype), lanes)
 
     @jax.jit  # one program: its operations by themselves would be hundreds
     def program(*given: Any) -> osik.Solution:
         packed = _compiled_step._Arrays(given)
-        return _compiled_step._unpacked(like, *_compiled_step._by_core(packed, *packed.arrays))
+        return _compiled_step._by_core(packed, *packed.arrays)
 
     first, *others = jax.tree.map(lambda a: jnp.asarray(a)[None], (robot, *rest))
     found = program(first, q, *others)

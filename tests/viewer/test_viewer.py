@@ -1,8 +1,6 @@
 """The viewer against MuJoCo: where faces, cameras, rays and pictures put a robot."""
 
 import os
-import subprocess
-import sys
 
 import jax
 import mujoco
@@ -273,18 +271,3 @@ def test_hero_picture_shows_every_instant(tmp_path, nao):
     orange = (pixels[..., 0] - pixels[..., 2]) > 90
     counts = [orange[:, 100 * k : 100 * (k + 1)].sum() for k in range(3)]
     assert min(counts) > 0.6 * max(counts) > 20
-
-
-@pytest.mark.variants(slow=["osik_jax.viewer"])
-@pytest.mark.parametrize(
-    ("module", "heavy"),
-    [
-        ("osik_jax", ("matplotlib", "tyro", "rich", "osik_jax.viewer", "osik_jax.demo", "osik_jax.cli")),
-        ("osik_jax.viewer", ("matplotlib.pyplot",)),
-    ],
-    ids=["osik_jax", "osik_jax.viewer"],
-)
-def test_an_import_loads_no_drawing(module, heavy):
-    code = f"import sys, {module}; print([m for m in sys.modules if m.startswith({heavy})])"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert out.stdout.strip().splitlines()[-1] == "[]"

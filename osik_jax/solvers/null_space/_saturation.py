@@ -119,12 +119,11 @@ def _kernel_candidates(
 ) -> Candidates:
     """Return the function that uses a kernel, which checks its own answers, and the search in blocks for the rest."""
 
-    def certified(problem: Problem) -> tuple[SaturatedResult, Array]:
-        result = solve(problem, max_iterations)
-        return result, result.done | (result.iterations >= max_iterations)
+    def certified(problem: Problem) -> SaturatedResult:
+        return solve(problem, max_iterations)
 
-    def search_rest(candidates: tuple[SaturatedResult, Array], problem: Problem) -> SaturatedResult:
-        result, is_final = candidates
+    def search_rest(result: SaturatedResult, problem: Problem) -> SaturatedResult:
+        is_final = result.done | (result.iterations >= max_iterations)
         return with_a_few(problem, result, is_final, lambda problem, _: search(problem), block)
 
     return Candidates(certified, search_rest)
