@@ -33,13 +33,12 @@ from ...numerics._constants import (
     VALUE_TOL,
 )
 from ...numerics._dense import apply
-from .._goldfarb_idnani import Roundoff
 from . import _core, _cuda
 from ._core import Candidate
 from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
 from ._problem import QP, active_bounds, constraint_scales, gradient_scale, kkt_residual, multiplier_roundoff, unpack
-from ._search import SearchResult, initial_result, search, usable_guess, violated_conditions
+from ._search import Roundoff, SearchResult, initial_result, search, usable_guess, violated_conditions
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
 """Block size of the search on a GPU: a 16th of the batch, at least 1,024 problems."""
@@ -125,7 +124,7 @@ def core_candidates(kkt_tol: float, max_iterations: int) -> Candidates:
             data, tolerance = given
             like = jax.tree.map(lambda a: a[0], qp)
             block = data if isinstance(data, QP) else jax.vmap(partial(unpack, like))(*data)
-            end = search(block, result.active, tolerance, max_iterations=max_iterations, by_pivots=False)
+            end = search(block, result.active, tolerance, max_iterations=max_iterations)
             return end._replace(factorizations=end.factorizations + result.factorizations)
 
         # as few arrays as can be: most problems are done
@@ -167,9 +166,6 @@ def _as_result(
         factorizations=candidate.factorizations,
         done=is_certified,
         optimal=is_certified,
-        infeasible_ends=zeros,
-        cold=zeros.astype(bool),
-        used_newton=zeros.astype(bool),
         infeasible=zeros.astype(bool),
         compliance=qp.compliance,
         residual=residual,

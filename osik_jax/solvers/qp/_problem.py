@@ -96,6 +96,13 @@ def active_bounds(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_an
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
 
 
+def in_units(qp: QP, unit: Float[Array, " n"]) -> QP:
+    """Return the problem in other units of the variables: of x / unit."""
+    per_constraint = jnp.concatenate([unit, jnp.ones_like(qp.compliance)])
+    bounds = qp.lower / per_constraint, qp.upper / per_constraint
+    return QP(qp.cost.in_units(unit), qp.rows * unit, qp.compliance, bounds[0], bounds[1], qp.known_equalities)
+
+
 def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
     """Return compliances with hard rows made soft: curvature ``penalty_ratio`` times the largest one of the cost."""
     is_soft = qp.compliance > 0.0
