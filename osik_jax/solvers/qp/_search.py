@@ -22,7 +22,6 @@ from ...numerics._constants import (
     INACTIVE,
     INFEASIBLE_COMPLIANCE,
     KKT_TOLERANCE,
-    REDUNDANCY_TOL,
     RELAXED,
     SEARCH_TOLERANCES,
 )
@@ -46,7 +45,6 @@ class SearchResult(NamedTuple):
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
     active: Int[Array, " m"]
-    redundant: Bool[Array, " m"]  # equalities that the active constraints imply
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]
@@ -64,7 +62,6 @@ def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B
         x=jnp.zeros((batch, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
         active=jax.vmap(usable_guess)(qp, guess),
-        redundant=jnp.zeros(guess.shape, bool),
         iterations=zeros,
         factorizations=zeros,
         done=no,
@@ -196,8 +193,8 @@ def violated_conditions(
     multipliers = jnp.concatenate([gradient, y])
     # primal feasibility, the equalities, and dual feasibility
     gap = _gaps(qp, x, y)
-    inactive_equality = qp.equality & (active == INACTIVE) & ~result.redundant
-    violated = gap > jnp.where(result.redundant, REDUNDANCY_TOL[x.dtype], 1.0) * roundoff.value
+    inactive_equality = qp.equality & (active == INACTIVE)
+    violated = gap > roundoff.value
     wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, -jnp.inf))
     return violated | inactive_equality | (wrong_sign > roundoff.multiplier)
 
