@@ -97,15 +97,6 @@ FARKAS_MARGIN = 1e-3
 """Part by which a Farkas certificate exceeds its bound: where rows just hold, the two differ by roundoff alone."""
 SINGLE_TOL = 1e-7
 """Least tolerance of a kernel in single precision and of its certificate; the search uses the requested one."""
-VALUE_TOL, SIGN_TOL = 30.0, 2.0
-"""Certificate limits in units of the tolerance: distance of a value from its bound or of a gradient from 0, and size of
-a multiplier of the wrong sign.
-
-The second is smaller: a multiplier of the wrong sign means a wrong active set, whose cost grows as the curvature left
-by the rows weakens.
-"""
-GRADIENT_TOL = 4.0
-"""Largest certified gradient of a free variable, in units of machine epsilon times the gradient's terms."""
 BOX_TOLERANCE = 10.0
 """Largest distance of a candidate outside its box before it is clipped and certified, in units of the rank tolerance. A
 bound that a step approaches by less than the rank tolerance of the step does not stop it.
@@ -113,15 +104,6 @@ bound that a step approaches by less than the rank tolerance of the step does no
 MAX_RESIDUAL = 10.0
 """Largest ``kkt_residual`` of a SOLVED hierarchy in units of the rank tolerance; with the default rank tolerance this
 is ``KKT_TOLERANCE``.
-"""
-MAX_DETOUR = 100.0
-"""Largest intermediate x of a warm start, in units of the answer. Tolerances are relative to x, and ``HARD_ROW_TOL`` of
-an x larger by this factor is still the residual of a SOLVED answer.
-"""
-
-REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
-"""Violation in units of roundoff, below which a dependent constraint is redundant and above which the problem is
-infeasible.
 """
 
 # ---- weighted QPs

@@ -138,7 +138,6 @@ def _level_problem(
         upper=state.upper,
         may_block=may_block,
         is_own=level_of_hard == k,
-        is_own_inequality=(level_of_hard == k) & ~hierarchy.hard_is_equality,
         hard_of_row=jnp.asarray(layout.hard_of_row, int)[k],
         projector=state.projector,
         x=state.x,
