@@ -22,36 +22,28 @@ class Functions(NamedTuple):
     rows: Any
 
 
+_POINTER, _NUMBER = ctypes.c_void_p, ctypes.c_int
+_TYPES: dict[str, tuple[Any, list[Any]]] = {
+    "new": (_POINTER, [_POINTER, _NUMBER]),
+    "free": (None, [_POINTER]),
+    "step": (None, [_POINTER] * 5 + [_NUMBER] + [_POINTER] * 2),
+    "integrate": (None, [_NUMBER] * 2 + [_POINTER] * 5),
+    "rows_new": (_POINTER, [_POINTER] * 2 + [_NUMBER]),
+    "rows_free": (None, [_POINTER]),
+    "rows_set": (None, [_POINTER] * 3),
+    "rows": (None, [_POINTER] * 5),
+}
+"""Type of each function's result, and of its arguments."""
+
+
 @cache
 def functions() -> Functions:
     """Return the functions of this process's core, which has to be there.
 
     They keep Python's lock: a step is shorter than what giving it away costs.
     """
-    library, pointer, number = ctypes.PyDLL(str(_library.core().path)), ctypes.c_void_p, ctypes.c_int
-    library.osik_plain_new.argtypes = [pointer, number]
-    library.osik_plain_new.restype = pointer
-    library.osik_plain_free.argtypes = [pointer]
-    library.osik_plain_free.restype = None
-    library.osik_plain_step.argtypes = [pointer] * 5 + [number] + [pointer] * 2
-    library.osik_plain_step.restype = None
-    library.osik_plain_integrate.argtypes = [number] * 2 + [pointer] * 5
-    library.osik_plain_integrate.restype = None
-    library.osik_plain_rows_new.argtypes = [pointer] * 2 + [number]
-    library.osik_plain_rows_new.restype = pointer
-    library.osik_plain_rows_free.argtypes = [pointer]
-    library.osik_plain_rows_free.restype = None
-    library.osik_plain_rows_set.argtypes = [pointer] * 3
-    library.osik_plain_rows_set.restype = None
-    library.osik_plain_rows.argtypes = [pointer] * 5
-    library.osik_plain_rows.restype = None
-    return Functions(
-        library.osik_plain_new,
-        library.osik_plain_free,
-        library.osik_plain_step,
-        library.osik_plain_integrate,
-        library.osik_plain_rows_new,
-        library.osik_plain_rows_free,
-        library.osik_plain_rows_set,
-        library.osik_plain_rows,
-    )
+    library = ctypes.PyDLL(str(_library.core().path))
+    found = Functions(*(getattr(library, f"osik_plain_{name}") for name in Functions._fields))
+    for name, function in zip(Functions._fields, found, strict=True):
+        function.restype, function.argtypes = _TYPES[name]
+    return found

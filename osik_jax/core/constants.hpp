@@ -13,19 +13,18 @@ constexpr double BLOCKING_PART = 1e-5, DAMPING_RIDGE = 1e-13, NEGLIGIBLE_DAMPING
 
 // hierarchy
 constexpr int MAX_STALLED = 20;
-constexpr double STATIONARITY_TOL = 10.0, DAMPED_RANK = 1e-14, EXTRA_DAMPING = 1e-9, MAX_DETOUR = 100.0;
+constexpr double STATIONARITY_TOL = 10.0, DAMPED_RANK = 1e-14, EXTRA_DAMPING = 1e-9;
 
 // labels of constraints
 constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT = 3;
 
 // weighted QP; SINGLE_... in single precision
 constexpr double SINGLE_CORRECTION = 1e-6, SINGLE_RIDGE = 1.0, ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0,
-                 SINGLE_BOUND_MULTIPLIER = 0.03, REDUNDANCY_TOL = 1e3, INFEASIBLE_COMPLIANCE = 1e-11;
+                 SINGLE_BOUND_MULTIPLIER = 0.03, INFEASIBLE_COMPLIANCE = 1e-11;
 
 // certificates, and the point without one
 constexpr int GRADIENT_STEPS = 100;
-constexpr double VALUE_TOL = 30.0, SIGN_TOL = 2.0, GRADIENT_TOL = 4.0, ROW_MULTIPLIER = 1e-3, BOX_TOLERANCE = 10.0,
-                 MAX_RESIDUAL = 10.0;
+constexpr double ROW_MULTIPLIER = 1e-3, BOX_TOLERANCE = 10.0, MAX_RESIDUAL = 10.0;
 
 // tasks of a step
 constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-6, UNHELD_PART = 0.04, NEAR_ERROR = 0.06,
@@ -69,6 +68,17 @@ constexpr double LARGEST_RATE = 10.0;
 // Part of a constraint's diagonal left by the active constraints, relative to the square of the constraint's normal,
 // below which it is dependent: the factors are orthogonal.
 constexpr double KERNEL_DEPENDENCE = 1e-14;
+// Hierarchy: largest intermediate x of a warm start, in units of the answer. Tolerances are relative to x, and HARD_ROW_TOL
+// of an x larger by this factor is still the residual of a SOLVED answer.
+constexpr double MAX_DETOUR = 100.0;
+// Certificate of a weighted QP, in units of the tolerance: distance of a value from its bound or of a gradient from 0, and
+// size of a multiplier of the wrong sign. The second is smaller: a multiplier of the wrong sign means a wrong active set,
+// whose cost grows as the curvature left by the rows weakens.
+constexpr double VALUE_TOL = 30.0, SIGN_TOL = 2.0;
+// Largest certified gradient of a free variable, in units of machine epsilon times the gradient's terms.
+constexpr double GRADIENT_TOL = 4.0;
+// Violation in units of roundoff, below which a dependent constraint is redundant and above which the problem is infeasible.
+constexpr double REDUNDANCY_TOL = 1e3;
 // Weighted QP: largest number of corrections.
 constexpr int KERNEL_REFINEMENTS = 10;
 // Predicted next correction, relative to the answer, below which none follows; in single precision it is

@@ -1,6 +1,7 @@
-// Checks whether a candidate solves its weighted QP: the C++ version of the certificate in solvers/qp/_dispatch.py
-// (_is_certified, _is_stationary, kkt_residual). A CPU judges by the data alone; a GPU by the rows that the search has
-// copied, with their weights multiplied in.
+// Checks whether a candidate solves its weighted QP: active constraints are at their bounds, the gradient is 0 elsewhere,
+// multipliers have their signs, inactive constraints hold, and the residual (kkt_residual in solvers/qp/_problem.py) is
+// small. No gradient has to be smaller than the roundoff of its terms. A CPU judges by the data alone; a GPU by the rows
+// that the search has copied, with their weights multiplied in.
 #pragma once
 #include "lanes.hpp"
 #include "weighted_qp.hpp"

@@ -23,21 +23,25 @@ const double* read(QPData<double>& d, const double* at, const QPSizes& s) {
   return at;
 }
 
-// Arguments and results as in solvers/qp/_core.py; the second argument has all numbers of a problem but the matrix.
+// Arguments and results as in solvers/qp/_core.py; the second argument has all numbers of a problem but the matrix, the
+// fourth its tolerance and the largest residual that is certified.
 void solve_weighted_qps(const xla::Call& call) {
   using Method = WeightedQP<Serial<double>>;
   const int batch = call.size(0, 0), m = call.size(0, 1), n = call.size(0, 2), N = call.size(2, 1), p = N - n;
   const QPSizes s{m, n, p, call.in<int>(4)[0]};
   std::vector<double> space(Method::bytes(s) / sizeof(double));
   Method method(s, reinterpret_cast<char*>(space.data()));
-  const double *matrix = call.in<double>(0), *packed = call.in<double>(1), *tolerance = call.in<double>(3);
+  QPCertificate<Serial<double>> certificate(s, reinterpret_cast<char*>(space.data()));
+  const double *matrix = call.in<double>(0), *packed = call.in<double>(1), *tolerances = call.in<double>(3);
   const int* guess = call.in<int>(2);
   QPAnswer<double> a{call.out<double>(0), call.out<double>(1), call.out<int>(2), call.out<int>(3)};
   for (int k = 0; k < batch; ++k) {
     QPData<double> d{};
     const double* at = read(d, packed, s);
-    d.matrix = matrix, d.guess = guess, d.tolerance = tolerance[k];
+    d.matrix = matrix, d.guess = guess, d.tolerance = tolerances[2 * k];
     method.solve(d, a);
+    const Certificate found = certificate.judge(d, a.x, a.multipliers, a.active, tolerances[2 * k + 1]);
+    a.report[0] += a.report[0] && found.holds && found.is_exact, call.out<double>(4)[k] = found.residual;
     matrix += size_t(m) * n, packed = at, guess += N;
     a.x += n, a.multipliers += p, a.active += N, a.report += 3;
   }

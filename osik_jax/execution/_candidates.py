@@ -30,14 +30,12 @@ def certified_or_searched(
     kernels: dict[str, Candidates],
     search: Callable[..., Any],
     *problems: Any,
-    no_candidates: Callable[..., Any] | None = None,
 ) -> Any:
     """Solve a batch by the kernel of the platform and the search, or by the search alone.
 
     If the only kernel is for CPUs and JAX's default backend is a CPU, one search is traced, for all platforms. On
-    platforms without the kernel it begins with ``no_candidates``. The search may omit methods that the kernel has
-    tried, so a program for such a platform is faster with ``backend="jax"``. ``kernels`` has the functions of each
-    kernel by backend; ``no_candidates`` returns uncertified candidates, by default zeros.
+    platforms without the kernel it begins with zeros that are not certified. ``kernels`` has the functions of each
+    kernel by backend.
     """
     if len(kernels) != 1 or not kernels.keys() <= CPU_KERNELS or not cpu_is_default():
         return on_platforms({name: kernel.answers for name, kernel in kernels.items()}, search, *problems)
@@ -46,5 +44,5 @@ def certified_or_searched(
     def zeros(*problems: Any) -> Any:
         return jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(certified, *problems))
 
-    candidates = on_platforms({name: certified}, no_candidates or zeros, *problems)
+    candidates = on_platforms({name: certified}, zeros, *problems)
     return when_lowered(search_rest, candidates, candidates, *problems)

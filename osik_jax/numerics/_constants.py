@@ -93,17 +93,10 @@ certificate.
 """
 FARKAS_ROUNDOFF = 1e-14
 """Sum relative to its absolute terms, below which it counts as 0."""
+FARKAS_MARGIN = 1e-3
+"""Part by which a Farkas certificate exceeds its bound: where rows just hold, the two differ by roundoff alone."""
 SINGLE_TOL = 1e-7
 """Least tolerance of a kernel in single precision and of its certificate; the search uses the requested one."""
-VALUE_TOL, SIGN_TOL = 30.0, 2.0
-"""Certificate limits in units of the tolerance: distance of a value from its bound or of a gradient from 0, and size of
-a multiplier of the wrong sign.
-
-The second is smaller: a multiplier of the wrong sign means a wrong active set, whose cost grows as the curvature left
-by the rows weakens.
-"""
-GRADIENT_TOL = 4.0
-"""Largest certified gradient of a free variable, in units of machine epsilon times the gradient's terms."""
 BOX_TOLERANCE = 10.0
 """Largest distance of a candidate outside its box before it is clipped and certified, in units of the rank tolerance. A
 bound that a step approaches by less than the rank tolerance of the step does not stop it.
@@ -112,34 +105,17 @@ MAX_RESIDUAL = 10.0
 """Largest ``kkt_residual`` of a SOLVED hierarchy in units of the rank tolerance; with the default rank tolerance this
 is ``KKT_TOLERANCE``.
 """
-MAX_DETOUR = 100.0
-"""Largest intermediate x of a warm start, in units of the answer. Tolerances are relative to x, and ``HARD_ROW_TOL`` of
-an x larger by this factor is still the residual of a SOLVED answer.
-"""
-
-# ---- the dual active-set method
-
-DEPENDENCE_TOL = 100.0
-"""Part of a constraint's diagonal left by the active constraints, in units of machine epsilon, below which it is
-dependent.
-"""
-REDUNDANCY_TOL = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e1}
-"""Violation in units of roundoff, below which a dependent constraint is redundant and above which the problem is
-infeasible.
-"""
 
 # ---- weighted QPs
 
 ZERO_TOL = 100.0
 """Size of x in units of machine epsilon times the Newton step at x, below which x counts as 0."""
-MAX_ROUNDS = 12
-"""Rounds of factor, check and search; after that many without an answer projected Newton takes over."""
-RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
-"""Violations in units of roundoff up to which an answer is accepted that the dual method does not change."""
-MAX_INFEASIBLE = 2
-"""Number of dual methods that may end as infeasible before projected Newton takes over; one without any change is
-enough.
+SEARCH_TOLERANCES = 0.01, 0.1, 0.1
+"""Violation of hard rows at the end of each projected Newton search for a problem, in units of ``KKT_TOLERANCE``. Where
+a search ends without an answer, the next one begins at its end.
 """
+RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
+"""Violations in units of roundoff up to which an exact solve after projected Newton is accepted."""
 ROW_MULTIPLIER = 1e-3
 """Multiplier of a row relative to the sum of all rows in a variable's gradient, below which its sign is not
 significant.
@@ -179,6 +155,8 @@ PENALTY = 1e5
 """Curvature of a hard row relative to the largest curvature of the cost; an update reduces its violation to about
 1e-5.
 """
+LARGEST_PENALTY, SLOW_DECREASE = 1e7, 0.25
+"""The same where updates are slow: that leave more than the second times the violation before."""
 SHORTEST_STEP, STEP_LENGTHS = 1e-9, 31
 """Shortest step of the line search, and number of lengths tried from 1 down to it."""
 NEWTON_ROUNDOFF = 4e-15
@@ -187,18 +165,22 @@ SMALL_STEP = 1e-13
 """Newton step relative to x, below which it is the last on its face."""
 FULL_STEP_ROUNDOFF = 4.0
 """Improvement of a shorter step in units of the roundoff of the cost, below which the full step is taken."""
-FEASIBLE_AT_ONCE, FEASIBLE_DECREASE = 1e-3, 0.1
+FEASIBLE_AT_ONCE, FEASIBLE_DECREASE = 1e-3, 0.7
 """End of the multiplier updates, in units of the feasibility tolerance: a violation below the first, or below 1 if an
 update leaves more than the second times the violation before.
 """
 MAX_JOINT_RELEASES = 10
 """Iterations in which all bounds are released together that the gradient points away from; afterwards one at a time."""
+MAX_STEPS = 100
+"""Steps after which the multipliers are updated though a bound still comes and goes."""
 MAX_UPDATES = 40
 """Largest number of updates of the multipliers of hard rows."""
 COMPLIANCE_DECREASE = 0.1
 """Factor on the compliance of infeasible hard rows, applied while a bound keeps x from the least violation."""
 ZERO_GRADIENT = 1e-9
-"""Cosine of the angle between the violation and a column of C, below which it counts as 0."""
+"""Cosine of the angle between the violation and a column of C, and multiplier relative to the gradient's terms, below
+which they count as 0.
+"""
 UNCHANGED = 1e-9
 """Change of x by an update relative to x, below which the least violation has been found."""
 

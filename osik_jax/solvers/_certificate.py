@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..execution._platform import cuda_is_default
-from ..numerics._constants import FARKAS_RADIUS, FARKAS_ROUNDOFF
+from ..numerics._constants import FARKAS_MARGIN, FARKAS_RADIUS, FARKAS_ROUNDOFF
 from ..numerics._dense import apply
 
 
@@ -35,7 +35,7 @@ def is_farkas_certificate(
     # the most that this function reaches in the box: each variable at the bound that raises it
     distance = jnp.where(gradient > 0.0, x - lower, upper - x)
     largest_change = jnp.sum(jnp.abs(gradient) * jnp.where(jnp.isfinite(distance), distance, radius))
-    return jnp.dot(certificate, gap) > largest_change
+    return jnp.dot(certificate, gap) > (1.0 + FARKAS_MARGIN) * largest_change
 
 
 def relative_kkt_residual(

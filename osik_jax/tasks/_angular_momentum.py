@@ -7,17 +7,15 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError
 from ..kinematics import Kinematics, centroidal_momentum_matrix
 from ..kinematics._forward import body_masses
-from ..numerics._host import on_host, to_jax
 from ..robot import Robot
-from ._com import check_axes
-from ._leaves import as_bounds, as_scalar, as_vector, as_weight, check_bounds
+from ._com import along_axes, axis_numbers, check_axes
+from ._leaves import as_bounds, as_scalar, as_weight
 from ._stay import MotionTask
 from ._task import TaskRows, check_priority
 
@@ -75,13 +73,15 @@ class AngularMomentumTask(MotionTask):
         self.weight = as_weight(weight, self._weight_rows, dtype)
         self.gain = as_scalar(0.0, "gain", dtype)
         self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
-        self.target = self._along_axes(0.0 if target is None else target) if self.lower is None else None
+        self.target = None
+        if self.lower is None:
+            self.target = along_axes(0.0 if target is None else target, axes, "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per axis [kg m^2/s]."""
         del q
         # the centroidal matrix has [linear; angular] rows
-        kept = np.array([3 + "xyz".index(axis) for axis in self.axes])
+        kept = 3 + axis_numbers(self.axes)
         jacobian = centroidal_momentum_matrix(robot, kinematics)[kept]
         weight = jnp.broadcast_to(self.weight, (len(kept),))
         error = jnp.zeros(len(kept), jacobian.dtype)
@@ -99,15 +99,7 @@ class AngularMomentumTask(MotionTask):
     def _weight_rows(self) -> int:
         return len(self.axes)
 
-    def _along_axes(self, value: Any) -> Float[Array, " m"]:
-        """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
-        value = on_host(to_jax(value, self.weight.dtype))
-        if value.shape == (3,) and len(self.axes) < 3:
-            value = value[np.array(["xyz".index(axis) for axis in self.axes])]
-        return as_vector(value, (len(self.axes),), "target", self.weight.dtype)
-
     def _convert(self, name: str, value: Any) -> Any:
-        return self._along_axes(value) if name == "target" else super()._convert(name, value)
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
+        if name == "target":
+            return along_axes(value, self.axes, name, self.weight.dtype)
+        return super()._convert(name, value)

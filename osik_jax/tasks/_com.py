@@ -19,11 +19,12 @@ from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics, center_of_mass
 from ..kinematics._forward import body_masses, moving_center
 from ..kinematics._kernels import Call, center_arguments
+from ..numerics._host import on_host, to_jax
 from ..robot import Robot
 from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_array, as_bounds, as_vector, as_weight, check_bounds, check_finite, home_kinematics
+from ._leaves import as_array, as_bounds, as_vector, as_weight, check_finite, home_kinematics
 from ._polygon import SupportPolygon
 from ._task import CENTER, DEFAULT_GAIN, CoreCard, Task, TaskRows, check_priority
 
@@ -97,10 +98,10 @@ class ComTask(Task):
         self.target = self.target_velocity = None
         if polygon is None:
             velocity = 0.0 if target_velocity is None else target_velocity
-            self.target_velocity = self._along_axes(velocity, "target_velocity")
+            self.target_velocity = along_axes(velocity, self.axes, "target_velocity", dtype)
             if self.lower is None:
                 point = center_of_mass(robot, home_kinematics(robot), subtree) if target is None else target
-                self.target = self._along_axes(point, "target")
+                self.target = along_axes(point, self.axes, "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per axis, or one per edge of the polygon [m]."""
@@ -173,25 +174,14 @@ class ComTask(Task):
             return super()._held(robot, kinematics, q)
         return dict(target=center_of_mass(robot, kinematics, self.subtree)[axis_numbers(self.axes)])
 
-    def _along_axes(self, value: Any, what: str) -> Float[Array, " m"]:
-        """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
-        value = as_array(value, what, self.weight.dtype)
-        check_finite(value, what)
-        if value.shape == (3,) and len(self.axes) < 3:
-            value = value[axis_numbers(self.axes)]
-        return as_vector(value, (len(self.axes),), what, self.weight.dtype)
-
     def _convert(self, name: str, value: Any) -> Any:
         if name == "polygon":
             if not isinstance(value, SupportPolygon):
                 raise OsikTypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(value).__name__}")
             return _cast(value, self.weight.dtype)
         if name in ("target", "target_velocity"):
-            return self._along_axes(value, name)
+            return along_axes(value, self.axes, name, self.weight.dtype)
         return super()._convert(name, value)
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _fields(task: ComTask, robot: Robot, kinematics: Kinematics) -> Fields:
@@ -221,6 +211,15 @@ def _cast(polygon: SupportPolygon, dtype: Any) -> SupportPolygon:
 def axis_numbers(axes: str) -> np.ndarray:
     """Return 0 for x, 1 for y, 2 for z. (m,)."""
     return np.array(["xyz".index(axis) for axis in axes])
+
+
+def along_axes(value: Any, axes: str, what: str, dtype: Any) -> Float[Array, " m"]:
+    """Return one entry per axis from a scalar, from a vector x, y, z, or from one entry per axis."""
+    value = as_array(value, what, dtype)
+    check_finite(value, what)
+    if value.shape == (3,) and len(axes) < 3:
+        value = to_jax(on_host(value)[axis_numbers(axes)])
+    return as_vector(value, (len(axes),), what, dtype)
 
 
 def check_axes(axes: str) -> str:

@@ -22,7 +22,7 @@ from ..numerics._host import to_jax
 from ..robot import Robot
 from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_vector, as_weight, check_bounds
+from ._leaves import as_bounds, as_vector, as_weight
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
 Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
@@ -173,9 +173,6 @@ class FunctionTask(Task):
             if a.shape != old.shape:
                 raise OsikValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
         return new
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _check_signature(function: Function) -> None:

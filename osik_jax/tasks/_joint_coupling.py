@@ -19,7 +19,7 @@ from ..robot import Robot
 from ..robot._joint_selection import dofs_of, is_scalar, select_joints
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._leaves import as_bounds, as_scalar, as_vector
 from ._rotation import dot
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
@@ -118,9 +118,6 @@ class JointCouplingTask(Task):
     def _value(self, robot: Robot, q: Float[Array, " nq"]) -> Float[Array, "1"]:
         """Return the weighted sum of joint positions [rad or m]."""
         return dot(self.ratios, q[np.array([robot.tree.qpos_address[joint] for joint in self.joints])])[None]
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _by_joint(robot: Robot, ratios: Mapping[str, float]) -> dict[int, float]:

@@ -19,7 +19,7 @@ from ..robot import Robot
 from ..robot._joint_selection import select_all
 from ..robot._tree import DOF_WIDTH, KinematicTree
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds
+from ._leaves import as_bounds, as_scalar, as_vector
 from ._pose import option, row_mask
 from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
 
@@ -162,9 +162,6 @@ class ManipulabilityTask(Task):
         identity = jnp.asarray(np.eye(robot.nv)[dofs], error.dtype)
         weight = jnp.broadcast_to(self.weight, error.shape)
         return TaskRows.of(error, identity, gain=self.gain, weight=weight, dofs=self.dofs)
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _moving_dofs(tree: KinematicTree, body: int, joints: Sequence[int]) -> tuple[int, ...]:

@@ -23,7 +23,7 @@ from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import pose_curvature
 from ._framed import FramedTask
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_bounds, check_not_negative
+from ._leaves import as_bounds, as_scalar, as_vector, check_not_negative
 from ._repr import ROWS
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
 from ._task import POSE, CoreCard, TaskRows, check_priority
@@ -238,9 +238,6 @@ class PoseTask(FramedTask):
         if name in ("position_weight", "orientation_weight"):
             return _row_weight(value, name, self.weight.dtype)
         return super()._convert(name, value)
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _rest(pose: Pose, kept: Sequence[bool], coupled: bool) -> tuple[Any, Any]:

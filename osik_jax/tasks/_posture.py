@@ -19,7 +19,7 @@ from ..robot._tree import BALL, DOF_WIDTH, FREE
 from ._background import background_weight
 from ._curvature import no_curvature
 from ._gain import AdaptiveGain, as_gain
-from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_bounds, check_finite
+from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_finite
 from ._rotation import inverse_left_jacobian
 from ._task import DEFAULT_GAIN, POSTURE, CoreCard, Task, TaskRows, check_priority
 
@@ -183,9 +183,6 @@ class PostureTask(Task):
         if target.shape != self.target.shape:
             raise OsikValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
         return target
-
-    def _check(self) -> None:
-        check_bounds(self.lower, self.upper)
 
 
 def _check_bounded(robot: Robot, joints: tuple[int, ...], target: Any) -> None:

@@ -21,7 +21,7 @@ from ..robot import Robot
 from ..robot._made_for import MadeForRobot
 from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, capped_gain, evaluate_gain
-from ._leaves import as_own_weight, as_weight
+from ._leaves import as_own_weight, as_weight, check_bounds
 from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
@@ -287,6 +287,9 @@ class Task(MadeForRobot, Replaceable):
         if name == "weight":
             return as_weight(value, self._weight_rows, self.weight.dtype, like=self.weight.shape)
         return as_gain(value, self.weight.dtype) if name == "gain" else super()._convert(name, value)
+
+    def _check(self) -> None:
+        check_bounds(getattr(self, "lower", None), getattr(self, "upper", None))
 
     def __repr__(self) -> str:
         return short_repr(self)

@@ -42,7 +42,7 @@ def batch() -> Batch:
     hierarchy = jax.vmap(padded)([*map(tuple, p.levels), last], jnp.asarray(p.lower), jnp.asarray(p.upper))
     tolerances = jax.tree.map(lambda a: jnp.full(COUNT, a), Tolerances())
     layout = layouts[0]
-    answers = jax.jit(lambda s, t: _cascade.solve_cascade(layout, CAP, s, t, None))(hierarchy, tolerances)
+    answers = jax.jit(lambda s, t: _cascade.solve_cascade(layout, CAP, s, t))(hierarchy, tolerances)
     assert answers.done.all() and (answers.active_bounds != 0).any(1).all()
     return Batch(layout, hierarchy, tolerances, answers)
 
@@ -124,7 +124,7 @@ def test_when_the_kernel_is_asked(monkeypatch):
 
     def solve(layout, hierarchy, tolerances, warm_start, max_iterations):
         asked.append(layout.variables)
-        return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances, warm_start)
+        return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances)
 
     monkeypatch.setattr(_cuda, "solve", solve)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")

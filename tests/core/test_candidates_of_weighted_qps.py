@@ -1,4 +1,4 @@
-"""Candidates of the weighted QP are taken only where they are right: by the certificates of plain JAX and of the core.
+"""Candidates of the weighted QP are taken only where they are right: by the certificate of the core.
 
 And what is done on a GPU with those that its kernel does not certify, without a GPU."""
 
@@ -9,17 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from core_checks import needs_core
 from recorded import QP_DAMPING, recorded_qps
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.core import _library
 from osik_jax.execution import _backends
-from osik_jax.execution._lanes import first_set, with_the_rest
+from osik_jax.execution._lanes import FEW_ON_CPU, first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _core, _cuda, _dispatch, _search, _solve
-from osik_jax.solvers.qp._core import Candidate
+from osik_jax.solvers.qp import _cuda, _dispatch, _search
+from osik_jax.solvers.qp._core import CERTIFIED, Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
+from osik_jax.solvers.qp._dispatch import kernel_candidates
 from osik_jax.solvers.qp._problem import QP, pack
 
 CAP = 1000
@@ -57,28 +59,24 @@ def batch() -> Batch:
 
 def candidate_of(found: _search.SearchResult) -> Candidate:
     yes = jnp.ones_like(found.iterations)
-    certified = jnp.full_like(yes, _cuda.CERTIFIED)
-    return Candidate(found.x, found.row_multipliers, found.active, certified, yes, yes, residual=found.residual)
+    certified = jnp.full_like(yes, CERTIFIED)
+    return Candidate(found.x, found.row_multipliers, found.active, certified, yes, yes, found.residual)
 
 
-@functools.partial(jax.jit, static_argnames=("smallest", "kernel"))
-def searched_from(candidate: Candidate, *given: Any, smallest: int, kernel: str) -> _search.SearchResult:
+@functools.partial(jax.jit, static_argnames=("smallest", "block"))
+def searched_from(candidate: Candidate, *given: Any, smallest: int, block: int | None) -> _search.SearchResult:
     """One program for all candidates, and another where the blocks are of another size."""
     assert smallest == _dispatch._MIN_BLOCK
     qp, guess, tolerance = given
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(_cuda if kernel == "core-cuda" else _core, "solve", lambda *_: candidate)
-        if kernel == "core":
-            return _dispatch.core_candidates(KKT_TOLERANCE[np.dtype("float64")], CAP).answers(
-                qp, None, guess, tolerance
-            )
-        as_given = qp, jnp.ones(len(guess), bool)
-        return _dispatch.cuda_candidates(CAP).answers(qp, as_given, guess, tolerance)
+    as_given = qp, jnp.ones(len(guess), bool)
+    return kernel_candidates(CAP, lambda *_: candidate, block).answers(qp, as_given, guess, tolerance)
 
 
-def completed(batch: Batch, candidate: Candidate, kernel: str = "core") -> tuple[_search.SearchResult, np.ndarray]:
+def completed(
+    batch: Batch, candidate: Candidate, block: int | None = FEW_ON_CPU
+) -> tuple[_search.SearchResult, np.ndarray]:
     """The end, and the lanes in which the candidate was taken; in NumPy."""
-    end = searched_from(candidate, *batch[:3], smallest=_dispatch._MIN_BLOCK, kernel=kernel)
+    end = searched_from(candidate, *batch[:3], smallest=_dispatch._MIN_BLOCK, block=block)
     end, p = jax.device_get((end, candidate))
     return end, np.all(end.x == p.x, 1) & (end.factorizations == p.factorizations)
 
@@ -137,7 +135,6 @@ def changed(batch: Batch, **how: Any) -> Candidate:
 
 
 WRONG = {
-    "not converged": lambda b: changed(b, converged=jnp.zeros_like),
     "NaN": lambda b: changed(b, x=lambda x: x.at[:, 3].set(jnp.nan)),
     "NaN multipliers": lambda b: changed(b, row_multipliers=lambda y: y * jnp.nan),
     "infinite": lambda b: changed(b, x=lambda x: x.at[:, 0].set(jnp.inf)),
@@ -152,14 +149,17 @@ WRONG = {
 }
 
 
+@needs_core
 @pytest.mark.parametrize("wrong", WRONG)
-def test_wrong_candidates_are_not(batch, wrong):
-    candidate = jax.jit(WRONG[wrong])(batch)
+def test_wrong_candidates_are_not_certified(batch, wrong):
+    assert not judged(batch, jax.jit(WRONG[wrong])(batch)).any()
+
+
+def test_what_is_not_certified_is_searched(batch):
+    candidate = changed(batch, converged=jnp.ones_like, x=lambda x: 1.001 * x)
     end, taken = completed(batch, candidate)
     assert not taken.any()
     assert_right(batch, end)
-    if wrong != "not converged" and _library.installed():  # the caller of the core's certificate looks at the former
-        assert not judged(batch, candidate).any()
 
 
 @pytest.mark.slow
@@ -172,20 +172,20 @@ def test_what_is_left_goes_through_in_blocks(batch, monkeypatch):
     candidate = right._replace(
         x=jnp.where(spoiled[:, None], 0.0, right.x), converged=jnp.where(spoiled, 1, right.converged)
     )
-    end, taken = completed(batch, candidate, "core-cuda")
+    end, taken = completed(batch, candidate, None)
     np.testing.assert_array_equal(taken, ~spoiled)
     assert_right(batch, end)
     assert (end.factorizations[spoiled] == 2).all()  # the kernel's, and one from the active set that it left
 
 
-def test_what_is_not_valid_is_not_searched(batch, monkeypatch):
+def test_what_is_not_valid_is_not_searched(batch):
     is_valid = jnp.arange(len(batch.guess)) != 3
     right = candidate_of(batch.answers)
     spoiled = [jnp.where(is_valid[:, None], a, jnp.nan) for a in (right.x, right.row_multipliers)]
     converged = jnp.where(is_valid, right.converged, 1)
     candidate = right._replace(x=spoiled[0], row_multipliers=spoiled[1], converged=converged)
-    monkeypatch.setattr(_cuda, "solve", lambda *_: candidate)
-    end = _dispatch.cuda_candidates(CAP).certified(batch.qp, (batch.qp, is_valid), batch.guess, batch.tolerance)
+    kernel = kernel_candidates(CAP, lambda *_: candidate)
+    end = kernel.certified(batch.qp, (batch.qp, is_valid), batch.guess, batch.tolerance)
     assert end.done.all() and not end.optimal[3]
     assert (end.x[3] == 0.0).all() and (end.row_multipliers[3] == 0.0).all()
     np.testing.assert_array_equal(end.x[is_valid], batch.answers.x[is_valid])
@@ -218,10 +218,9 @@ def beside_a_gpu(monkeypatch):
         asked.append(qp.cost.matrix.shape[1:])
         nothing = jnp.zeros(len(guess), jnp.int32)
         x = jnp.full_like(qp.cost.damping, jnp.nan)
-        return Candidate(x, jnp.zeros_like(qp.compliance), guess, *[nothing] * 3, residual=x[:, 0])
+        return Candidate(x, jnp.zeros_like(qp.compliance), guess, nothing, nothing, nothing, x[:, 0])
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
-    monkeypatch.setattr(_solve, "cpu_is_default", lambda: False)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
     monkeypatch.setattr(_cuda, "solve", solve)
     jax.clear_caches()

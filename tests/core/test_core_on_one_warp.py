@@ -14,7 +14,7 @@ from weighted_families import soft_problems
 
 from osik_jax.numerics._constants import INACTIVE, SINGLE_DAMPING
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp._cuda import CERTIFIED
+from osik_jax.solvers.qp._core import CERTIFIED
 
 pytestmark = needs_core
 TOLERANCE = {np.float32: 1e-7, np.float64: 1e-12}

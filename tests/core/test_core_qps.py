@@ -72,7 +72,7 @@ def test_no_candidate_is_left_to_the_search_where_dampings_are_weak():
     """Dampings from 1e-6, fewer rows than variables: the rows' system has a condition of 1e9."""
     p = problems(10_000, seed=1)
     taken = candidates(p)
-    assert (taken.converged == 1).all()
+    assert (taken.converged == _core.CERTIFIED).all()
     np.testing.assert_array_equal(solved(p).factorizations, taken.factorizations)
 
 
@@ -141,7 +141,7 @@ def test_what_was_once_left_over_is_at_the_planted_optimum(family, seed, lanes):
     p = planted(np.random.default_rng(seed), 4096, draw=PLANTED[family])
     p, H, x = jax.tree.map(lambda a: a[np.asarray(lanes)], (p, qps.H, qps.x))
     taken = candidates(p)
-    np.testing.assert_array_equal(taken.converged, 1)
+    assert (taken.converged != 0).all()
     off = np.asarray(taken.x) - x
     cost, whole = (np.einsum("bi,bij,bj->b", v, H, v) for v in (off, x))
     assert np.sqrt(cost / whole).max() < 1e-9

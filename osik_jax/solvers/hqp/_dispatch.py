@@ -56,7 +56,10 @@ def _solve_on_platform(
         kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _cuda.solve)
     if takes(backend, "core", fits=True):
         kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve)
-    search = partial(solve_cascade, layout, max_iterations)
+
+    def search(hierarchy: PaddedHierarchy, tolerances: Tolerances, _: WorkingSet | None) -> CascadeResult:
+        return solve_cascade(layout, max_iterations, hierarchy, tolerances)
+
     return certified_or_searched(kernels, search, hierarchy, tolerances, warm_start)
 
 
@@ -75,8 +78,7 @@ def kernel_candidates(layout: Layout, max_iterations: int, solve: Solve) -> Cand
     ) -> CascadeResult:
         def search_block(at: Array, result: CascadeResult) -> CascadeResult:
             block, block_tolerances = jax.tree.map(lambda a: a[at], (hierarchy, tolerances))
-            # without the warm start, which the kernel has tried
-            return solve_cascade(layout, max_iterations, block, block_tolerances, None)
+            return solve_cascade(layout, max_iterations, block, block_tolerances)
 
         return with_the_rest(result, result.done, search_block, min(_BLOCK, len(result.done)))
 

@@ -34,7 +34,6 @@ class CascadeState(NamedTuple):
     curvature: Float[Array, " n"]  # bound on the curvature of the rows so far along each variable
     active_bounds: Int[Array, " n"]  # of the box, frozen or not
     residual: Float[Array, ""]  # largest stationarity residual of a level, in units of its gradient's terms
-    largest: Float[Array, ""]  # largest absolute variable at a guess from which the search of a level went on
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]

@@ -65,7 +65,6 @@ class LevelProblem(NamedTuple):
     upper: Float[Array, " h"]
     may_block: Bool[Array, " h"]  # hard rows of the box or of levels above that are bounded and not frozen
     is_own: Bool[Array, " h"]  # hard rows that belong to this level
-    is_own_inequality: Bool[Array, " h"]
     hard_of_row: Int[Array, " m"]  # index of the level's rows among the hard rows; h for none
     projector: Float[Array, "n n"]  # onto the null space of the frozen rows
     x: Float[Array, " n"]  # feasible, with the frozen rows at their values

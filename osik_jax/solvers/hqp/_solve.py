@@ -42,7 +42,7 @@ def solve_hqp(
     |x|, so that the answer is unique. Pure, compiled on first use, and batched by ``vmap``.
 
     Each level is solved on the working set of the warm start, and the exact solution is judged by its multipliers;
-    where it is not the optimum, or without a warm start, a primal active-set method goes on. A row
+    where it is not the optimum, without a warm start, or without a kernel, a primal active-set method goes on. A row
     violated at its optimum, and every hard row with a nonzero multiplier, has one value on the whole face of
     minimisers: it is frozen as an equality before the next level and eliminated by its null space. The search is in
     double precision also where the data are single.
@@ -54,7 +54,8 @@ def solve_hqp(
         damping: of each level, or one for all: the level minimises ``1/2 |w_k|^2 + 1/2 damping |x|^2``, and the levels
             below it keep what its rows have reached, A_k x. >= 0. A ``Damping`` has a part that vanishes where the
             level can be met.
-        warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer.
+        warm_start: that of the solution of a problem nearby with the same levels. It changes the time, not the answer;
+            plain JAX ignores it.
         max_iterations: limit on the active-set iterations of one level (static); default 10 (n + rows of the level).
         tolerances: what counts as zero; the default rank tolerance depends on the precision of the data.
         backend: whose candidates for the answer are taken (static): "auto" for those of the kernels that are there for

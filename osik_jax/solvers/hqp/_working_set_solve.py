@@ -69,21 +69,6 @@ def solve_on_working_set(
     )
 
 
-def placeholder(problem: LevelProblem) -> WorkingSetSolution:
-    """Return the start of a level as a solution that is neither feasible nor optimal."""
-    inactive = jnp.zeros(problem.lower.shape, jnp.int32)
-    return WorkingSetSolution(
-        x=problem.x,
-        active=inactive,
-        multiplier=jnp.zeros_like(problem.lower),
-        in_cost=jnp.zeros(problem.level.lower.shape, bool),
-        rank=jnp.asarray(0, jnp.int32),
-        residual=jnp.zeros_like(problem.x[0]),
-        feasible=jnp.asarray(False),
-        optimal=jnp.asarray(False),
-    )
-
-
 def factor_least_squares(
     problem: LevelProblem, in_cost: Bool[Array, " m"], active_rows: ActiveRows, tolerances: Tolerances
 ) -> tuple[Callable[[Float[Array, " n"], Float[Array, " m"]], Float[Array, " n"]], Int[Array, ""]]:

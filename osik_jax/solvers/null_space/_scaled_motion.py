@@ -151,7 +151,6 @@ def _level(problem: ScaledMotion, level: Level, x: Float[Array, " n"], projector
         upper=problem.upper,
         may_block=problem.lower < problem.upper,
         is_own=no,
-        is_own_inequality=no,
         hard_of_row=jnp.full(level.lower.shape, n, jnp.int32),
         projector=projector,
         x=x,

@@ -50,6 +50,10 @@ class Quadratic(eqx.Module):
         """Return the diagonal of a matrix D >= H: row sums of |H| (Gershgorin), (n,)."""
         return jnp.sum(jnp.abs(self.matrix), 1)
 
+    def in_units(self, unit: Float[Array, " n"]) -> Quadratic:
+        """Return the cost of x / unit."""
+        return Quadratic(self.matrix * unit[:, None] * unit, self.linear * unit)
+
     def lowest_valid(self, number: float) -> list[np.ndarray]:
         """Return the lower ends of the valid ranges of H and g: ``number``, and 0 on the diagonal of H."""
         n = len(self.linear)
@@ -106,6 +110,10 @@ class LeastSquares(eqx.Module):
         # |x'A'WA x| <= sum_ij |x_i| (|A|'W|A|)_ij |x_j| <= sum_i (row sum)_i x_i^2
         size = jnp.abs(self.matrix)
         return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
+
+    def in_units(self, unit: Float[Array, " n"]) -> LeastSquares:
+        """Return the cost of x / unit."""
+        return LeastSquares(self.matrix * unit, self.target, self.weight, self.damping * unit**2, self.center / unit)
 
     def lowest_valid(self, number: float) -> list[np.ndarray]:
         """Return the lower ends of the valid ranges of each array: ``number``, and 0 for weights and damping."""

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...core import _cuda, _library
-from ...numerics._constants import KKT_TOLERANCE
+from ...numerics._constants import KKT_TOLERANCE, SINGLE_TOL
 from ._core import Candidate, of_core
 from ._cost import LeastSquares
 from ._problem import QP
 
-CERTIFIED = 2
-"""``Candidate.converged`` of a candidate that solves its problem; 1: there is one."""
 _KERNEL = """
 using namespace osik;
 using Method = WeightedQP<Warp<Real, N, M, P>>;
@@ -69,6 +67,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     batch, m, n = cost.matrix.shape
     p, kind = qp.rows.shape[1], cost.matrix.dtype
     sizes = m, n, p, kind == jnp.float32
+    tolerance = jnp.maximum(tolerance, SINGLE_TOL) if kind == jnp.float32 else tolerance
     numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.rows, qp.compliance)
     per_block, most = _cuda.problems_of_a_block(batch), n + p
     # of the dual method, which few problems need
@@ -83,4 +82,4 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         shared=_bytes(*sizes),
         per_block=per_block,
     )
-    return of_core(x, y, active, report)._replace(residual=residual)
+    return of_core(x, y, active, report, residual)

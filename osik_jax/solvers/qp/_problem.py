@@ -27,8 +27,6 @@ class QP(eqx.Module):
     upper: Float[Array, " n+p"]  # upper bounds; inf allowed, equal to the lower for an equality
     # constraints that are equalities to the lower bound, whatever the upper is (static); None for none
     known_equalities: tuple[bool, ...] | None = eqx.field(default=None, static=True)
-    # all of the arrays above but the cost's matrix, one after another, where these are at hand as one
-    packed: Float[Array, " k"] | None = None
 
     @property
     def equality(self) -> Bool[Array, " n_and_p"]:
@@ -37,24 +35,15 @@ class QP(eqx.Module):
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
 
 
-def arrays(qp: QP) -> tuple[list[Any], Any]:
-    """Return the cost's matrix, then all other arrays in the order of ``pack``, and their tree structure."""
-    # not by replace: the constructor's annotations are of one problem, and a kernel gets a batch
-    return jax.tree.flatten(eqx.tree_at(lambda p: p.packed, qp, None, is_leaf=lambda leaf: leaf is None))
+def arrays(qp: QP) -> list[Any]:
+    """Return the cost's matrix, then all other arrays in the order of ``pack``."""
+    return jax.tree.leaves(qp)
 
 
 def pack(qp: QP) -> tuple[Array | np.ndarray, Array]:
-    """Return the cost's matrix, and all other arrays concatenated for ``unpack``; NumPy arrays are accepted."""
-    (matrix, *others), _ = arrays(qp)
+    """Return the cost's matrix, and all other arrays concatenated; NumPy arrays are accepted."""
+    matrix, *others = arrays(qp)
     return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
-
-
-def unpack(like: QP, matrix: Float[Array, "..."], packed: Float[Array, " k"]) -> QP:
-    """Return a problem with the shapes of another one, from its matrix and its other arrays concatenated."""
-    (first, *rest), tree = arrays(like)
-    parts = jnp.split(packed, np.cumsum([a.size for a in rest])[:-1])
-    others = [part.reshape(a.shape).astype(a.dtype) for part, a in zip(parts, rest, strict=True)]
-    return jax.tree.unflatten(tree, [matrix.reshape(first.shape).astype(first.dtype), *others])
 
 
 class QPSolution(eqx.Module):
@@ -65,8 +54,9 @@ class QPSolution(eqx.Module):
             hard rows, and of those the least cost. MAX_ITERATIONS: projected gradient steps, no worse than zero clipped
             into the box, which NUMERICAL_ERROR has. (n,)
         status: a ``Status`` code.
-        iterations: constraints added to or dropped from the active set.
-        factorizations: systems factored: 1 where the warm start (or no active bound) was right, 2 after a search.
+        iterations: constraints added to or dropped from the active set, or Newton steps in plain JAX.
+        factorizations: systems factored: 1 where the warm start (or no active bound) was right; in plain JAX each
+            Newton step factors one.
         kkt_residual: without units, at most 1e-9 (1e-5 in float32) where SOLVED. The larger of two: the largest
             gradient of the Lagrangian at a variable without an active bound, or multiplier of the wrong sign, relative
             to the largest sum of absolute terms of that gradient; the largest violation of a row, relative to its
@@ -94,6 +84,13 @@ def active_bounds(qp: QP, active: Int[Array, " n_and_p"]) -> Float[Array, " n_an
     """Return the bound of each active constraint, 0 for inactive ones (never infinite)."""
     at_lower = (active != INACTIVE) & (active != AT_UPPER)
     return jnp.where(at_lower, qp.lower, 0.0) + jnp.where(active == AT_UPPER, qp.upper, 0.0)
+
+
+def in_units(qp: QP, unit: Float[Array, " n"]) -> QP:
+    """Return the problem in other units of the variables: of x / unit."""
+    per_constraint = jnp.concatenate([unit, jnp.ones_like(qp.compliance)])
+    bounds = qp.lower / per_constraint, qp.upper / per_constraint
+    return QP(qp.cost.in_units(unit), qp.rows * unit, qp.compliance, bounds[0], bounds[1], qp.known_equalities)
 
 
 def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:

@@ -1,15 +1,15 @@
-"""Minimiser by a projected Newton method, for problems in which the dual method's tableau loses accuracy.
+"""Minimiser by a projected Newton method, where a guess of the active set was wrong.
 
-The tableau is an inverse. With weak damping beside heavy rows, its entries may be smaller than their roundoff, and
-feasible constraints then seem infeasible. This method inverts nothing and updates nothing. A soft row makes the cost
-piecewise quadratic. So a problem with soft rows alone is constrained by its box only, and a projected Newton method
-descends in the box from any start (D. P. Bertsekas, "Projected Newton methods for optimization problems with simple
-constraints", SIAM J. Control and Optimization 20, 1982). Its factor is R of the QR factors of the rows, whose condition
-number is the root of the Hessian's.
+A soft row makes the cost piecewise quadratic. So a problem with soft rows alone is constrained by its box only, and a
+projected Newton method descends in the box from any start (D. P. Bertsekas, "Projected Newton methods for optimization
+problems with simple constraints", SIAM J. Control and Optimization 20, 1982). Its factor is R of the QR factors of the
+rows, whose condition number is the root of the Hessian's.
 
 Hard rows are softened and corrected by their multipliers: the method of multipliers, or augmented Lagrangian
 (D. P. Bertsekas, "Constrained Optimization and Lagrange Multiplier Methods", 1982). If they are infeasible, the
 multipliers grow along a Farkas certificate, and x approaches the least violation.
+
+The cost has a curvature of 1 along each variable (``in_units``).
 """
 
 from __future__ import annotations
@@ -32,11 +32,14 @@ from ...numerics._constants import (
     FEASIBLE_DECREASE,
     FULL_STEP_ROUNDOFF,
     INACTIVE,
+    LARGEST_PENALTY,
     MAX_JOINT_RELEASES,
+    MAX_STEPS,
     MAX_UPDATES,
     NEWTON_ROUNDOFF,
     PENALTY,
     SHORTEST_STEP,
+    SLOW_DECREASE,
     SMALL_STEP,
     STEP_LENGTHS,
     UNCHANGED,
@@ -83,6 +86,7 @@ class NewtonResult(NamedTuple):
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
     active: Int[Array, " m"]
+    determined: Int[Array, " m"]  # those of them whose multiplier is more than roundoff
     iterations: Int[Array, ""]
     converged: Bool[Array, ""]
     infeasible: Bool[Array, ""]
@@ -92,8 +96,7 @@ def projected_newton(
     qp: QP,
     start: Float[Array, "B n"],
     iterations: Int[Array, " B"],
-    *,
-    feasibility_tol: float,
+    feasibility_tol: Float[Array, ""],
     max_iterations: int,
 ) -> NewtonResult:
     """Return the minimisers of a batch: every argument has a leading axis of problems.
@@ -147,13 +150,12 @@ def _linearise(qp: QP, s: NewtonState) -> Linearisation:
     at_bound = (s.x <= lower) | (s.x >= upper)
     # bounds whose multiplier has the wrong sign; one at a time, the one whose release lowers the cost most
     released = at_bound & (((s.x > lower) & (gradient > 0.0)) | ((s.x < upper) & (gradient < 0.0)))
-    gain = jnp.where(released, gradient**2 / qp.cost.diagonal(), 0.0)
-    best = released & (jnp.arange(n) == first_smallest(-gain)) & s.on_face
+    best = released & (jnp.arange(n) == first_smallest(-jnp.where(released, gradient**2, 0.0))) & s.on_face
     free = ~at_bound | jnp.where(s.single_release, best, released)
     return Linearisation(values, multipliers, gradient, free, released.any())
 
 
-def _iterate(feasibility_tol: float, qp: QP, s: NewtonState) -> NewtonState:
+def _iterate(feasibility_tol: Float[Array, ""], qp: QP, s: NewtonState) -> NewtonState:
     """Take a projected Newton step; at a minimiser update the multipliers of the hard rows, or end."""
     at = _linearise(qp, s)
     updated, stepped = _update_multipliers(feasibility_tol, qp, s, at), _newton_iteration(qp, s, at)
@@ -162,22 +164,22 @@ def _iterate(feasibility_tol: float, qp: QP, s: NewtonState) -> NewtonState:
 
 def _newton_iteration(qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
     newton = _newton_step(qp, s, at)
-    root = jnp.sqrt(qp.cost.diagonal())
-    is_small = jnp.max(jnp.abs(newton) * root) <= SMALL_STEP * jnp.max(jnp.abs(s.x) * root)
+    is_small = jnp.max(jnp.abs(newton)) <= SMALL_STEP * jnp.max(jnp.abs(s.x))
     roundoff = NEWTON_ROUNDOFF * gradient_scale(qp, s.x, at.multipliers)
     is_stationary = jnp.all(~at.free | (jnp.abs(at.gradient) <= roundoff))
     # three ways to stop: a Newton step of roundoff, a gradient of roundoff, a line search without descent
-    step, descends, is_full, is_inside = _line_search(qp, s, at, newton)
+    step, descends, is_inside = _line_search(qp, s, at, newton)
     stops = is_small | is_stationary | ~descends
     # the minimiser: no step lowers the cost, and no bound can be released
     is_last = stops & (s.on_face | ~at.can_release) & (s.single_release | is_small | is_stationary)
+    is_last |= s.steps >= MAX_STEPS
     step = jnp.where(is_small | (is_inside & ~descends), newton, jnp.where(descends, step, 0.0))
     return s._replace(
         x=_add_step(qp, s.x, step),
         iterations=s.iterations + 1,
         steps=s.steps + 1,
         single_release=s.single_release | (stops & ~is_last) | (s.steps >= MAX_JOINT_RELEASES),
-        on_face=jnp.where(s.single_release, stops | is_full, is_small | is_stationary),
+        on_face=jnp.where(s.single_release, stops, is_small | is_stationary),
         at_minimiser=is_last,
     )
 
@@ -215,11 +217,11 @@ def _longest_first(rows: Float[Array, "m n"]) -> Float[Array, "m n"]:
 
 def _line_search(
     qp: QP, s: NewtonState, at: Linearisation, newton: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""], Bool[Array, ""]]:
+) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""]]:
     """Return the step along Newton's direction with the lowest cost, by a projected line search.
 
     The direction is clipped into the box at many lengths, or followed to the first bound. Return that step, whether it
-    lowers the cost, whether it is the full Newton step, and whether that stays in the box.
+    lowers the cost or meets a bound, and whether the full Newton step stays in the box.
     """
     lower, upper = _box(qp)
     # the step length at which the first bound is met
@@ -227,12 +229,8 @@ def _line_search(
     to_bound = jnp.min(jnp.where(newton != 0.0, ahead / jnp.where(newton != 0.0, newton, 1.0), jnp.inf))
     # geometrically decreasing step lengths, and the one to the first bound
     lengths = SHORTEST_STEP ** jnp.linspace(0.0, 1.0, STEP_LENGTHS)
-    lengths = jnp.concatenate(
-        [
-            jnp.where(s.single_release, jnp.clip(to_bound, 0.0, 1.0), 1.0) * lengths,
-            jnp.clip(to_bound, 0.0, 1.0)[None],
-        ]
-    )
+    reach = jnp.clip(to_bound, 0.0, 1.0)
+    lengths = jnp.append(jnp.where(s.single_release, reach, 1.0) * lengths, reach)
     steps = jnp.clip(s.x + lengths[:, None] * newton, lower, upper) - s.x
     changes = jax.vmap(partial(_cost_change, qp, s, at))(steps)
     eps = float(jnp.finfo(s.x.dtype).eps)
@@ -241,7 +239,11 @@ def _line_search(
     is_full = is_inside & (lengths == 1.0)
     # the full step is preferred by a few units of roundoff
     best = first_smallest(changes - jnp.where(is_full, FULL_STEP_ROUNDOFF * roundoff, 0.0))
-    return steps[best], changes[best] < -roundoff[best], is_full[best], is_inside
+    descends = changes[best] < -roundoff[best]
+    # a bound may be so near that the way to it changes nothing
+    meets_bound = s.single_release & ~descends & ~is_inside & (to_bound > 0.0) & (changes[-1] <= roundoff[-1])
+    best = jnp.where(meets_bound, len(lengths) - 1, best)
+    return steps[best], descends | meets_bound, is_inside
 
 
 def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, " n"]) -> Float[Array, ""]:
@@ -255,7 +257,7 @@ def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, "
     return jnp.dot(at.gradient, step) + 0.5 * jnp.dot(step, qp.cost.hessian_product(step)) + bend
 
 
-def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
+def _update_multipliers(feasibility_tol: Float[Array, ""], qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
     """Update the multipliers of hard rows at a minimiser of the augmented Lagrangian, or end if they hold."""
     n = len(s.x)
     hard = qp.compliance == 0.0
@@ -270,14 +272,17 @@ def _update_multipliers(feasibility_tol: float, qp: QP, s: NewtonState, at: Line
     ceased = infeasibility > FEASIBLE_DECREASE * s.infeasibility
     feasible = (infeasibility <= FEASIBLE_AT_ONCE) | ((infeasibility <= 1.0) & ceased)
     turns_infeasible = certified & ~s.infeasible
-    root = jnp.sqrt(qp.cost.diagonal())
-    unchanged = jnp.max(jnp.abs(s.x - s.last_x) * root) <= UNCHANGED * jnp.max(jnp.abs(s.x) * root)
+    unchanged = jnp.max(jnp.abs(s.x - s.last_x)) <= UNCHANGED * jnp.max(jnp.abs(s.x))
     is_least = _is_least_violation(qp, s.x, gap)
     is_last = s.updates + 1 >= MAX_UPDATES
     converged = jnp.where(s.infeasible, certified & ((unchanged & is_least) | is_last), feasible & ~turns_infeasible)
     # once infeasible, all hard rows get one compliance: x then goes to the least violation in the Euclidean norm
     equal = jnp.max(jnp.where(hard, s.compliance, 0.0), initial=0.0)
-    reduced = jnp.where(s.infeasible & unchanged & ~is_least, COMPLIANCE_DECREASE, 1.0) * s.compliance
+    # slow updates want a larger penalty, but not one that multipliers get their roundoff from
+    may_grow = s.compliance > softened_compliance(qp, LARGEST_PENALTY)
+    is_slow = may_grow & (infeasibility > jnp.maximum(SLOW_DECREASE * s.infeasibility, 1.0))
+    is_slow = jnp.where(s.infeasible, unchanged & ~is_least, is_slow)
+    reduced = jnp.where(is_slow, COMPLIANCE_DECREASE, 1.0) * s.compliance
     multiplier = jnp.where(converged, s.multiplier, 0.0)
     return s._replace(
         multiplier=jnp.where(hard & ~turns_infeasible & ~converged, at.multipliers, multiplier),
@@ -310,14 +315,14 @@ def _is_least_violation(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) 
 
 def _result(qp: QP, s: NewtonState) -> NewtonResult:
     at = _linearise(qp, s)
-    n = len(s.x)
-    low, _ = _box(qp)
-    labels = jnp.concatenate(
-        [
-            jnp.where(at.free, INACTIVE, jnp.where(s.x <= low, AT_LOWER, AT_UPPER)),
-            jnp.sign(-at.multipliers).astype(jnp.int32),
-        ]
+    lower, _ = _box(qp)
+    in_box = jnp.where(at.free, INACTIVE, jnp.where(s.x <= lower, AT_LOWER, AT_UPPER))
+    labels = jnp.concatenate([in_box, jnp.sign(-at.multipliers).astype(jnp.int32)])
+    in_gradient = jnp.concatenate([at.gradient, at.multipliers * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
+    counts = jnp.abs(in_gradient) > ZERO_GRADIENT * jnp.max(gradient_scale(qp, s.x, at.multipliers))
+    hard = jnp.concatenate([jnp.ones(len(s.x), bool), qp.compliance == 0.0])
+    active, determined = (
+        jnp.where(qp.equality & (hard | (own != INACTIVE)), EQUALITY, own).astype(jnp.int32)
+        for own in (labels, jnp.where(counts, labels, INACTIVE))
     )
-    hard = jnp.concatenate([jnp.ones(n, bool), qp.compliance == 0.0])
-    active = jnp.where(qp.equality & (hard | (labels != INACTIVE)), EQUALITY, labels).astype(jnp.int32)
-    return NewtonResult(s.x, at.multipliers, active, s.iterations, s.converged, s.infeasible)
+    return NewtonResult(s.x, at.multipliers, active, determined, s.iterations, s.converged, s.infeasible)

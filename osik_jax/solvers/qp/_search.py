@@ -1,12 +1,11 @@
-"""Search for the active set in plain JAX: guess, factor, check; if the check fails, the dual method continues.
+"""Search for the active set in plain JAX: guess, factor, check; if the check fails, projected Newton goes on.
 
 The guess is the warm start, or no active bound at all; where it is right, one factorisation is all there is. The answer
-always comes from a fresh factorisation at the final active set, never from the tableau that found it.
+comes from a fresh factorisation at the final active set, if there are digits enough for that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -23,18 +22,21 @@ from ...numerics._constants import (
     INACTIVE,
     INFEASIBLE_COMPLIANCE,
     KKT_TOLERANCE,
-    MAX_INFEASIBLE,
-    MAX_ROUNDS,
-    REDUNDANCY_TOL,
     RELAXED,
+    SEARCH_TOLERANCES,
 )
 from ...numerics._dense import apply
-from .._goldfarb_idnani import Roundoff
-from ._kkt_solve import KKTFactor, factorize, solve_on_active_set
-from ._problem import QP, constraint_scales, kkt_residual, multiplier_roundoff
+from ._kkt_solve import factorize, solve_on_active_set
+from ._problem import QP, constraint_scales, in_units, kkt_residual, multiplier_roundoff
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
-from ._tableau import find_active_set
+
+
+class Roundoff(NamedTuple):
+    """Tolerances below which a violation, or a multiplier of the wrong sign, is roundoff."""
+
+    value: Float[Array, " m"]
+    multiplier: Float[Array, " m"]
 
 
 class SearchResult(NamedTuple):
@@ -43,14 +45,10 @@ class SearchResult(NamedTuple):
     x: Float[Array, " n"]
     row_multipliers: Float[Array, " p"]
     active: Int[Array, " m"]
-    redundant: Bool[Array, " m"]  # equalities that the active constraints imply
     iterations: Int[Array, ""]
     factorizations: Int[Array, ""]
     done: Bool[Array, ""]
     optimal: Bool[Array, ""]
-    infeasible_ends: Int[Array, ""]  # of the dual method
-    cold: Bool[Array, ""]  # the search began with no active bound, or does so again
-    used_newton: Bool[Array, ""]  # projected Newton took over from the dual method
     infeasible: Bool[Array, ""]  # proven: no point of the box satisfies the hard rows; x is the least violation
     compliance: Float[Array, " p"]  # of the rows in the problem that ``x`` solves
     residual: Float[Array, ""]  # of the optimality conditions
@@ -64,52 +62,45 @@ def initial_result(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B
         x=jnp.zeros((batch, n), dtype),
         row_multipliers=jnp.zeros(qp.rows.shape[:2], dtype),
         active=jax.vmap(usable_guess)(qp, guess),
-        redundant=jnp.zeros(guess.shape, bool),
         iterations=zeros,
         factorizations=zeros,
         done=no,
         optimal=no,
-        infeasible_ends=zeros,
-        cold=jax.vmap(lambda one, start: jnp.all(usable_guess(one, 0 * start) == usable_guess(one, start)))(qp, guess),
-        used_newton=no,
         infeasible=no,
         compliance=qp.compliance,
         residual=jnp.zeros_like(tolerance),
     )
 
 
-def search(
-    qp: QP,
-    guess: Int[Array, "B m"],
-    tolerance: Float[Array, " B"],
-    *,
-    max_iterations: int,
-    by_pivots: bool = True,
-) -> SearchResult:
+def search(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int) -> SearchResult:
     """Solve a batch: every argument has a leading axis of problems.
 
     The search is in double precision whatever the data: which bounds are active is yes or no, and a weak damping beside
-    heavy rows is below the roundoff of single precision. Without ``by_pivots`` projected Newton follows a wrong guess
-    at once, not the dual method: a kernel has tried the latter by then, and it is much of what there is to compile.
+    heavy rows is below the roundoff of single precision.
     """
     kkt_tol = KKT_TOLERANCE[qp.lower.dtype]
-    rounds = partial(_search_rounds, max_iterations=max_iterations, kkt_tol=kkt_tol, by_pivots=by_pivots)
-    return in_double(partial(_solve_batch, rounds=rounds, kkt_tol=kkt_tol))(qp, guess, tolerance)
+    return in_double(partial(_solve_batch, max_iterations=max_iterations, kkt_tol=kkt_tol))(qp, guess, tolerance)
 
 
 def _solve_batch(
-    qp: QP,
-    guess: Int[Array, "B m"],
-    tolerance: Float[Array, " B"],
-    *,
-    rounds: Callable[[tuple[QP, Array], SearchResult], SearchResult],
-    kkt_tol: float,
+    qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], *, max_iterations: int, kkt_tol: float
 ) -> SearchResult:
-    """Return the answers, or the end of projected gradient steps for problems without one."""
-    result = rounds((qp, tolerance), initial_result(qp, guess, tolerance))
-    # the certificate: no answer without it, however the search ended
-    residual = jax.vmap(kkt_residual)(qp, result.x, result.row_multipliers, result.active)
-    result = result._replace(residual=residual, optimal=result.optimal & (residual <= kkt_tol))
+    """Return the answers, or the end of projected gradient steps for problems without one.
+
+    A search that ends without an answer has another one begin at its end, which asks for less.
+    """
+    first = _on_active_set(qp, tolerance, initial_result(qp, guess, tolerance), kkt_tol, relaxed=1.0)
+
+    def is_running(state: tuple[SearchResult, Array]) -> Bool[Array, ""]:
+        return (state[1] < len(SEARCH_TOLERANCES)) & ~jnp.all(state[0].done)
+
+    def go_on(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
+        result, count = state
+        tol = jnp.array(SEARCH_TOLERANCES)[count] * kkt_tol
+        newton = partial(_by_newton, feasibility_tol=tol, kkt_tol=kkt_tol, max_iterations=max_iterations)
+        return with_a_few((qp, tolerance), result, result.done, newton), count + 1
+
+    result = jax.lax.while_loop(is_running, go_on, (first, jnp.asarray(0)))[0]
     return with_a_few(qp, result, result.optimal | result.infeasible, _fall_back)
 
 
@@ -120,157 +111,62 @@ def _fall_back(qp: QP, result: SearchResult) -> SearchResult:
     return result._replace(x=x, row_multipliers=y, active=inactive, residual=residual)
 
 
-def _search_rounds(
-    given: tuple[QP, Float[Array, " B"]], start: SearchResult, *, max_iterations: int, kkt_tol: float, by_pivots: bool
+def _by_newton(
+    data: tuple[QP, Float[Array, " B"]],
+    result: SearchResult,
+    *,
+    feasibility_tol: Float[Array, ""],
+    kkt_tol: float,
+    max_iterations: int,
 ) -> SearchResult:
-    """Factor, check and search in rounds until all problems are done; projected Newton takes over on failure.
-
-    Where weak dampings are beside heavy rows, the tableau of an active set that is far off may have no correct digit.
-    So a search that fails from a guess begins again with no active bound before projected Newton takes over.
-
-    After projected Newton there is one more round, so that its answer is the exact minimiser on its active set, if
-    there are digits enough for that.
-    """
-    qp, tolerance = given
-    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
-    newton = partial(_by_newton, kkt_tol=kkt_tol, max_iterations=max_iterations, by_pivots=by_pivots)
-
-    def is_running(state: tuple[SearchResult, Array]) -> Bool[Array, ""]:
-        result, rounds = state
-        return (rounds <= 2 * MAX_ROUNDS) & ~jnp.all(result.done)
-
-    def body(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
-        result, rounds = state
-        result = choose(~result.done, _round(qp, hessian, result, tolerance, max_iterations, by_pivots), result)
-        gives_up = (result.infeasible_ends >= MAX_INFEASIBLE) | ((rounds + 1) % MAX_ROUNDS == 0)
-        failed = ~(result.done | result.used_newton) & gives_up
-        restarts = failed & ~result.cold & by_pivots
-        result = choose(restarts, _begun_again(qp, result), result)
-        return with_a_few(qp, result, ~failed | restarts, newton), rounds + 1
-
-    return jax.lax.while_loop(is_running, body, (start, jnp.asarray(0)))[0]
-
-
-def _begun_again(qp: QP, result: SearchResult) -> SearchResult:
-    """Return the iterate with no active bound; the counts of changes and factorisations go on."""
-    no = jnp.zeros_like(result.redundant)
-    inactive = jax.vmap(usable_guess)(qp, no.astype(jnp.int32))
-    ends = jnp.zeros_like(result.infeasible_ends)
-    return result._replace(active=inactive, redundant=no, infeasible_ends=ends, cold=jnp.ones_like(result.cold))
-
-
-def _by_newton(qp: QP, result: SearchResult, *, kkt_tol: float, max_iterations: int, by_pivots: bool) -> SearchResult:
-    # x on an active set that no pivots have made consistent may be anywhere
-    start = jnp.where(jnp.isfinite(result.x), result.x, 0.0) if by_pivots else jnp.zeros_like(result.x)
-    end = projected_newton(qp, start, result.iterations, feasibility_tol=kkt_tol, max_iterations=max_iterations)
-    largest = jax.vmap(lambda one: jnp.max(apply(one.rows**2, 1.0 / one.cost.diagonal()), initial=0.0))(qp)
-    # a minimiser gets one more round; the least violation of infeasible rows is final
-    infeasible = end.converged & end.infeasible
-    optimal = end.converged & ~end.infeasible
-    softened = jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest[:, None], qp.compliance)
-    return result._replace(
-        x=end.x,
+    """Return the end of projected Newton, or the exact minimiser on its active set, where that is optimal."""
+    qp, tolerance = data
+    # in units in which the cost has a curvature of 1 along each variable
+    unit = 1.0 / jnp.sqrt(jax.vmap(lambda one: one.cost.diagonal())(qp))
+    start = jnp.where(jnp.isfinite(result.x), result.x, 0.0) / unit
+    scaled = jax.vmap(in_units)(qp, unit)
+    limits = feasibility_tol, max_iterations
+    end = projected_newton(scaled, start, result.iterations, *limits)
+    infeasible, optimal = end.converged & end.infeasible, end.converged & ~end.infeasible
+    largest = jnp.max(jnp.sum(scaled.rows**2, 2), 1, initial=0.0)[:, None]
+    softened = jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest, qp.compliance)
+    found = result._replace(
+        x=end.x * unit,
         row_multipliers=end.row_multipliers,
         active=end.active,
         iterations=end.iterations,
         factorizations=result.factorizations + end.iterations - result.iterations,
-        done=~optimal,
         optimal=optimal,
-        used_newton=jnp.ones_like(optimal),
         infeasible=infeasible,
         compliance=jnp.where(infeasible[:, None], softened, qp.compliance),
     )
+    found = _judged(qp, found, 10.0 * feasibility_tol)
+    exact = _on_active_set(qp, tolerance, found._replace(active=end.determined), kkt_tol, relaxed=RELAXED[unit.dtype])
+    exact = choose(optimal & exact.optimal, exact, found)
+    return exact._replace(done=exact.done | (end.iterations >= max_iterations))
 
 
-class _Minimizers(NamedTuple):
-    """Minimisers of a batch on its active sets, and their optimality checks."""
-
-    factor: KKTFactor
-    x: Float[Array, "B n"]
-    row_multipliers: Float[Array, "B p"]
-    roundoff: Roundoff
-    optimal: Bool[Array, " B"]
-    nearly_optimal: Bool[Array, " B"]  # within relaxed tolerances
-
-
-def _round(
-    qp: QP,
-    hessian: Float[Array, "B n n"],
-    result: SearchResult,
-    tolerance: Float[Array, " B"],
-    max_iterations: int,
-    by_pivots: bool,
+def _on_active_set(
+    qp: QP, tolerance: Float[Array, " B"], result: SearchResult, kkt_tol: float, *, relaxed: float
 ) -> SearchResult:
-    """Solve on the active set, check, and run the dual method if the check fails, or end."""
-    end = _minimize(qp, hessian, result, tolerance)
-    exhausted = result.iterations >= max_iterations
-    searching = ~(result.done | end.optimal | exhausted | result.used_newton)
-    nearly_optimal = end.nearly_optimal
-    if by_pivots:
-        by_dual_method = partial(_by_dual_method, qp, hessian, result, end, searching, max_iterations)
-        after = jax.lax.cond(jnp.any(searching), lambda: choose(searching, by_dual_method(), result), lambda: result)
-    else:
-        after = result._replace(infeasible_ends=jnp.where(searching, MAX_INFEASIBLE, result.infeasible_ends))
-        nearly_optimal &= end.optimal | result.used_newton
-    # an active set that the dual method confirms is accepted with relaxed tolerances: what is left is roundoff
-    unchanged = jnp.all(after.active == result.active, 1)
-    x, y = end.x, end.row_multipliers
-    is_finite = jax.vmap(lambda x, y: jnp.isfinite(x).all() & jnp.isfinite(y).all())(x, y)
-    accepted = nearly_optimal & unchanged & is_finite
-    failed = after.infeasible_ends >= MAX_INFEASIBLE
-    x, y = choose(accepted | ~result.used_newton, (x, y), (result.x, result.row_multipliers))
-    no_new_end = after.infeasible_ends == result.infeasible_ends
-    return after._replace(
-        x=x,
-        row_multipliers=y,
-        factorizations=result.factorizations + 1,
-        done=exhausted | result.used_newton | (accepted & (no_new_end | failed)),
-        optimal=accepted | result.used_newton,
-    )
-
-
-def _minimize(
-    qp: QP, hessian: Float[Array, "B n n"], result: SearchResult, tolerance: Float[Array, " B"]
-) -> _Minimizers:
-    """Return the minimisers on the active sets, by fresh factors, checked within roundoff and relaxed tolerances."""
-    factor = jax.vmap(factorize)(qp, hessian, result.active)
-    x, y = solve_on_active_set(qp, factor, result.active)
+    """Return the minimisers on the active sets, by fresh factors; optimal within ``relaxed`` times the tolerances."""
+    hessian = jax.vmap(lambda one: one.cost.hessian())(qp)
+    x, y = solve_on_active_set(qp, jax.vmap(factorize)(qp, hessian, result.active), result.active)
     scales = jax.vmap(constraint_scales)(qp, jnp.diagonal(hessian, axis1=1, axis2=2), x, y)
-    value, multiplier = (tolerance[:, None] * a for a in scales)
-    significant = jax.vmap(multiplier_roundoff)(qp, x, y)
-    roundoff = Roundoff(value, jnp.minimum(multiplier, significant))
-    optimal = jax.vmap(is_optimal)(qp, result, x, y, roundoff)
-    relaxed = RELAXED[hessian.dtype]
-    relaxed = Roundoff(relaxed * value, jnp.minimum(relaxed * multiplier, significant))
-    nearly_optimal = jax.vmap(is_optimal)(qp, result, x, y, relaxed)
-    return _Minimizers(factor, x, y, roundoff, optimal, nearly_optimal)
+    value, multiplier = (relaxed * tolerance[:, None] * a for a in scales)
+    roundoff = Roundoff(value, jnp.minimum(multiplier, jax.vmap(multiplier_roundoff)(qp, x, y)))
+    wrong = jax.vmap(violated_conditions)(qp, result, x, y, roundoff)
+    finite = jnp.isfinite(jnp.concatenate([x, y], 1)).all(1)
+    factorizations = result.factorizations + 1
+    found = result._replace(x=x, row_multipliers=y, factorizations=factorizations, optimal=finite & ~wrong.any(1))
+    return _judged(qp, found, kkt_tol)
 
 
-def _by_dual_method(
-    qp: QP,
-    hessian: Float[Array, "B n n"],
-    result: SearchResult,
-    at: _Minimizers,
-    searching: Bool[Array, " B"],
-    max_iterations: int,
-) -> SearchResult:
-    """Continue from the minimisers by the dual method, which confirms or changes their active sets, or ends."""
-    end = find_active_set(
-        *(qp, hessian, at.factor, result.active, at.roundoff, at.x, at.row_multipliers),
-        searching=searching,
-        iterations=result.iterations,
-        max_iterations=max_iterations,
-    )
-    unchanged = jnp.all(end.active == result.active, 1)
-    # from an active set that it confirms though the minimiser is none, it would go nowhere in the next round either
-    hopeless = unchanged & (end.infeasible | ~at.nearly_optimal)
-    ends = jnp.where(hopeless, MAX_INFEASIBLE, end.infeasible.astype(jnp.int32))
-    return result._replace(
-        active=end.active,
-        redundant=end.redundant,
-        iterations=end.iterations,
-        infeasible_ends=result.infeasible_ends + ends,
-    )
+def _judged(qp: QP, result: SearchResult, kkt_tol: float | Array) -> SearchResult:
+    """Return the result with its residual; there is no answer without this certificate, however it was found."""
+    residual = jax.vmap(kkt_residual)(qp, result.x, result.row_multipliers, result.active)
+    optimal = result.optimal & (residual <= kkt_tol)
+    return result._replace(residual=residual, optimal=optimal, done=optimal | result.infeasible)
 
 
 def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
@@ -282,16 +178,6 @@ def usable_guess(qp: QP, guess: Int[Array, " m"]) -> Int[Array, " m"]:
     in_box = jnp.arange(len(guess)) < n
     pinned = qp.equality & (in_box | (guess != INACTIVE))
     return jnp.where(pinned, EQUALITY, label).astype(jnp.int32)
-
-
-def is_optimal(
-    qp: QP, result: SearchResult, x: Float[Array, " n"], y: Float[Array, " p"], roundoff: Roundoff
-) -> Bool[Array, ""]:
-    """Check that the minimiser on the active set is optimal: constraints hold, and multipliers have their signs.
-
-    The arguments are those of ``violated_conditions``.
-    """
-    return ~jnp.any(violated_conditions(qp, result, x, y, roundoff))
 
 
 def violated_conditions(
@@ -307,8 +193,8 @@ def violated_conditions(
     multipliers = jnp.concatenate([gradient, y])
     # primal feasibility, the equalities, and dual feasibility
     gap = _gaps(qp, x, y)
-    inactive_equality = qp.equality & (active == INACTIVE) & ~result.redundant
-    violated = gap > jnp.where(result.redundant, REDUNDANCY_TOL[x.dtype], 1.0) * roundoff.value
+    inactive_equality = qp.equality & (active == INACTIVE)
+    violated = gap > roundoff.value
     wrong_sign = jnp.where(active == AT_LOWER, -multipliers, jnp.where(active == AT_UPPER, multipliers, -jnp.inf))
     return violated | inactive_equality | (wrong_sign > roundoff.multiplier)
 

@@ -22,7 +22,7 @@ from .._status import Status
 from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
-from ._problem import QP, QPSolution, pack, unpack
+from ._problem import QP, QPSolution, pack
 from ._search import SearchResult
 
 
@@ -186,8 +186,7 @@ def _solve(
     limit = 20 * m if max_iterations is None else max_iterations
     solve = qp_solver(limit, check_backend(backend))
     # the search is not differentiated: its answer is, at the active set that was found
-    as_given = None if cpu_is_default() else (given, is_valid)
-    result = _rules.found(solve(*jax.lax.stop_gradient((safe, as_given, start, tolerance))))
+    result = _rules.found(solve(*jax.lax.stop_gradient((safe, (given, is_valid), start, tolerance))))
     x, y, is_finite = _differentiable(safe, result, is_valid, backend)
     # at the end x is inside the box that was given, to the last bit
     box = (jnp.where(is_valid, b, own)[:n] for b, own in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
@@ -217,7 +216,7 @@ def _differentiable(
     The derivative is that of the problem which x solves: with infeasible hard rows, the softened one.
     """
     compliance = jnp.where(result.infeasible, result.compliance, safe.compliance)
-    solved = replace(safe, packed=None, compliance=compliance)
+    solved = replace(safe, compliance=compliance)
     has_answer = result.optimal | result.infeasible
     constant = result.x, result.row_multipliers
     differentiable = with_derivative(backend)(*constant, result.active, solved)
@@ -258,13 +257,10 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
     )
     # on a CPU one operation for all arrays but the matrix, where each costs as much as its numbers do
     flat = pack if cpu_is_default() else jax.tree.leaves
-    arrays = [flat(each) for each in (qp, placeholder, *_valid_range(qp))]
-    in_range = [((lowest <= a) & (a <= highest)).all() for a, _, lowest, highest in zip(*arrays, strict=True)]
+    arrays = map(flat, (qp, *_valid_range(qp)))
+    in_range = [((least <= a) & (a <= most)).all() for a, least, most in zip(*arrays, strict=True)]
     is_valid = jnp.stack(in_range).all()
-    safe = [jnp.where(is_valid, a, b) for a, b, *_ in zip(*arrays, strict=True)]
-    if flat is pack:
-        return replace(unpack(qp, *safe), packed=safe[1]), is_valid
-    return jax.tree.unflatten(jax.tree.structure(qp), safe), is_valid
+    return jax.tree.map(lambda a, b: jnp.where(is_valid, a, b), qp, placeholder), is_valid
 
 
 def _valid_range(qp: QP) -> tuple[QP, QP]:
