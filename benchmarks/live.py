@@ -108,6 +108,19 @@ def broken(robot: osik.Robot, q: np.ndarray, dt: float) -> dict[str, int]:
     return dict(too_fast=int(fast.any(1).sum()), outside=int(outside.any(1).sum()))
 
 
+def recorded(view: LiveView) -> list[np.ndarray]:
+    """Return a list that gets the configuration of each step from now on."""
+    path: list[np.ndarray] = []
+    step = view.loop._step
+
+    def kept() -> None:
+        step()
+        path.append(view.loop.snapshot.q)
+
+    view.loop._step = kept
+    return path
+
+
 def resident() -> float:
     """Memory of this process [MB], on Linux."""
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
@@ -125,14 +138,14 @@ def measure(name: str, seconds: float) -> dict[str, object]:
         visitor = visit(view.url)
         time.sleep(5.0)
         view.loop.pause()
-        view.loop.record()
+        path = recorded(view)
         view.loop._stopwatch = Stopwatch(round(seconds / view.loop.dt))
         before = resident()
         beside = idle(view.loop.dt, seconds)
         view.loop.resume()
         lead(view, robot, seconds, radius=0.35 if robot.floating_base else 0.2)
         timing, failures = view.loop.timing, view.loop.snapshot.failures
-        after, q, dt = resident(), view.loop.recorded().q, view.loop.dt
+        after, q, dt = resident(), np.array(path), view.loop.dt
         nothing = json.loads(beside.communicate()[0])
         read = int(visitor.communicate("end\n")[0])
     return {

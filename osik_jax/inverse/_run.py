@@ -99,7 +99,7 @@ def found_at_once(
     The answer has no axis of targets; the ends of the searches have.
     """
     found, score, ends, *_ = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
-    if not found.converged or ((how.near or how.every) and not score <= ENOUGH):
+    if not (found.converged and (score is None or score <= ENOUGH)):
         return None
     return Explored(found, *split(None if ends is None else np.asarray(ends)[None]))
 

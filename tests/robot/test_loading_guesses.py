@@ -19,7 +19,6 @@ from urdfs import LIMIT, joint, link
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.cli._demo import read_demo_robot
 from osik_jax.robot._feet import guess_feet
 
 
@@ -92,11 +91,6 @@ class TestBase:
         assert "floating base" in said.out and not said.err
         assert cli.main(["info", biped_file]) == 0
         assert "floating base" in capsys.readouterr().out
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", osik.OsikWarning)
-            assert not read_demo_robot(cli.Demo(robot=arm), arm).floating_base
-        assert read_demo_robot(cli.Demo(robot=arm, support=("tool",)), arm).floating_base
-        assert read_demo_robot(cli.Demo(robot=biped_file), biped_file).floating_base
 
 
 class TestRangesOfOneValue:
