@@ -15,6 +15,7 @@ import osik_jax as osik
 from osik_jax import cli
 from osik_jax.cli._view import _keeps_off
 from osik_jax.viewer.live._desk import Desk
+from osik_jax.viewer.live._obstacles import nearest_pair
 from osik_jax.viewer.live._open import default_session
 from osik_jax.viewer.live._session import RobotSource
 
@@ -28,7 +29,7 @@ def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
     apart = osik.CollisionAvoidanceLimit(arm, scene=osik.Scene(shapes).moved("ball", ([0.0, -2.0, 0.5], np.eye(3))))
     session = default_session(arm, source=RobotSource("ur5"))
     desk = Desk(dataclasses.replace(session, limits=(*session.limits, apart)))
-    assert list(desk.obstacles) == ["box", "ball"] and desk.obstacles["ball"].size[0] == 0.1
+    assert list(desk.obstacles) == ["box", "ball", "post"] and desk.obstacles["ball"].part.size[0] == 0.1
     with desk.loop as loop:
         assert loop.wait_until_ready(300.0)
         steps = loop._steps
@@ -41,6 +42,9 @@ def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
         gaps = jax.jit(lambda q: moved.distances(arm, osik.forward_kinematics(arm, q)).min())
         assert gaps(desk.session.q) < -0.01
         assert until(lambda: float(gaps(loop.snapshot.q)) > 0.009)
+        near = nearest_pair(desk.session.active_limits, loop.snapshot.q)
+        assert near is not None and "box" in near.names and near.kept == 0.01
+        np.testing.assert_allclose(np.linalg.norm(near.points[0] - near.points[1]), near.distance, rtol=1e-6)
         assert loop._steps is steps
 
 

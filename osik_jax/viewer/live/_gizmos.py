@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from ...robot.loading._mjmodel import quaternion, rotation_matrix
 from ...tasks import Task
+from .._parts import Part
 from ._obstacles import Obstacle
+from ._surfaces import part_triangles
 
 if TYPE_CHECKING:
     from viser import SceneApi, TransformControlsEvent, TransformControlsHandle
@@ -115,7 +118,7 @@ class ObstacleNodes(Handles):
 
         super().__init__(scene, dragged)
         self._scale = 0.1 * size
-        self._sizes: dict[str, Float[np.ndarray, "3"]] = {}
+        self._shown: dict[str, Part] = {}
         self._last: Mapping[str, Obstacle] | None = None
 
     def show(self, obstacles: Mapping[str, Obstacle]) -> None:
@@ -124,18 +127,17 @@ class ObstacleNodes(Handles):
             return
         self._last = obstacles
         self.keep(obstacles)
-        self._sizes = {name: size for name, size in self._sizes.items() if name in obstacles}
-        for name, one in obstacles.items():
-            look = dict(scale=self._scale + float(np.max(one.size)), disable_rotations=one.kind == "ball", opacity=0.7)
-            self.put(name, f"/obstacles/{name}", (one.position, quaternion(one.rotation)), **look)
-            if not np.array_equal(self._sizes.get(name, ()), one.size):
-                self._draw(one)
-                self._sizes[name] = one.size
+        self._shown = {name: part for name, part in self._shown.items() if name in obstacles}
+        for name, (_, part, position, rotation) in obstacles.items():
+            is_round = part.kind == mujoco.mjtGeom.mjGEOM_SPHERE
+            look = dict(scale=self._scale + float(part.corners.max()), disable_rotations=is_round, opacity=0.7)
+            self.put(name, f"/obstacles/{name}", (position, quaternion(rotation)), **look)
+            if not _look_alike(self._shown.get(name), part):
+                self._shown[name], surface = part, part_triangles(part)
+                node = f"/obstacles/{name}/shape"
+                self._scene.add_mesh_simple(node, surface.vertices, surface.faces, color=_COLOR, opacity=0.8)
 
-    def _draw(self, one: Obstacle) -> None:
-        """Draw the shape as a child of its handle."""
-        name = f"/obstacles/{one.name}/shape"
-        if one.kind == "ball":
-            self._scene.add_icosphere(name, radius=float(one.size[0]), color=_COLOR, opacity=0.8)
-        else:
-            self._scene.add_box(name, dimensions=tuple(2.0 * one.size), color=_COLOR, opacity=0.8)
+
+def _look_alike(one: Part | None, other: Part) -> bool:
+    same = one is not None and one.kind == other.kind and np.array_equal(one.size, other.size)
+    return same and np.array_equal(one.mesh[0] if one.mesh else (), other.mesh[0] if other.mesh else ())  # pyright: ignore

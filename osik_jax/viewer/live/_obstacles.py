@@ -1,4 +1,4 @@
-"""Obstacles of a page: the balls and boxes that a ``CollisionAvoidanceLimit`` has in the world or in its scene."""
+"""Obstacles of a page: the shapes that a ``CollisionAvoidanceLimit`` has in the world or in its scene."""
 
 from __future__ import annotations
 
@@ -6,22 +6,44 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ...collision._convex import ConvexShape, table_shapes
+from ...collision._core import core_scene, gaps_at
 from ...collision._geometry import Kind
 from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
+from .._parts import Part
+
+_GEOM = mujoco.mjtGeom
+_KINDS = {
+    ShapeKind.SPHERE: _GEOM.mjGEOM_SPHERE,
+    ShapeKind.CAPSULE: _GEOM.mjGEOM_CAPSULE,
+    ShapeKind.CYLINDER: _GEOM.mjGEOM_CYLINDER,
+    ShapeKind.BOX: _GEOM.mjGEOM_BOX,
+    ShapeKind.HULL: _GEOM.mjGEOM_MESH,
+}
 
 
 class Obstacle(NamedTuple):
     """Draggable shape of the world."""
 
     name: str  # in its limit
-    kind: str  # ball or box
+    part: Part  # how it looks
     position: Float[np.ndarray, "3"]  # of its middle [m]
     rotation: Float[np.ndarray, "3 3"]  # from its axes to the world's
-    size: Float[np.ndarray, "3"]  # of a ball, the radius first; of a box, half its edges [m]
+
+
+class NearestPair(NamedTuple):
+    """The nearest pair of shapes of a limit's scene."""
+
+    names: tuple[str, str]
+    distance: float  # [m]
+    kept: float  # distance that the limit keeps [m]
+    points: Float[np.ndarray, "2 3"]  # nearest points of both [m]
 
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
@@ -30,7 +52,7 @@ def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
 
 
 def _added(limit: Limit) -> Iterator[Obstacle]:
-    """Return the balls and boxes that were added to a collision limit in the world."""
+    """Return the balls, capsules and boxes that were added to a collision limit in the world."""
     if not isinstance(limit, CollisionAvoidanceLimit):
         return
     layout, own = limit.layout, len(limit.layout.geoms)
@@ -39,21 +61,46 @@ def _added(limit: Limit) -> Iterator[Obstacle]:
     )
     for number, name in enumerate(layout.names[own:]):
         position, rotation, size = (part[number] for part in places)
-        kind = {Kind.SEGMENT: "ball", Kind.BOX: "box"}.get(layout.kinds[own + number])
-        if layout.bodies[own + number] == 0 and kind and not (kind == "ball" and size[1] > 0.0):
-            yield Obstacle(name, kind, position, rotation, size)
+        segment = ShapeKind.CAPSULE if size[1] > 0.0 else ShapeKind.SPHERE
+        kind = {Kind.SEGMENT: segment, Kind.BOX: ShapeKind.BOX}.get(layout.kinds[own + number])
+        if layout.bodies[own + number] == 0 and kind:
+            yield _obstacle(name, ConvexShape(kind, size, position, rotation))
 
 
 def _in_scene(limit: Limit) -> Iterator[Obstacle]:
-    """Return the balls and boxes of a limit's scene that nothing carries."""
+    """Return the shapes of a limit's scene that nothing carries, but half spaces."""
     scene = limit.scene if isinstance(limit, CollisionAvoidanceLimit) else None
     if scene is None:
         return
-    kinds, table = {ShapeKind.SPHERE: "ball", ShapeKind.BOX: "box"}, jax.tree.map(np.asarray, scene.table)
-    for row, name in enumerate(scene.names):
-        kind = kinds.get(ShapeKind(int(table.kind[row])))
-        if kind and int(scene.body[row]) < 0:
-            yield Obstacle(name, kind, table.position[row], table.rotation[row], table.size[row])
+    for name, body, shape in zip(scene.names, np.asarray(scene.body), table_shapes(scene.table), strict=False):
+        if shape.kind in _KINDS and body < 0:
+            yield _obstacle(name, shape)
+
+
+def _obstacle(name: str, shape: ConvexShape) -> Obstacle:
+    mesh = None
+    if shape.kind == ShapeKind.HULL:
+        from trimesh.convex import convex_hull  # comes with viser
+
+        hull = convex_hull(np.unique(shape.vertices, axis=0))
+        mesh = np.asarray(hull.vertices), np.asarray(hull.faces)
+    return Obstacle(name, Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh), shape.position, shape.rotation)
+
+
+def nearest_pair(limits: Sequence[Limit], q: Float[np.ndarray, " nq"]) -> NearestPair | None:
+    """Return the nearest of the pairs that limits with a scene keep apart and see, if there is one."""
+    found: NearestPair | None = None
+    for limit in limits:
+        if not isinstance(limit, CollisionAvoidanceLimit) or limit.kept is None or limit.scene is None:
+            continue
+        shapes = limit.kept.shapes
+        one = gaps_at(limit.kept.core, jnp.asarray(q)[None], core_scene(limit.scene, shapes))
+        gaps = jax.tree.map(lambda a: np.asarray(a)[0], one)
+        if gaps.distance < (float(limit.detection_distance) if found is None else found.distance):
+            names = (*shapes.names, *limit.scene.names)
+            pair = names[gaps.pair[0]], names[gaps.pair[1]]
+            found = NearestPair(pair, float(gaps.distance), float(limit.minimum_distance), gaps.points)
+    return found
 
 
 def moved(

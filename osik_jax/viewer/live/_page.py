@@ -21,6 +21,7 @@ from .._outline import floor_height
 from .._parts import robot_parts
 from ._desk import Desk
 from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
+from ._obstacles import NearestPair, nearest_pair
 from ._panel import Panel
 from ._robot_nodes import RobotNodes
 from ._server import FRAME, WORDS, Driving
@@ -29,7 +30,9 @@ from ._surroundings import add_surroundings
 
 if TYPE_CHECKING:
     from viser import ClientHandle, SceneApi
-_IN, _OUT, _EDGE = (42, 157, 98), (215, 38, 61), (28, 111, 184)
+_IN, _OUT, _EDGE, _NEAR = (42, 157, 98), (215, 38, 61), (28, 111, 184), (231, 126, 34)
+_CLOSE, _HELD = 0.05, 1e-3
+"""Distance below which the nearest pair is close; distance beyond the one that is kept where it is held off [m]."""
 _LIFT = 0.002
 """Height of flat marks above the floor [m]."""
 _TOUCHING = 1e-3
@@ -48,7 +51,8 @@ class LiveView(Driving):
         self.loop = self._desk.loop
         seen, floor = shapes.corners(data), floor_height(robot, shapes, [data])
         size = float(np.linalg.norm(np.ptp(seen, axis=0)))
-        add_surroundings(self._server, seen, floor)
+        around = (one.part.corners @ one.rotation.T + one.position for one in self._desk.obstacles.values())
+        add_surroundings(self._server, np.concatenate([seen, *around]), floor)
         self._robot = RobotNodes(self._server.scene, robot)
         self._marks = BalanceMarks(self._server.scene, floor, size) if robot.floating_base else None
         self._gizmos = Gizmos(self._server.scene, size, self._drag)
@@ -81,7 +85,9 @@ class LiveView(Driving):
             begin = time.perf_counter()
             self._draw()
             if count % WORDS == 0:
-                self._panel.tell()
+                near = nearest_pair(self._desk.session.active_limits, self.loop.snapshot.q)
+                self._panel.tell(near)
+                show_nearest(self._server.scene, near)
             count += 1
             # a pause even when drawing is late, so that the control loop gets the GIL
             self._end.wait(max(FRAME - (time.perf_counter() - begin), 0.2 * FRAME))
@@ -203,6 +209,15 @@ def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:
     """Return the polygon of the first task that keeps the centre of mass inside one; None if there is none."""
     found = (task.polygon for task in tasks.values() if isinstance(task, ComTask) and task.polygon is not None)
     return next(found, None)
+
+
+def show_nearest(scene: SceneApi, near: NearestPair | None) -> None:
+    """Draw a line between the points of the nearest pair: green, orange within 5 cm, red where it is held off."""
+    if near is None:
+        return scene.remove_by_name("/nearest")
+    color = _OUT if near.distance < near.kept + _HELD else _NEAR if near.distance < _CLOSE else _IN
+    scene.add_line_segments("/nearest", near.points[None], color, thickness=4.0, thickness_units="screen")
+    return None
 
 
 class BalanceMarks:

@@ -10,6 +10,7 @@ import numpy as np
 from ...limits import Limit, NoLimits
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
+from ._obstacles import NearestPair
 from ._readout import error_table, state_text, timing_text
 from ._server import show_texts
 from ._session import session_from_json
@@ -45,13 +46,14 @@ class Panel:
             self._add_session()
         self.refill()
 
-    def tell(self) -> None:
-        """Show the current state of the loop."""
+    def tell(self, near: NearestPair | None) -> None:
+        """Show the current state of the loop, and the nearest pair of shapes."""
         snapshot, session = self._desk.loop.snapshot, self._desk.session
         texts = (
             (self._state, state_text(snapshot)),
             (self._timing, timing_text(snapshot, self._desk.loop.timing)),
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
+            (self._near, f"{near.names[0]} and {near.names[1]}: {1e3 * near.distance:.0f} mm" if near else ""),
         )
         show_texts(texts)
 
@@ -108,6 +110,7 @@ class Panel:
 
     def _add_limits(self) -> None:
         gui = self._server.gui
+        self._near = gui.add_markdown("")
         self._limits = gui.add_folder("On and off")
         self._limit_boxes: list[Any] = []
 
