@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -38,7 +37,7 @@ from ._host import in_chunks
 from ._problem import read_problem
 from ._run import explored, explored_by_core, found_at_once, isolated_at_answers, searched, searched_on
 from ._seeds import starting_box
-from ._solution import InverseKinematicsSolution
+from ._solution import InverseKinematicsSolution, with_fields
 from ._task_search import entry_limits
 from ._whole import whole_is_possible
 
@@ -179,7 +178,7 @@ def inverse_kinematics(
         results = find_free(*given, once * (1 + restarts), steps, how, obstacles, single=not (many or all))
         found = results.found
         if all:
-            found = dataclasses.replace(found, **_as_arrays(_all_of(*given, results, route)))
+            found = with_fields(found, **_as_arrays(_all_of(*given, results, route)))
         return found if many or not (all or is_traced(found)) else jax.tree.map(lambda a: a[0], found)
     most, by_core = once * (1 + restarts), not traced and whole_is_possible(route, every=nearest or all)
     # inside jit, operations on numbers would be traced too
@@ -189,7 +188,7 @@ def inverse_kinematics(
             if at_once is not None and all:
                 batched = at_once._replace(found=jax.tree.map(lambda a: np.asarray(a)[None], at_once.found))
                 more = {name: a[0] for name, a in _all_of(*given, batched, route).items()}
-                return dataclasses.replace(at_once.found, **_as_arrays(more))
+                return with_fields(at_once.found, **_as_arrays(more))
             if at_once is not None:
                 return at_once.found
         if traced or nearest or all:
@@ -203,13 +202,13 @@ def inverse_kinematics(
             if not traced:
                 found = searched_on(*given, found, most, steps, route=route, warm=how.warm, near=nearest)
             if all:
-                found = dataclasses.replace(found, **_all_of(*given, results._replace(found=found), route))
+                found = with_fields(found, **_all_of(*given, results._replace(found=found), route))
         else:
             found = searched(*given, most, steps, route=route, warm=how.warm, go_on=closest)
         if not (traced or np.all(found.converged)):
             missed = np.asarray(found.q)[~np.asarray(found.converged)]
             said = advice(robot, route.asked(settings), route.held(settings), missed)
-            found = dataclasses.replace(found, advice=said)
+            found = with_fields(found, advice=said)
         return jax.device_put(found if problem.many else jax.tree.map(lambda a: a[0], found))
 
 
