@@ -369,11 +369,15 @@ def _placed(
         return len(places) - 1
 
     for name, own in rows.items():
-        upper, jacobian = (None if own.is_equality else own.upper), (None if own.dofs is not None else own.jacobian)
-        numbers = own.error, own.lower, upper, own.weight, own.pull, own.levers, own.curvature, jacobian, None
-        found[name] = [add(part) for part in numbers]
+        found[name] = [add(part) for part in row_parts(own)]
     limit_rows = [] if of_limits is None else [add(part) for part in jax.tree.leaves(of_limits)]
     return found, limit_rows, parts
+
+
+def row_parts(rows: TaskRows) -> tuple[Any, ...]:
+    """Return the numbers of rows that JAX computes, in the order of ``StepRows::add_given``; None: it needs none."""
+    upper, jacobian = (None if rows.is_equality else rows.upper), (None if rows.dofs is not None else rows.jacobian)
+    return rows.error, rows.lower, upper, rows.weight, rows.pull, rows.levers, rows.curvature, jacobian, None
 
 
 def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:

@@ -13,8 +13,8 @@ from ..kinematics._manifold import layout as manifold
 from ..limits import Limit, with_own_limits
 from ..robot import Robot
 from ..schemes import Scheme
-from ..tasks import Task
-from ._compiled_step import Layout, missing_part
+from ..tasks import Task, TaskRows
+from ._compiled_step import Layout, missing_part, row_parts
 from ._units import configuration_units, velocity_units
 
 VERSION = 2
@@ -33,6 +33,7 @@ class PackedStep(NamedTuple):
         rows: sizes and indices of the step's rows.
         layout: what ``Step`` in ``core/step.hpp`` reads.
         constants: what ``StepData`` has under this name.
+        given: where the rows that JAX computes go, one task's after another's.
     """
 
     numbers: np.ndarray
@@ -41,6 +42,7 @@ class PackedStep(NamedTuple):
     rows: Layout
     layout: np.ndarray
     constants: np.ndarray
+    given: slice
 
     def place(self, leaf: int) -> slice:
         """Return where the numbers of a leaf are."""
@@ -49,9 +51,15 @@ class PackedStep(NamedTuple):
 
 
 def pack(
-    robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float, limit_rows: int = 0
+    robot: Robot,
+    tasks: Mapping[str, Task],
+    scheme: Scheme,
+    bounds: Sequence[Limit],
+    dt: float,
+    limit_rows: int = 0,
+    given: Mapping[str, TaskRows] | None = None,
 ) -> PackedStep:
-    """Return the step of tasks, scheme and all limits, of which the core has every part.
+    """Return the step of tasks, scheme and all limits, of which the core has every part but rows that are given.
 
     Args:
         robot: the robot.
@@ -60,27 +68,41 @@ def pack(
         bounds: all limits.
         dt: time of a step [s].
         limit_rows: number of rows of limits, for which there is room in the last three leaves: Jacobian, bounds.
+        given: rows that JAX computes, by task, of which the shapes count.
     """
-    tasks = dict(sorted(tasks.items()))  # as in a program of JAX, so that roundoff is the same
-    given = robot, robot.q0, tasks, scheme, tuple(bounds), dt, None
-    leaves, tree = jax.tree.flatten(given)
+    leaves, tree = jax.tree.flatten(arguments_of(robot, tasks, scheme, bounds, dt))
     leaves = [np.asarray(leaf, np.float64).ravel() for leaf in leaves]
     numbered = jax.tree.unflatten(tree, range(len(leaves)))
+    of_rows, first, before = {}, sum(map(len, leaves)), len(leaves)
+    for name, own in (given or {}).items():
+        parts = [None if part is None else np.zeros(part.size) for part in row_parts(own)]
+        numbers = iter(range(len(leaves), len(leaves) + len(parts)))
+        of_rows[name] = [-1 if part is None else next(numbers) for part in parts]
+        leaves += [part for part in parts if part is not None]
+    end = first + sum(map(len, leaves[before:]))
     room = np.zeros(limit_rows * robot.nv), np.full(limit_rows, -np.inf), np.full(limit_rows, np.inf)
     of_limits = [*range(len(leaves), len(leaves) + 3)] if limit_rows else []
     leaves += room if limit_rows else ()
     sizes = [len(leaf) for leaf in leaves]
     firsts = (np.cumsum(sizes) - sizes).tolist()
-    rows = Layout(robot, tasks, scheme, limit_rows=limit_rows)
+    rows = Layout(robot, dict(sorted(tasks.items())), scheme, given, limit_rows)
     of_one_array = {i: (0, first, size) for i, (first, size) in enumerate(zip(firsts, sizes, strict=True))}
     return PackedStep(
         np.concatenate(leaves),
         list(zip(firsts, sizes, strict=True)),
         numbered,
         rows,
-        rows.integers(of_one_array, numbered, -1, limit_rows=of_limits),
+        rows.integers(of_one_array, numbered, -1, of_rows, of_limits),
         rows.constants(np.dtype(np.float64)),
+        slice(first, end),
     )
+
+
+def arguments_of(
+    robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, bounds: Sequence[Limit], dt: float
+) -> tuple[Any, ...]:
+    """Return the arguments of a step; tasks in the order of a program of JAX, so that roundoff is the same."""
+    return robot, robot.q0, dict(sorted(tasks.items())), scheme, tuple(bounds), dt, None
 
 
 def packed_section(

@@ -6,6 +6,7 @@ they are recognised by their identity, and only the configuration and what is ne
 
 from __future__ import annotations
 
+import itertools
 import operator
 import threading
 from collections import OrderedDict
@@ -14,19 +15,21 @@ from functools import lru_cache
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 from ..core._plain import functions
 from ..limits import CollisionAvoidanceLimit, Limit, NoLimits, with_own_limits
-from ..numerics._host import float_now, is_traced
+from ..numerics._host import float_now, is_traced, untraced
 from ..robot import Robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
 from ..tasks import Task
 from ._checks import LARGEST_GAIN, plain_configuration
-from ._compiled_step import is_compiled, leaf_places, missing_part, solution_shapes
-from ._packed_step import pack
+from ._compiled_step import given_rows, is_compiled, leaf_places, missing_part, row_parts, solution_shapes
+from ._packed_step import arguments_of, pack
 from ._plain_rows import PlainRows, with_plain_rows
 from ._solution import Solution
 
@@ -61,7 +64,7 @@ def keep_step(
     key, numbers = _key(robot, tasks, scheme, limits), (robot, dict(tasks), scheme, limits)
     if key is None or is_traced((q, dt)) or _is_open(numbers) or robot.q0.dtype != float_now():
         return None
-    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has these numbers as constants
+    with untraced():  # the call may stand inside a program that has these numbers as constants
         step = plain_step(robot, tasks, scheme, limits, dt) or Checked(robot, tasks, scheme, limits)
     with _lock:
         _kept[key] = step
@@ -101,8 +104,10 @@ def plain_step(
     if not is_compiled(robot, robot.q0, dict(tasks), chosen, bounds, np.float64(dt), None):
         return None
     others = [limit for limit in bounds if limit not in with_plain_rows(bounds)]
-    if missing_part(robot, tasks, chosen, others) is not None:
+    if missing_part(robot, {}, chosen, others) is not None:
         return None
+    if any(type(task).after is not Task.after for task in tasks.values() if isinstance(task.core(robot), str)):
+        return None  # their rows are of the step before, too
     return PlainStep(robot, tasks, scheme, limits, float(dt), chosen, bounds)
 
 
@@ -185,7 +190,12 @@ class PlainStep(Checked):
     ) -> None:
         super().__init__(robot, tasks, scheme, limits)
         avoiding = with_plain_rows(bounds)
-        packed = pack(robot, tasks, chosen, bounds, dt, sum(limit.max_pairs for limit in avoiding))
+        arguments = arguments_of(robot, tasks, chosen, bounds, dt)
+        leaves, structure = jax.tree.flatten(arguments)
+        shapes = tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+        given, _ = jax.eval_shape(given_rows, *arguments[:4], (), dt)
+        packed = pack(robot, tasks, chosen, bounds, dt, sum(limit.max_pairs for limit in avoiding), given)
+        self._given, self._given_rows = packed.given, _given_program(structure, shapes) if given else None
         of_robot, q, numbered, of_scheme, of_limits, of_dt, _ = packed.numbered
         self._q, self._of_dt = packed.place(q), packed.place(of_dt)
         self._dt: Any = dt
@@ -304,6 +314,9 @@ class PlainStep(Checked):
                     self._aim(name, tasks[name], parts, own)
                 for rows in self._rows:
                     rows.fill(self._q_address, dt)
+                if self._given_rows is not None:
+                    with untraced():
+                        self._numbers[self._given] = self._given_rows(self._numbers)
                 functions().step(*self._inputs, *guesses, self._clean, *self._results)
             finally:  # also where Ctrl-C ends the call
                 for place, numbers in own:
@@ -384,6 +397,21 @@ class PlainStep(Checked):
 
     def _put(self, place: slice, part: Any) -> None:
         self._numbers[place] = np.asarray(part).ravel()  # NumPy's ravel would run JAX's
+
+
+@lru_cache
+def _given_program(structure: Any, shapes: tuple[tuple[tuple[int, ...], Any], ...]) -> Callable[[Any], Array]:
+    """Return the program from the numbers of a step to the rows that JAX computes, as ``pack`` lays out both."""
+    ends = np.cumsum([0, *(int(np.prod(shape)) for shape, _ in shapes)]).tolist()
+
+    def given(numbers: Array) -> Array:
+        parts = [numbers[first:end] for first, end in itertools.pairwise(ends)]
+        leaves = [part.reshape(shape).astype(kind) for part, (shape, kind) in zip(parts, shapes, strict=True)]
+        robot, q, tasks, scheme, _, dt, _ = jax.tree.unflatten(structure, leaves)
+        rows, _ = given_rows(robot, q, tasks, scheme, (), dt)
+        return jnp.concatenate([part.ravel() for own in rows.values() for part in row_parts(own) if part is not None])
+
+    return jax.jit(given)
 
 
 def _is_aimed(task: Any, seen: Any) -> bool:

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from compilations import Compilations
 from core_checks import needs_core
 from jax.core import Tracer
 from refusals import refuses
@@ -149,6 +150,27 @@ def test_a_step_of_the_core_compiles_nothing(arm: osik.Robot, monkeypatch: pytes
     for _ in range(3):
         q = osik.integrate(arm, q, osik.solve(arm, q, tasks, dt=DT).velocity, DT)
         tasks = {**tasks, "hand": tasks["hand"].replace(target=(np.array([0.4, 0.1, 0.4]), np.eye(3)))}
+
+
+@needs_core
+@pytest.mark.parametrize("scheme", ["default", "weighted"])
+@pytest.mark.filterwarnings("ignore:a WeightedQP ignores priorities")
+def test_rows_that_jax_computes_enter_the_call_of_the_core(arm: osik.Robot, scheme: str) -> None:
+    """New targets and gains compile nothing; a point in the hand gets the status of a compiled step."""
+    hand = arm.tree.body_names[-1]
+    tasks = {**tasks_of(arm), "look": osik.LookAtTask(arm, hand, target=[1.0, 0.2, 0.4], priority=2)}
+    tasks["height"] = osik.FunctionTask(arm, lambda r, k, q: k.frame_pose(r, hand)[0][2:], lower=0.1, upper=0.3)
+    controller, q = osik.Controller(arm, tasks, scheme=SCHEMES[scheme], dt=DT), moved(arm, 3)
+    assert isinstance(controller._plain, _plain_step.PlainStep)
+    assert_same(controller.step(q), compiled(arm, q, tasks, scheme=SCHEMES[scheme]))
+    points = np.array([0.5, 0.5, 0.5]), np.asarray(osik.forward_kinematics(arm, q).frame_pose(arm, hand)[0])
+    controller.tasks["look"] = tasks["look"] = tasks["look"].replace(gain=3.0)
+    with Compilations() as later:
+        found = [controller.step(q, {"look": point}) for point in points]
+    assert later.names == []
+    for answer, point in zip(found, points, strict=True):
+        aimed = {**tasks, "look": tasks["look"].replace(target=point)}
+        assert_same(answer, compiled(arm, q, aimed, scheme=SCHEMES[scheme]))
 
 
 @needs_core
