@@ -192,7 +192,7 @@ class PlainStep(Checked):
         avoiding = with_plain_rows(bounds)
         arguments = arguments_of(robot, tasks, chosen, bounds, dt)
         leaves, structure = jax.tree.flatten(arguments)
-        shapes = tuple((np.shape(leaf), np.result_type(leaf)) for leaf in leaves)
+        shapes = tuple((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         given, _ = jax.eval_shape(given_rows, *arguments[:4], (), dt)
         packed = pack(robot, tasks, chosen, bounds, dt, sum(limit.max_pairs for limit in avoiding), given)
         self._given, self._given_rows = packed.given, _given_program(structure, shapes) if given else None
