@@ -10,8 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.extend.core import get_opaque_trace_state
 from jaxtyping import Array
+
+try:
+    from jax.extend.core import get_opaque_trace_state
+except ImportError:  # in JAX 0.8
+    from jax.core import get_opaque_trace_state  # pyright: ignore[reportAttributeAccessIssue]
 
 if TYPE_CHECKING:
     Numbers: TypeAlias = Any  # an operator of both is none of their union's
