@@ -248,9 +248,9 @@ def _descended_plain(
 def _descended_by_core(
     call: Call,
     clip: _Clip,
-    q: Float[Array, "lanes F nq"],
-    most: Int[Array, " lanes"],
-    damping: Float[Array, " lanes"],
+    q: Float[Array, "#lanes F nq"],
+    most: Int[Array, " #lanes"],
+    damping: Float[Array, " #lanes"],
     *,
     until: _Ending,
 ) -> Plan:
