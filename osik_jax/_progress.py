@@ -10,7 +10,7 @@ from typing import Any
 from ._errors import OsikTypeError
 
 Progress = bool | Callable[[int, int], Any]
-"""What shows how far a job is: a bar (True), nothing (False), or a function of the number of lanes done and of all."""
+"""Display of a job's progress: a bar (True), none (False), or a function of the number of lanes done and of all."""
 
 
 @contextlib.contextmanager

@@ -70,7 +70,8 @@ def pack(
         limit_rows: number of rows of limits, for which there is room in the last three leaves: Jacobian, bounds.
         given: rows that JAX computes, by task, of which the shapes count.
     """
-    leaves, tree = jax.tree.flatten(arguments_of(robot, tasks, scheme, bounds, dt))
+    arguments = arguments_of(robot, tasks, scheme, bounds, dt)
+    leaves, tree = jax.tree.flatten(arguments)
     leaves = [np.asarray(leaf, np.float64).ravel() for leaf in leaves]
     numbered = jax.tree.unflatten(tree, range(len(leaves)))
     of_rows, first, before = {}, sum(map(len, leaves)), len(leaves)
@@ -85,7 +86,7 @@ def pack(
     leaves += room if limit_rows else ()
     sizes = [len(leaf) for leaf in leaves]
     firsts = (np.cumsum(sizes) - sizes).tolist()
-    rows = Layout(robot, dict(sorted(tasks.items())), scheme, given, limit_rows)
+    rows = Layout(robot, arguments[2], scheme, given, limit_rows)
     of_one_array = {i: (0, first, size) for i, (first, size) in enumerate(zip(firsts, sizes, strict=True))}
     return PackedStep(
         np.concatenate(leaves),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -78,13 +79,17 @@ def _in_scene(limit: Limit) -> Iterator[Obstacle]:
 
 
 def _obstacle(name: str, shape: ConvexShape) -> Obstacle:
-    mesh = None
-    if shape.kind == ShapeKind.HULL:
-        from trimesh.convex import convex_hull  # comes with viser
-
-        hull = convex_hull(np.unique(shape.vertices, axis=0))
-        mesh = np.asarray(hull.vertices), np.asarray(hull.faces)
+    mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
     return Obstacle(name, Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh), shape.position, shape.rotation)
+
+
+@lru_cache
+def _hull(vertices: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and triangles of a hull, once for all poses that it is dragged to."""
+    from trimesh.convex import convex_hull  # comes with viser
+
+    hull = convex_hull(np.unique(np.frombuffer(vertices).reshape(-1, 3), axis=0))
+    return np.asarray(hull.vertices), np.asarray(hull.faces)
 
 
 def nearest_pair(limits: Sequence[Limit], q: Float[np.ndarray, " nq"]) -> NearestPair | None:
