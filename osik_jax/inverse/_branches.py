@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ._fixed import Explored
-from ._turns import TURN, apart, unwound
+from ._turns import TURN, unwound
 
 _SEPARATION = 0.1
 """Solutions that differ by less in every joint [rad or m] are one."""
@@ -72,11 +72,13 @@ def _distinct(
 ) -> Int[np.ndarray, " m"]:
     """Return the first of each set of configurations that differ by less than their separation, modulo whole turns."""
     kept: list[int] = []
-    left = np.arange(len(x))
+    left, columns, turn = np.arange(len(x)), np.ascontiguousarray(x.T), TURN * turns[:, None]
     while len(left):
-        first = int(left[0])
-        kept.append(first)
-        left = left[apart(x[left], x[first], turns) > np.maximum(separation[left], separation[first])]
+        kept.append(int(left[0]))
+        away = columns - columns[:, :1]
+        away -= turn * np.rint(away / TURN)
+        more = np.abs(away).max(0) > np.maximum(separation, separation[0])
+        left, columns, separation = left[more], columns.compress(more, 1), separation[more]
     return np.array(kept)
 
 
@@ -85,15 +87,19 @@ def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> 
 
     A joint without limits has no copies: there is no end to them.
     """
+    joints = np.flatnonzero(own.turns & np.isfinite(own.lower) & np.isfinite(own.upper))
+    here, unit = branches[:, joints, None], np.eye(len(own.first), dtype=branches.dtype)[joints]
+    fewest, greatest = (
+        np.ceil((own.lower[joints, None] - here) / TURN),
+        np.floor((own.upper[joints, None] - here) / TURN),
+    )
+    choices = (greatest - fewest).max((0, 2), initial=0).astype(int) + 1
+    number = fewest + np.arange(choices.max(initial=1))
+    moved = np.where(number <= greatest, TURN * number, np.nan).astype(branches.dtype)
     copies = branches[:, None]
-    for at in np.flatnonzero(own.turns & np.isfinite(own.lower) & np.isfinite(own.upper)):
-        here, end = branches[:, at], own.upper[at]
-        fewest = np.ceil((own.lower[at] - here) / TURN)
-        number = fewest[:, None] + np.arange(int((np.floor((end - here) / TURN) - fewest).max(initial=0)) + 1)
-        turned = copies[:, :, None].repeat(number.shape[1], 2)
-        turned[..., at] += TURN * number[:, None]
-        turned[turned[..., at] > end] = np.nan
-        copies = turned.reshape(len(branches), -1, len(own.first))
+    for at in np.flatnonzero(choices > 1):
+        turned = moved[:, None, at, : choices[at], None] * unit[at]
+        copies = (copies[:, :, None] + turned).reshape(len(branches), -1, len(own.first))
         if copies.shape[1] > most:
             copies = _nearest(copies, own, most)
     every = copies[(copies != branches[:, None]).any(-1) & np.isfinite(copies[..., 0])]

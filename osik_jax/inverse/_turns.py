@@ -43,10 +43,3 @@ def one_turn(
     """Return bounds one turn apart within wider limits, centred on a configuration as far as possible."""
     low = jnp.clip(about - 0.5 * TURN, lower, upper - TURN)
     return low, low + TURN
-
-
-def apart(x: Float[np.ndarray, "*k n"], other: Float[np.ndarray, " n"], turns: np.ndarray) -> Float[np.ndarray, "*k"]:
-    """Return the largest difference of a coordinate, modulo whole turns [rad or m]."""
-    difference = x - other
-    turned = difference - TURN * np.round(difference / TURN)
-    return np.abs(np.where(turns, turned, difference)).max(-1)
