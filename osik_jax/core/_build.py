@@ -32,7 +32,7 @@ def library_path(level: str) -> Path:
 
 def sources() -> list[Path]:
     """Return the C++ files of the library."""
-    return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("*.cpp")])
+    return sorted([*FOLDER.glob("*.hpp"), *FOLDER.glob("tasks/*.hpp"), *FOLDER.glob("*.cpp")])
 
 
 def fingerprint() -> str:

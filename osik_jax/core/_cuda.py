@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import math
 import os
+import posixpath
 import re
 import sys
 from collections.abc import Sequence
@@ -92,12 +93,13 @@ def text_of(header: str) -> str:
     """Return a header of the core with all headers it includes, as one text for NVRTC."""
     seen: set[str] = set()
 
-    def inlined(name: str) -> str:
+    def inlined(name: str, folder: str = "") -> str:
+        name = posixpath.normpath(posixpath.join(folder, name))
         if name in seen or name in ("serial.hpp", "lanes.hpp"):  # the team of a CPU, and its packs
             return ""
         seen.add(name)
         text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())
-        return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1]), text.replace("#pragma once\n", ""))
+        return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1], posixpath.dirname(name)), text.replace("#pragma once\n", ""))
 
     return rolled(inlined(header))
 

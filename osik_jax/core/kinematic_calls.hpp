@@ -10,7 +10,8 @@
 //   space()                               numbers to work with, a Space: as many as the caller in Python says
 // Both calls are written for it: one of a CPU (xla.hpp: Batch), one of a GPU (lanes_cuda.hpp).
 #pragma once
-#include "task_rows.hpp"
+#include "tasks/center.hpp"
+#include "tasks/pose.hpp"
 
 namespace osik {
 

@@ -97,7 +97,7 @@ class Step : StepRows {
     for (const Task& task : tasks) {
       for (int i = 0; i < task.m && task.dofs && task.level == level; ++i)
         force[count++] = task.weight[i] * task.rows.pull[i];
-      loops |= task.level < level && task.closes_loop();
+      loops |= task.level < level && task.closes_loop;
     }
     if (!level || !(count || loops)) return 0;
     const double linear = count ? safe_norm(force, count) * bending([&](const Task& task) { return task.level < level; })
@@ -112,7 +112,7 @@ class Step : StepRows {
       curved = safe_norm(both, 2);
     }
     const double both[] = {linear,
-                           curved * bending([&](const Task& task) { return task.level < level && task.closes_loop(); })};
+                           curved * bending([&](const Task& task) { return task.level < level && task.closes_loop; })};
     return safe_norm(both, 2);
   }
   // VelocityProblem._bending: the curvature of tasks for a unit force in the joints

@@ -46,8 +46,7 @@ inline double safe_norm(const double* v, int count) {
 }
 
 // The rows and the box of a step at hand. Robots of a batch have their rows computed in packs.
-class StepRows {
- protected:
+struct StepRows {
   using Team = Serial<double>;
   using Numbers = std::vector<double>;
   using Pack = Lanes<double>;
@@ -57,15 +56,14 @@ class StepRows {
     Rows<double*> rows = {};
     double* weight = nullptr;
 
+    bool closes_loop = false;
+
     explicit Task(const StepLayout::Task& of) : StepLayout::Task(of) {
-      const int own = kind == POSTURE ? m : kind == GIVEN ? FIRST_FINITE + options[FINITE] : count;
-      dofs = own < count ? options + own : nullptr;
+      TaskKinds::with(kind, [&](auto card) {
+        dofs = card.dofs(of) < count ? options + card.dofs(of) : nullptr, closes_loop = card.closes_loop(of);
+      });
     }
-    bool closes_loop() const { return kind == GIVEN && options[CLOSES_LOOP]; }
   };
-  // options of GIVEN: whether the rows close a loop, the task's own leaves (first, end), how many of them are never
-  // infinite, these, and dofs
-  enum { CLOSES_LOOP, LEAVES, LEAVES_END, FINITE, FIRST_FINITE };
   StepLayout layout;
   const StepSizes& s;
   const RowPlaces place;
@@ -82,7 +80,6 @@ class StepRows {
   bool ordered;  // whether no lower bound is above its upper one
   int limit_rows = 0;
 
- public:
   StepRows(const int* given, int count)
       : layout(given, count), s(layout.s), place(s), own(layout), packed(layout), numbers(Pack::COUNT * place.end) {
     center.resize(3 * s.nv + 8), zeros.resize(s.rows + s.nq + 1), no_labels.resize(s.labels()), bounds.resize(s.tasks);
@@ -97,14 +94,15 @@ class StepRows {
   // The rows of a pack of robots, the first of which is given.
   void find_pack(const StepData& d) {
     packed.place(d.constants, d.arrays, d.apart, numbers.data());
-    for (int k = 0; k < s.tasks; ++k)
-      if (tasks[k].kind == POSE || tasks[k].kind == CENTER) packed.add(k);
+    for (int k = 0; k < s.tasks; ++k) packed.add(k);
   }
-
- protected:
   Leaf<const double*> leaf(int k) const {
     const StepLayout::Place& place = layout.places[k];
     return {arrays[place.array] + place.offset, place.size};
+  }
+  bool is_finite(const Task& task, int own) const {
+    const auto numbers = leaf(task.leaves[own]);
+    return all_finite(numbers.at, numbers.size);
   }
   const double* of_step(int k) const { return leaf(layout.of_step[k]).at; }
   // f(rows) of each limit with rows. Leaves: Jacobian, lower and upper bounds.
@@ -141,13 +139,10 @@ class StepRows {
     if (is_placed && robot < 0) own.place(d.constants, arrays, d.apart, numbers.data());
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];
-      task.valid = is_placed;
-      const int* spoils = task.options + LEAVES;
-      if (task.kind == GIVEN) task.valid = is_placed && (clean || !spoiled(spoils[0], spoils[1], d.count));
-      else
-        for (int i = 0; i < 9 && !clean; ++i)
-          task.valid = task.valid && !(task.leaves[i] >= 0 && spoiled(task.leaves[i], task.leaves[i] + 1, d.count));
-      if (task.valid) valid = add_task(k, given, robot < 0) && valid;
+      TaskKinds::with(task.kind, [&](auto card) {
+        task.valid = is_placed && (clean || !card.is_spoiled(*this, task, d.count));
+        if (task.valid) valid = add(card, k, given, robot < 0) && valid;
+      });
       valid = valid && task.valid;
     }
     return valid;
@@ -232,31 +227,23 @@ class StepRows {
     };
     e.put(narrowed(from), lower.data()), e.put(narrowed(to), upper.data());
   }
-  // The rows of a task, and whether a solver takes them. Leaves of a task: gain, weight, target velocity (or none), bounds
-  // (or none), then those of its kind.
-  bool add_task(int k, const double* given, bool alone) {
+  // The rows of a task, and whether a solver takes them.
+  template <class Card> bool add(Card card, int k, const double* given, bool alone) {
     Task& task = tasks[k];
-    if (task.kind == GIVEN) return add_given(task);
-    const int m = task.m, *options = task.options, *leaves = task.leaves;
-    const double own_gain = *leaf(leaves[0]).at;
-    const double* velocity = leaves[2] < 0 ? zeros.data() : leaf(leaves[2]).at;
-    bool takes = true;
-    task.valid = fabs(own_gain) <= LARGEST_DOUBLE;
-    auto is_finite = [&](int i, int count) { return all_finite(leaf(leaves[i]).at, count); };
-    for (int i = 0; i < m && task.bounded; ++i)
-      takes &= (leaves[3] < 0 || leaf(leaves[3]).at[i] < INFINITE) && leaf(leaves[4]).at[i] > -INFINITE;
-    if (task.kind == POSE) {
-      task.valid &= is_finite(5, 3) && is_finite(6, 9) && all_finite(velocity, 6);
-      for (int i : {7, 8}) task.valid &= is_finite(i, leaf(leaves[i]).size);
-    } else if (task.kind == CENTER) {
-      if (options[0]) takes &= is_finite(5, 2 * m);
-      else if (!task.bounded) task.valid &= is_finite(5, m);
-      task.valid &= all_finite(velocity, m);
-    } else task.valid &= (task.bounded || is_finite(5, s.given)) && all_finite(velocity, m);
-    if (task.kind == POSTURE) add_posture(task, given, velocity, own_gain > 1 / dt ? 1 / dt : own_gain);
-    else if (task.valid && alone) own.add(k);
-    for (int i = 0; i < m; ++i) task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
-    return takes && are_taken(task);
+    if constexpr (card.IS_COMPUTED) return card.add(*this, task);
+    else {
+      const int m = task.m, *leaves = task.leaves;
+      const double gain = *leaf(leaves[GAIN]).at;
+      const double* velocity = leaves[TARGET_VELOCITY] < 0 ? zeros.data() : leaf(leaves[TARGET_VELOCITY]).at;
+      bool takes = card.takes(*this, task);
+      task.valid = fabs(gain) <= LARGEST_DOUBLE && all_finite(velocity, card.velocities(m)) && card.is_valid(*this, task);
+      for (int i = 0; i < m && task.bounded; ++i)
+        takes &= (leaves[LOWER] < 0 || leaf(leaves[LOWER]).at[i] < INFINITE) && leaf(leaves[UPPER]).at[i] > -INFINITE;
+      if constexpr (!card.MOVES) card.add(*this, task, given, velocity, gain > 1 / dt ? 1 / dt : gain);
+      else if (task.valid && alone) own.add(k);
+      for (int i = 0; i < m; ++i) task.valid &= fabs(task.weight[i]) <= LARGEST_DOUBLE;
+      return takes && are_taken(task);
+    }
   }
   // Whether a solver takes the rows of a task.
   bool are_taken(const Task& task) {
@@ -269,51 +256,12 @@ class StepRows {
     // squared lengths are finite only where all entries of the rows are
     return takes && (task.dofs || all_finite(task.rows.squares, task.m) || all_finite(task.rows.jacobian, task.m * s.nv));
   }
-  // The rows that JAX has computed. Leaves: error, bounds (or none above), weight, pull, levers, curvature, Jacobian (none
-  // for rows of dofs).
-  bool add_given(Task& task) {
-    const int m = task.m, nv = s.nv, *options = task.options, *leaves = task.leaves;
-    for (int i = 0; i < options[FINITE]; ++i) {
-      const auto own = leaf(options[FIRST_FINITE + i]);
-      task.valid = task.valid && all_finite(own.at, own.size);
-    }
-    const Rows<double*>& to = task.rows;
-    double* const places[] = {to.error, to.lower, to.upper, task.weight, to.pull, to.levers, to.curvature, to.jacobian};
-    const int sizes[] = {m, m, m, m, m, nv, 1, m * nv};
-    for (int k = 0; k < 8; ++k)
-      if (leaves[k] >= 0) std::copy_n(leaf(leaves[k]).at, sizes[k], places[k]);
-    if (task.dofs) put_dofs(task);
-    bool takes = all_finite(task.weight, m) && all_finite(to.error, m) && all_finite(to.pull, m) &&
-                 all_finite(to.levers, nv) && all_finite(to.curvature, 1);
-    for (int i = 0; i < m; ++i) {
-      if (!task.dofs) to.squares[i] = Team::own_dot(&to.jacobian[i * nv], &to.jacobian[i * nv], 0, nv);
-      takes &= !task.bounded || (s.scheme == WEIGHTED && task.weight[i] == 0) ||
-               (to.lower[i] < INFINITE && to.upper[i] > -INFINITE);
-    }
-    return takes && are_taken(task);
-  }
   // rows of the identity, and their squared lengths
   void put_dofs(const Task& task) {
     for (int i = 0; i < task.m; ++i) {
       task.rows.squares[i] = 1;
       for (int j = 0; j < s.nv && !task.diagonal; ++j) task.rows.jacobian[i * s.nv + j] = j == task.dofs[i];
     }
-  }
-  // options: place in q and dof of each row
-  void add_posture(const Task& task, const double* given, const double* velocity, double gain) {
-    const int m = task.m, *options = task.options, *leaves = task.leaves;
-    const double* target = task.bounded ? nullptr : leaf(leaves[5]).at;
-    Bounds<const double*> interval;
-    if (task.bounded) interval = {leaf(leaves[3]).at, leaf(leaves[4]).at};
-    const Leaf<const double*> weights = leaf(leaves[1]);
-    *task.rows.curvature = 0;
-    std::fill_n(task.rows.levers, s.nv, 0.0);
-    for (int i = 0; i < m; ++i) {
-      const double value = given[options[i]] - (target ? target[options[i]] : 0.0);
-      task.weight[i] = weights[i];
-      ask(task.rows, interval, i, value, velocity[i], gain);
-    }
-    put_dofs(task);
   }
 };
 }  // namespace osik

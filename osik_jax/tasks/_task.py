@@ -134,9 +134,9 @@ class TaskRows(eqx.Module):
 
 
 class CoreCard(NamedTuple):
-    """Facts by which the compiled step computes the rows of a task (``core/step_rows.hpp``)."""
+    """Facts by which the compiled step computes the rows of a task (``core/tasks``)."""
 
-    kind: int  # ``POSE``, ``CENTER`` or ``POSTURE``: ``StepTask`` in ``core/moving_rows.hpp``
+    kind: int  # ``POSE``, ``CENTER`` or ``POSTURE``: a place in ``TaskKinds`` (``core/tasks/kinds.hpp``)
     rows: int  # their number
     options: list[int]  # indices and flags of this kind
 

@@ -7,7 +7,8 @@
 #include <string>
 #include <vector>
 
-#include "../moving_rows.hpp"
+#include "../step_layout.hpp"
+#include "../tasks/kinds.hpp"
 
 namespace osik {
 
@@ -21,14 +22,14 @@ inline void require_within(const int* from, int count, int low, int end, const c
 class LayoutCheck {
   using Task = StepLayout::Task;
   const StepLayout& layout;
-  const StepSizes& s;
   const bool by_weight, projects;
 
  public:
+  const StepSizes& s;
   // numbers, constants: lengths of the file's arrays of these names
   LayoutCheck(const StepLayout& layout, size_t numbers, size_t constants)
-      : layout(layout), s(layout.s), by_weight(s.scheme == WEIGHTED),
-        projects(s.scheme == CLASSICAL || s.scheme == SATURATED) {
+      : layout(layout), by_weight(layout.s.scheme == WEIGHTED),
+        projects(layout.s.scheme == CLASSICAL || layout.s.scheme == SATURATED), s(layout.s) {
     check_sizes();
     const int tolerances[] = {2, 4, 1, 1};  // of each scheme
     require(constants == size_t(s.nq) + s.dofs + 1 + tolerances[s.scheme], "constants");
@@ -50,6 +51,23 @@ class LayoutCheck {
     else check_levels(of_level);
   }
 
+  // what cards of tasks ask
+  static void require(bool holds, const char* part) { osik::require(holds, part); }
+  static void require_within(const int* from, int count, int low, int end, const char* part) {
+    osik::require_within(from, count, low, end, part);
+  }
+  void check_leaf(int k, int size, int other = -1) const {
+    require(k >= 0 && k < s.leaves && (layout.places[k].size == size || layout.places[k].size == other), "leaves");
+  }
+  void check_optional_leaf(int k, int size) const {
+    if (k != -1) check_leaf(k, size);
+  }
+  int frames() const {
+    const int k = layout.of_robot[StepLayout::FRAME_POSITION];
+    require(k >= 0 && k < s.leaves && layout.places[k].size % 3 == 0 && layout.places[k].size < 1 << 24, "frames");
+    return layout.places[k].size / 3;
+  }
+
  private:
   void check_sizes() const {
     require(s.scheme >= WEIGHTED && s.scheme <= SATURATED && s.bodies > 0 && s.nv > 0 && s.given > 0 && s.tasks > 0,
@@ -57,12 +75,6 @@ class LayoutCheck {
     require(s.max_iterations > 0 && s.max_iterations <= 20 * (s.nv + s.rows + 1), "limit on iterations");
     // workspaces have some thousand columns at most, so that their sizes in bytes are integers
     require(s.nv + s.dofs + s.m + s.p + s.h + s.rows <= 8192 && int64_t(s.L) * s.m * s.nv <= 1 << 24, "sizes");
-  }
-  void check_leaf(int k, int size, int other = -1) const {
-    require(k >= 0 && k < s.leaves && (layout.places[k].size == size || layout.places[k].size == other), "leaves");
-  }
-  void check_optional_leaf(int k, int size) const {
-    if (k != -1) check_leaf(k, size);
   }
   // the leaves of the step, of the robot, and of limits
   void check_leaves() const {
@@ -83,11 +95,6 @@ class LayoutCheck {
       for (int i = 1; i < 5; ++i) check_leaf(limit[i], 1, s.nv);
     }
   }
-  int frames() const {
-    const int k = layout.of_robot[StepLayout::FRAME_POSITION];
-    require(k >= 0 && k < s.leaves && layout.places[k].size % 3 == 0 && layout.places[k].size < 1 << 24, "frames");
-    return layout.places[k].size / 3;
-  }
   void check_tree() const {
     for (int b = 1; b < s.bodies; ++b) require_within(layout.parents + b, 1, 0, b, "parents");
     require_within(layout.types, s.joints, FREE_JOINT, HINGE_JOINT + 1, "joints");
@@ -107,37 +114,15 @@ class LayoutCheck {
     require(m >= 0 && m <= s.rows && task.first >= 0 && task.first <= s.rows - m && task.out >= 0 && task.out <= s.rows - m,
             "rows");
     require(task.level >= 0 && task.level < s.tasks, "levels");
-    require(task.diagonal == (by_weight && task.kind == POSTURE && !bounded), "tasks");
-    check_leaf(leaves[0], 1), check_leaf(leaves[1], 1, m);
-    check_optional_leaf(leaves[2], task.kind == POSE ? 6 : m);
-    if (bounded && (leaves[3] != -1 || task.kind == POSTURE)) check_leaf(leaves[3], m);
-    if (bounded) check_leaf(leaves[4], m);
-    if (task.kind == POSE) check_pose(task);
-    else if (task.kind == CENTER) check_center(task);
-    else check_posture(task);
-  }
-  void check_pose(const Task& task) const {
-    const int *options = task.options, *leaves = task.leaves;
-    check_leaf(leaves[5], 3), check_leaf(leaves[6], 9), check_leaf(leaves[7], 1, 3), check_leaf(leaves[8], 1, 3);
-    require(task.count >= 9 && (options[8] == 1 || options[8] == 2) && task.count == 9 + options[8] * (2 + s.dofs),
-            "frames");
-    int kept = 0;
-    for (int i = 2; i < 8; ++i) kept += options[i] != 0;
-    require(kept == task.m, "rows");
-    for (const int* frame = options + 9; frame < options + task.count; frame += 2 + s.dofs)
-      require_within(frame, 1, 0, frames(), "frames"), require_within(frame + 1, 1, 0, s.bodies, "frames");
-  }
-  void check_center(const Task& task) const {
-    require(task.count == 1 + task.m + s.bodies, "centre of mass");
-    if (task.options[0]) check_leaf(task.leaves[5], 2 * task.m);
-    else if (!task.bounded) check_leaf(task.leaves[5], task.m);
-    require_within(task.options + 1, task.m, 0, 3, "axes");
-  }
-  void check_posture(const Task& task) const {
-    require(task.kind == POSTURE && task.count == 2 * task.m, "tasks");
-    if (!task.bounded) check_leaf(task.leaves[5], s.given);
-    require_within(task.options, task.m, 0, s.given, "posture"),
-        require_within(task.options + task.m, task.m, 0, s.nv, "posture");
+    require(task.kind >= 0 && task.kind < TaskKinds::COUNT, "tasks");
+    TaskKinds::with(task.kind, [&](auto card) {
+      require(task.diagonal == (by_weight && card.HAS_DOFS && !bounded), "tasks");
+      check_leaf(leaves[GAIN], 1), check_leaf(leaves[WEIGHT], 1, m);
+      check_optional_leaf(leaves[TARGET_VELOCITY], card.velocities(m));
+      if (bounded && (leaves[LOWER] != -1 || card.HAS_DOFS)) check_leaf(leaves[LOWER], m);
+      if (bounded) check_leaf(leaves[UPPER], m);
+      card.check(*this, task);
+    });
   }
   // of_level: rows of the tasks of each level; the last level of a hierarchy has none
   void check_levels(const std::vector<int>& of_level) const {

@@ -1,33 +1,9 @@
-// Rows of tasks that ask for a pose or a centre of mass: what tasks/_pose.py and tasks/_com.py define.
+// Tasks that ask for the pose of a frame, or of one frame in another: what tasks/_pose.py defines.
 #pragma once
-#include "kinematics.hpp"
+#include "../kinematics.hpp"
+#include "rows.hpp"
 
 namespace osik {
-
-// The rows of one task with m rows; fields of TaskRows (tasks/_task.py). An equality has no upper bounds (null).
-template <class Out> struct Rows {
-  Out error, jacobian, lower, curvature, pull, levers;  // [m], [m, nv], [m], [1], [m], [nv]
-  Out upper{}, squares{};  // [m] and, unless null, the squared length of each row [m]
-};
-
-// An interval of the error, [m] each; null for an equality.
-template <class In> struct Bounds {
-  In lower{}, upper{};
-};
-
-// The bounds on the rate of row i, and its pull: tasks/_task.py, TaskRows.of.
-template <class Real, class In, class Out>
-OSIK_FN void ask(const Rows<Out>& to, const Bounds<In>& bounds, int i, Real error, Real forward, Real gain) {
-  to.error[i] = error;
-  if (!bounds.lower) {
-    to.pull[i] = gain * error, to.lower[i] = forward - to.pull[i];
-    return;
-  }
-  const Real low = bounds.lower[i], high = bounds.upper[i];
-  auto approach = [&](Real bound) { return select(fabs(bound) < Real(INFINITE), gain * (bound - error) + forward, bound); };
-  to.pull[i] = gain * select(error > high, error - high, select(error < low, error - low, Real(0)));
-  to.lower[i] = approach(low), to.upper[i] = approach(high);
-}
 
 // The pose that a task asks for, and how.
 template <class In, class Own = In> struct PoseGoal {
@@ -139,54 +115,78 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
   to.curvature[0] = (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
 }
 
-// Where a task asks the centre of mass to be, along `m` of the world's axes or normals of edges on the ground.
-template <class In, class Own = In> struct CenterGoal {
-  int m;
-  const int *axes, *turning;            // [m] 0 for x, 1 for y, 2 for z; [nv] whether a dof turns something
-  In target, velocity;                  // [m] each, or null for 0
-  Own weight, gain;                     // [m], [1]
-  In normals{};                         // [m, 2] in place of axes
-  Bounds<In> bounds = {};
-};
-
-// Rows of a task on the centre of mass `point` [3], whose Jacobian has these columns.
-template <class In, class Own, class From, class Columns, class Out>
-void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& columns, int nv, const Rows<Out>& to) {
-  using Real = NumberAt<Out>;
-  auto along = [&](int i, Real x, Real y, Real z) {
-    if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
-    return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
-  };
-  Real turning = 0, largest = 0, square = 0, xx = 0, xy = 0, yy = 0, zz = 0;
-  OSIK_UNROLL_4
-  for (int j = 0; j < nv; ++j) {
-    const auto [x, y, z] = columns[j];
-    Real lever = 0;
-    OSIK_UNROLL_4
-    for (int i = 0; i < goal.m; ++i) {
-      const Real entry = along(i, x, y, z);
-      to.jacobian[i * nv + j] = entry, lever += goal.weight[i] * entry * entry;
-    }
-    to.levers[j] = sqrt(lever), turning += goal.turning[j] ? x * x + y * y + z * z : Real(0);
-    xx += x * x, xy += x * y, yy += y * y, zz += z * z;
+// Turn the first of two frames' poses and Jacobians into those in the axes of the second (tasks/_relative_frame.py).
+template <class Real> void see_from_root(Real* position, Real* rotation, Real* jacobian, int nv) {
+  using V = Vec3<Real>;
+  const Mat3<Real> turn = Mat3<Real>::of(rotation + 9).transposed();
+  const V apart = V::of(position) - V::of(position + 3);
+  Real* to = jacobian;
+  for (const Real* root = jacobian + 6 * nv; to < jacobian + nv; ++to, ++root) {
+    auto entry = [&](const Real* from, int i) { return V{from[i * nv], from[(i + 1) * nv], from[(i + 2) * nv]}; };
+    const V angular = entry(root, 3), linear = turn * (entry(to, 0) - entry(root, 0) + cross(apart, angular));
+    const V axis = turn * (entry(to, 3) - angular);
+    int i = 0;
+    for (Real value : {linear.x, linear.y, linear.z, axis.x, axis.y, axis.z}) to[i++ * nv] = value;
   }
-  for (int i = 0; i < goal.m; ++i) {
-    const Real value = along(i, point[0], point[1], point[2]);
-    ask(to, goal.bounds, i, goal.target ? value - goal.target[i] : value, goal.velocity ? goal.velocity[i] : Real(0),
-        goal.gain[0]);
-    const Real pull = fabs(goal.weight[i] * to.pull[i]);
-    largest = select((pull > largest) | (pull != pull), pull, largest);
-    if (!to.squares) continue;
-    const Real length = goal.normals ? along(i, along(i, xx, xy, Real(0)), along(i, xy, yy, Real(0)), Real(0))
-                                     : along(i, xx, yy, zz);
-    to.squares[i] = select(length < Real(0), Real(0), length);  // which roundoff may make it
-  }
-  // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
-  const Real unit = select(largest > Real(0), Real(1) / largest, Real(0));
-  for (int i = 0; i < goal.m; ++i) {
-    const Real part = goal.weight[i] * to.pull[i] * unit;
-    square += part * part;
-  }
-  to.curvature[0] = largest * sqrt(square) * sqrt(turning);
+  (turn * apart).put(position), (turn * Mat3<Real>::of(rotation)).put(rotation);
 }
+
+struct PoseTask : CommonCard {
+  static constexpr bool MOVES = true;
+  enum { POSITION = OWN, ROTATION, POSITION_WEIGHT, ROTATION_WEIGHT };  // leaves; a weight of each row, or of all three
+  // options; of each frame its number, its body, and whether each dof moves it. The second one is what the first one is in.
+  enum { IN_FRAME, GEOMETRIC, KEPT, FRAMES = KEPT + 6, FIRST_FRAME };
+  static int velocities(int) { return 6; }
+  template <class File, class Task> static void check(const File& file, const Task& task) {
+    const int *options = task.options, *leaves = task.leaves, size = 2 + file.s.dofs;
+    file.check_leaf(leaves[POSITION], 3), file.check_leaf(leaves[ROTATION], 9);
+    file.check_leaf(leaves[POSITION_WEIGHT], 1, 3), file.check_leaf(leaves[ROTATION_WEIGHT], 1, 3);
+    file.require(task.count >= FIRST_FRAME && (options[FRAMES] == 1 || options[FRAMES] == 2) &&
+                     task.count == FIRST_FRAME + options[FRAMES] * size,
+                 "frames");
+    int kept = 0;
+    for (int i = 0; i < 6; ++i) kept += options[KEPT + i] != 0;
+    file.require(kept == task.m, "rows");
+    for (const int* frame = options + FIRST_FRAME; frame < options + task.count; frame += size)
+      file.require_within(frame, 1, 0, file.frames(), "frames"),
+          file.require_within(frame + 1, 1, 0, file.s.bodies, "frames");
+  }
+  template <class Step, class Task> static bool is_valid(const Step& step, const Task& task) {
+    auto finite = [&](int i) { return step.is_finite(task, i); };
+    return finite(POSITION) && finite(ROTATION) && finite(POSITION_WEIGHT) && finite(ROTATION_WEIGHT);
+  }
+  // own: the rows of a robot (MovingRows), whose bodies are placed
+  template <class Own, class Task, class Interval, class Real, class To>
+  static void add(Own& own, const Task& task, const Interval& interval, const Real* gain, const To& to) {
+    using In = typename Own::In;
+    const auto& s = own.s;
+    const int *options = task.options, *leaves = task.leaves, nv = s.nv, count = options[FRAMES];
+    auto leaf = [&](int i) { return own.leaf(leaves[i]); };
+    const PoseGoal<In, const Real*> goal{leaf(POSITION).at,
+                                         leaf(ROTATION).at,
+                                         own.velocity(task),
+                                         own.weights.data(),
+                                         gain,
+                                         options + KEPT,
+                                         options[IN_FRAME] != 0,
+                                         options[GEOMETRIC] != 0,
+                                         interval};
+    for (int i = 0, row = 0; i < 6; ++i)
+      if (goal.kept[i]) own.weights[row] = leaf(WEIGHT)[row] * leaf(POSITION_WEIGHT + i / 3)[i % 3], ++row;
+    Real *position = own.frames.data(), *turn = position + 6, *jacobian = position + 24;
+    auto frame = [&](int f) { return options + FIRST_FRAME + f * (2 + s.dofs); };
+    auto offset_of = [&](int f) { return own.robot(own.layout.FRAME_POSITION) + 3 * frame(f)[0]; };
+    auto turn_of = [&](int f) { return own.robot(own.layout.FRAME_ROTATION) + 9 * frame(f)[0]; };
+    if (count == 1 && own.columns.alone()) {
+      const auto point = place_frame(own.placed, frame(0)[1], offset_of(0), turn_of(0), position, turn);
+      const CarriedColumns<In, Real*> carried{own.placed, own.columns.factor, frame(0) + 2, point};
+      return pose_rows(goal, position, turn, carried, nv, to);
+    }
+    for (int f = 0; f < count; ++f)
+      move_frame(own.columns, own.placed, frame(f)[1], offset_of(f), turn_of(f), frame(f) + 2, position + 3 * f,
+                 turn + 9 * f, jacobian + 6 * nv * f);
+    if (count == 2) see_from_root(position, turn, jacobian, nv);
+    pose_rows(goal, position, turn, StoredColumns<const Real*>{jacobian, nv}, nv, to);
+  }
+};
 }  // namespace osik
