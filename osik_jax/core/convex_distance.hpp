@@ -142,7 +142,7 @@ template <class Real> class Difference : Simplex<Real> {
   bool is_apart(Real least) {
     if (!is_known_place()) return false;
     approach(least, true);
-    return is_known ? is_far : !overlaps && size >= least;
+    return is_known ? is_far : !overlaps && size >= least && is_exact();
   }
   // Signed distance of the cores, in world axes; `most` alone, if it is positive and the distance not less.
   Gap<Real> gap(Real most = -1) {
@@ -155,6 +155,7 @@ template <class Real> class Difference : Simplex<Real> {
       distance = -deepen(normal, on_a);
     } else {
       normal = (Real(-1) / size) * v;
+      distance = is_exact() ? size : lower;
       for (int k = 0; k < count; ++k) on_a = on_a + share[k] * simplex[k].a;
     }
     const V on_b = on_a + distance * normal;
@@ -178,6 +179,7 @@ template <class Real> class Difference : Simplex<Real> {
   const V offset;
   using Simplex<Real>::simplex, Simplex<Real>::share, Simplex<Real>::size, Simplex<Real>::v, Simplex<Real>::count;
   bool overlaps, is_known, is_far;
+  Real lower;  // no point of the difference is nearer to the origin
   int near_a = -1, near_b = -1;  // vertices of hulls that the last direction found
 
   Point support(V d) {
@@ -189,6 +191,8 @@ template <class Real> class Difference : Simplex<Real> {
     const Real sum = inner(offset, offset) + turn.a.x + turn.b.y + turn.c.z;
     return sum - sum == 0;
   }
+  // Whether `size` is the distance. Where roundoff has ended the search, it may be larger by far.
+  bool is_exact() const { return size - lower <= 10 * TOLERANCE; }
   static Real length(V p) { return sqrt(inner(p, p)); }
   V world(V p) const { return a.rotation * p + a.position; }
 
@@ -196,12 +200,13 @@ template <class Real> class Difference : Simplex<Real> {
   // its distance is at least that, or, if one only `decides`, that it is less.
   OSIK_CALL void approach(Real least, bool decides) {
     v = Real(-1) * offset, count = 0, overlaps = is_known = is_far = false;
-    size = length(v);
+    size = length(v), lower = -Real(INFINITE);
     if (!(size > TOLERANCE)) v = {1, 0, 0}, size = 1;
     Real nearest = 0;  // size of v, of the steps that had a simplex
     for (int step = 0; step < MOST_STEPS; ++step) {
       const Point next = support((Real(-1) / size) * v);
       const Real bound = inner(v, next.w) / size;  // no point is nearer
+      lower = bound > lower ? bound : lower;
       if (least > 0 && bound >= least) return void(is_known = is_far = true);
       if (count && (size - bound <= TOLERANCE || is_in_simplex(next.w))) return;
       const Simplex<Real> before = *this;
@@ -270,7 +275,18 @@ template <class Real> class Difference : Simplex<Real> {
     Point kept[3];
     for (int k = 0; k < best.count; ++k) kept[k] = simplex[best.at[k]], share[k] = best.share[k];
     for (int k = 0; k < best.count; ++k) simplex[k] = kept[k];
-    count = best.count, v = best.v, size = sqrt(best.square);
+    count = best.count, v = best.v;
+    // across the edge or the face: the sum of points has roundoff that turns a short vector
+    const V p = simplex[0].w;
+    if (count == 2) {
+      const V along = simplex[1].w - p;
+      v = v - (inner(v, along) / inner(along, along)) * along;
+    } else if (count == 3) {
+      const V normal = cross(simplex[1].w - p, simplex[2].w - p);
+      const Real square = inner(normal, normal);
+      if (square > 0) v = (inner(normal, p) / square) * normal;
+    }
+    size = length(v);
   }
 
   // A unit vector across one or two directions.

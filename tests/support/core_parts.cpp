@@ -1,5 +1,5 @@
-// The parts of the core beside plain sums: linear algebra of the CPU's team, its layouts, rotations, and the reader of a
-// controller's file. Prints how many comparisons it made; the first that fails ends the program with its line.
+// The parts of the core beside plain sums: linear algebra of the CPU's team, its layouts, rotations, distances in single
+// precision, and the reader of a controller's file. Prints how many comparisons it made; the first that fails ends the program with its line.
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -9,6 +9,7 @@
 #include <vector>
 
 #include "c/section.hpp"
+#include "convex_distance.hpp"
 #include "linear_algebra.hpp"
 #include "rigid.hpp"
 
@@ -187,6 +188,46 @@ static void rotations() {
   }
 }
 
+// Single precision beside double, for small shapes that touch large ones by up to 1 mm or hardly do not: a shape that
+// touches is never called apart, and no distance is too large.
+static void shallow_overlaps() {
+  std::uniform_real_distribution<double> share(0.02, 1), depth(-3e-4, 1e-3);
+  constexpr int KINDS[] = {BOX, CYLINDER, CAPSULE, SPHERE};
+  int touching = 0;
+  for (int k = 0; k < 8000; ++k) {
+    float numbers[2][10];  // size, position, quaternion
+    for (int shape = 0; shape < 2; ++shape)
+      for (int i = 0; i < 10; ++i) numbers[shape][i] = float(i < 3 ? share(generator) * (shape ? 0.5 : 0.05) : any());
+    if (k % 2) std::copy(numbers[0] + 6, numbers[0] + 10, numbers[1] + 6);  // faces that are parallel
+    auto made = [&](int shape, auto zero) {
+      using Real = decltype(zero);
+      const float* from = numbers[shape];
+      const auto turn = Quaternion<double>{from[6], from[7], from[8], from[9]}.rotation();
+      float rows[9];
+      turn.a.put(rows), turn.b.put(rows + 3), turn.c.put(rows + 6);
+      Convex<Real> to{};
+      to.kind = KINDS[shape ? k / 2 % 2 : k / 4 % 4];
+      to.size = {Real(from[0]), Real(from[1]), Real(from[2])}, to.position = {Real(from[3]), Real(from[4]), Real(from[5])};
+      Real turned[9];
+      std::copy(rows, rows + 9, turned), to.rotation = Mat3<Real>::of(turned);
+      return to;
+    };
+    auto truth = [&] { return gap_between(made(0, 0.0), made(1, 0.0)); };
+    const double wanted = -depth(generator);
+    for (int step = 0; step < 6; ++step) {
+      const auto gap = truth();
+      const auto move = (gap.distance - wanted) * gap.normal;
+      numbers[0][3] += float(move.x), numbers[0][4] += float(move.y), numbers[0][5] += float(move.z);
+    }
+    const double distance = truth().distance;
+    if (!(distance < 1e-5 && distance > -2e-3)) continue;
+    ++touching;
+    CHECK(!is_apart(made(0, 0.0f), made(1, 0.0f), float(SINGLE_TOUCH)));
+    CHECK(gap_between(made(0, 0.0f), made(1, 0.0f)).distance - distance < SINGLE_TOUCH);
+  }
+  CHECK(touching > 5000);
+}
+
 static bool is_refused(const std::string& text) {
   try {
     JsonReader(text.c_str()).value();
@@ -217,6 +258,7 @@ int main() {
   Parts<double>().all();
   Parts<float>().all();
   rotations();
+  shallow_overlaps();
   sections();
   std::printf("%ld", compared);
 }
