@@ -95,8 +95,7 @@ def has_box(limit: Limit) -> bool:
 def unknown_scheme(scheme: Scheme) -> str | None:
     """Return a scheme that the core does not know in words; None if it knows it."""
     if _kind(scheme) is None:
-        method = f" with method={scheme.method!r}" if type(scheme) is NullSpace else ""
-        return f"the scheme {type(scheme).__name__}{method}"
+        return f"the scheme {type(scheme).__name__}"
     if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
         return f"a {type(scheme).__name__} with max_iterations"
     return None
@@ -118,7 +117,7 @@ def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits
 def _kind(scheme: Scheme) -> int | None:
     """Return the core's number of a scheme (``StepScheme``), None for one that it does not know."""
     if type(scheme) is NullSpace:
-        return {"classical": _CLASSICAL, "saturated": _SATURATED}.get(scheme.method)
+        return _SATURATED if scheme.saturates else _CLASSICAL
     return {WeightedQP: _WEIGHTED, HierarchicalQP: _HIERARCHICAL}.get(type(scheme))
 
 

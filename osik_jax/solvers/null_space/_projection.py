@@ -9,7 +9,7 @@ higher ones.
 
 When not to use it: where bounds have to hold (``_saturation.py``), or inequalities (``solve_hqp``): an inequality row
 takes part only while the levels above it leave it violated, and nothing keeps lower levels from violating it again.
-Where a level loses rank against those above it, the levels below jump (``_reverse.py`` does not).
+Where a level loses rank against those above it, the levels below jump.
 """
 
 from __future__ import annotations
