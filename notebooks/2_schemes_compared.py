@@ -413,7 +413,7 @@ plt.show()
 
 # %%
 fig, (left, right) = plt.subplots(1, 2, figsize=(12, 3.4))
-for width, name in zip((8, 6.5, 5, 3, 1.5), SCHEMES, strict=True):
+for width, name in zip((8, 6, 4, 2), SCHEMES, strict=True):
     left.plot(clock, results["joint limit", name, False]["q"][:-1, 0], color=COLORS[name], lw=width, label=name)
 left.axhspan(0.3, 0.35, color="#d55e00", alpha=0.12, lw=0)
 left.axhline(0.3, color="black", ls="--", lw=1)

@@ -26,10 +26,9 @@ from ..robot._tree import KinematicTree
 from ..robot.loading._equalities import KINDS, constraint_ends, is_in_tree
 from ..robot.loading._mjmodel import element_names
 from ._curvature import jacobian_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_weight
+from ._gain import AdaptiveGain
 from ._rotation import cross_matrix
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 _Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
 
@@ -97,10 +96,7 @@ class EqualityConstraintTask(Task):
     ):
         chosen = _selected(robot, constraints)
         self.constraints = tuple(_structure(robot, e) for e in chosen)
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.weight = as_weight(weight, self._weight_rows, dtype)
-        self.gain = as_gain(gain, dtype)
+        dtype = self._set_up(robot, weight, priority, hard, gain)
         model = robot.mj_model
         kinds = [constraint.kind for constraint in self.constraints]
         spatial = [e for e, kind in zip(chosen, kinds, strict=True) if kind != "joint"]

@@ -21,9 +21,9 @@ from ..kinematics._rates import kinematics_rates
 from ..numerics._host import to_jax
 from ..robot import Robot
 from ._curvature import jacobian_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_vector, as_weight
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._gain import AdaptiveGain
+from ._leaves import as_vector
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
 
@@ -85,20 +85,14 @@ class FunctionTask(Task):
         if not callable(function):
             raise OsikTypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
         _check_signature(function)
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
+        dtype, rows = robot.q0.dtype, _length(robot, function)
         numbers, self.structure = taken_apart(function)
         self.numbers = jax.tree.map(lambda a: to_jax(a, dtype if isinstance(a, float) else None), numbers)
-        self.gain = as_gain(gain, dtype)
-        rows = _length(robot, function)
-        self.weight = as_weight(weight, rows, dtype)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
-        self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
-        if target is not None and self.lower is not None:
-            raise OsikTypeError("a FunctionTask has a target or bounds (lower, upper), not both")
+        self._set_up(robot, weight, priority, hard, gain)
         self.target = None
-        if self.lower is None:
+        if self._set_bounds(target, lower, upper, rows, dtype):
             self.target = as_vector(0.0 if target is None else target, (rows,), "target", dtype)
 
     @property

@@ -15,10 +15,9 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, select_all
-from ._background import background_weight
-from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
-from ._stay import MotionTask
-from ._task import TaskRows, check_priority
+from ._bases import MotionTask
+from ._leaves import WeightLike, as_vector, background_weight, joint_weight
+from ._task import TaskRows
 
 
 class VelocityTask(MotionTask):
@@ -31,13 +30,21 @@ class VelocityTask(MotionTask):
     joints: tuple[int, ...] = eqx.field(static=True)
     row_count: int = eqx.field(static=True)
 
-    def __init__(self, robot: Robot, joints: Iterable[str] | None, *, weight: WeightLike, priority: int, hard: bool):
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: WeightLike | None = None,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        # by default far below a goal's weight: at the same weight calm would be bought with errors of the goals
+        weight = background_weight(robot) if weight is None else weight
         self.joints = tuple(select_all(robot, joints))
-        self.priority, self.hard = check_priority(priority), hard
         dofs = dofs_of(robot, self.joints)
         self.row_count = len(dofs)
-        self.weight = as_joint_weight(robot, weight, dofs)
-        self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
+        self._set_up(robot, joint_weight(robot, weight, dofs), priority, hard)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
         """Return the wanted velocities of the chosen dofs [rad/s or m/s]: 0 unless a subclass says otherwise."""
@@ -90,19 +97,6 @@ class DampingTask(VelocityTask):
 
     calms: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        joints: Iterable[str] | None = None,
-        weight: WeightLike | None = None,
-        priority: int = 1,
-        hard: bool = False,
-    ):
-        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
-        weight = background_weight(robot) if weight is None else weight
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
-
 
 class FreezeTask(VelocityTask):
     """Task that keeps joints at rest while the rest of the robot moves: ``v_i = 0``.
@@ -134,7 +128,7 @@ class FreezeTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         if not self.joints:
             raise OsikValueError("a FreezeTask needs at least one joint")
 
@@ -171,7 +165,7 @@ class JointVelocityTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         self.target = as_vector(target, (self.row_count,), "target", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
@@ -218,9 +212,7 @@ class LowAccelerationTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
-        weight = background_weight(robot) if weight is None else weight
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:

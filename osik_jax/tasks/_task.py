@@ -21,7 +21,7 @@ from ..robot import Robot
 from ..robot._made_for import MadeForRobot
 from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, capped_gain, evaluate_gain
-from ._leaves import as_own_weight, as_weight, check_bounds
+from ._leaves import as_bounds, as_own_weight, as_weight, check_bounds
 from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
@@ -183,6 +183,21 @@ class Task(MadeForRobot, Replaceable):
         if not isinstance(self.hard, bool | np.bool_):
             raise OsikTypeError(f"hard is {self.hard!r}; it is True (a constraint, above every priority) or False")
 
+    def _set_up(self, robot: Robot, weight: Any, priority: int, hard: bool, gain: Any = 0.0) -> Any:
+        """Set the fields of every task, where ``_weight_rows`` is known; return the dtype of the robot's numbers."""
+        dtype = robot.q0.dtype
+        self.priority, self.hard = check_priority(priority), hard
+        self.weight, self.gain = as_weight(weight, self._weight_rows, dtype), as_gain(gain, dtype)
+        return dtype
+
+    def _set_bounds(self, target: Any, lower: Any, upper: Any, rows: int, dtype: Any) -> bool:
+        """Set ``lower`` and ``upper``; return whether the task has a target in their place, TypeError for both."""
+        own: Any = self
+        own.lower, own.upper = as_bounds(lower, upper, rows, dtype)
+        if own.lower is not None and target is not None:
+            raise OsikTypeError(f"this {type(self).__name__} has a target or bounds (lower, upper), not both")
+        return own.lower is None
+
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return error, Jacobian and wanted velocities at configuration q with given kinematics."""
@@ -245,8 +260,11 @@ class Task(MadeForRobot, Replaceable):
 
         A subclass inherits no card: it may have rows of its own.
         """
-        del robot
-        return f"is of the class {type(self).__name__}"
+        return self._card(robot) if "_card" in vars(type(self)) else f"is of the class {type(self).__name__}"
+
+    def _card(self, robot: Robot) -> CoreCard | str:
+        """Return what ``core`` returns, in each class that has a card."""
+        raise NotImplementedError
 
     def core_leaves(self) -> list[Any]:
         """Return the leaves of a task with a card in the order of ``StepRows::add_task``; None for a missing one."""
