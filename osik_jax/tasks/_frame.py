@@ -85,7 +85,7 @@ class FrameTask(PoseTask):
         ValueError: a wrong shape, a rotation that is not one, a negative weight, lower > upper, an unknown option.
     """
 
-    _card = PoseTask._card
+    __init__, _card = PoseTask.__init__, PoseTask._card
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -110,7 +110,7 @@ class FrameTask(PoseTask):
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
-        return self.pose_rows(*(own[0] for own in frames), backend)
+        return self.pose_rows(frames.positions[0], frames.rotations[0], frames.jacobians[0], backend)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         del q

@@ -96,6 +96,7 @@ class DampingTask(VelocityTask):
     """
 
     calms: ClassVar[bool] = True
+    __init__ = VelocityTask.__init__
 
 
 class FreezeTask(VelocityTask):

@@ -186,6 +186,8 @@ class AxisAlignTask(PointingTask):
         "target_velocity": "rad/s",
     }
 
+    __init__ = PointingTask.__init__
+
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
         del backend
@@ -243,6 +245,8 @@ class LookAtTask(PointingTask):
     """
 
     units: ClassVar[Mapping[str, str]] = {"": "rad", "axis": "1 (direction)", "target": "m", "target_velocity": "m/s"}
+
+    __init__ = PointingTask.__init__
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""

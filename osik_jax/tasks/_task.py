@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics, forward_kinematics
 from ..numerics._dense import short_sum
+from ..numerics._guarded import approach
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
@@ -124,7 +125,7 @@ class TaskRows(eqx.Module):
         # signed like an error: positive above the interval, so that minus the pull leads back
         outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
         rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
-        low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
+        low, high = (approach(rate, bound, error) + shift for bound in (lower, upper))
         pull = rate * outside
         return cls(error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=False)
 
@@ -320,10 +321,3 @@ def check_priority(priority: int) -> int:
             f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}"
         )
     return int(priority)
-
-
-def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Return ``rate (bound - value)``; an infinite bound stays infinite at rate 0, with gradients of 0."""
-    free = jnp.isinf(bound)
-    gap = jnp.where(free, 0.0, bound) - value
-    return jnp.where(free, bound, rate * gap)

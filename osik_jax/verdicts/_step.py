@@ -13,15 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from ..control._checks import check_setting, check_target_names, check_tasks, checked_configuration, checked_limits
 from ..control._step import Targets, Tasks, aim, in_type_of, step, velocity_problem
 from ..kinematics import forward_kinematics
-from ..limits import (
-    AccelerationLimit,
-    CollisionAvoidanceLimit,
-    ConfigurationLimit,
-    Limit,
-    Limits,
-    VelocityLimit,
-    with_own_limits,
-)
+from ..limits import CollisionAvoidanceLimit, Limit, Limits, with_own_limits
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ..schemes import Scheme, VelocityProblem, WeightedQP
@@ -38,7 +30,6 @@ _AT_REST = 1e-3
 """Speed of the fastest joint [rad/s or m/s] up to which a robot counts as at rest."""
 _NEAR = 5e-3
 """Pairs of shapes are named if they are nearer than this to their least distance [m]."""
-_BOUNDS = {ConfigurationLimit: "limit", VelocityLimit: "speed limit", AccelerationLimit: "acceleration limit"}
 
 
 class StepVerdict(NamedTuple):
@@ -222,8 +213,9 @@ def _reasons(robot: Robot, measured: _Measured, limits: Sequence[Limit], goal: s
     stops, names = measured.stops[goal], dof_names(robot)
     dofs, pairs = np.flatnonzero(stops.joints), _near_pairs(measured, limits, stops)
     lines = [
-        f"{names[i]} is at its {('lower', 'upper')[upper]} {_bound(limits[int(measured.tightest[upper, i])])}"
+        f"{names[i]} is at its {('lower', 'upper')[upper]} {bound.bound_name or f'bound of a {type(bound).__name__}'}"
         for i, upper in ((i, int(stops.joints[i] > 0)) for i in dofs)
+        for bound in (limits[int(measured.tightest[upper, i])],)
     ]
     for (one, other), gap in pairs.items():
         lines.append(f"{one} and {other} are {round(gap, 6) + 0.0:+.3g} m from as near as they may be")
@@ -251,8 +243,3 @@ def _near_pairs(measured: _Measured, limits: Sequence[Limit], stops: _Stops) -> 
         if stops_it
         for at in np.flatnonzero(gaps <= max(_NEAR, gaps.min()))
     }
-
-
-def _bound(limit: Limit) -> str:
-    """Return what the bound of a limit is called."""
-    return _BOUNDS.get(type(limit), f"bound of a {type(limit).__name__}")
