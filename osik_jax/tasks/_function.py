@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -38,9 +38,9 @@ class FunctionTask(Task):
     - a target: ``e = x - target``, ``e' = J v - target'``, asked to be ``-gain(e) e``;
     - bounds: ``gain (lower - x) <= J v - target' <= gain (upper - x)``.
 
-    A function that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
-    floats; integers are static) without compiling: ``task.replace(function=...)``. Any other function compiles once for
-    each object: define it once and keep it, for a lambda made anew in a loop compiles anew.
+    The numbers of a function that is a pytree, such as an ``equinox.Module`` with ``__call__``, are traced (arrays and
+    floats; integers are static): a new task of such a function with other numbers compiles nothing. Any other function
+    compiles once for each object: define it once and keep it, for a lambda made anew in a loop compiles anew.
 
     Args:
         robot: the robot.
@@ -135,38 +135,10 @@ class FunctionTask(Task):
             return super()._held(robot, kinematics, q)
         return dict(target=jnp.atleast_1d(self.function(robot, kinematics, q)))
 
-    def replace(self, **changes: Any) -> Self:
-        """Return the task with other numbers; ``function`` takes one of the same structure (see ``Task.replace``).
-
-        Raises:
-            TypeError: a name that is not one of this task's numbers, or a function of another structure.
-            ValueError: a wrong shape or value.
-        """
-        if "function" not in changes or "function" not in self.replaceable:
-            return super().replace(**changes)
-        numbers = self._numbers(changes.pop("function"))
-        return eqx.tree_at(lambda task: task.numbers, self, numbers).replace(**changes)
-
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Return the names that ``replace`` accepts; ``function`` is among them if it has numbers."""
-        names = super().replaceable
-        own = ("function",) if jax.tree.leaves(self.numbers) else ()
-        return tuple(name for name in names if name != "numbers") + own
-
-    def _numbers(self, function: Any) -> Any:
-        """Return the numbers of a new function of the present structure, in the dtypes of the present numbers."""
-        numbers, structure = taken_apart(function)
-        if structure != self.structure:
-            raise OsikTypeError(
-                "the function's structure differs, not its numbers alone (an integer is structure: write 0.0 for 0); "
-                "make another FunctionTask of it"
-            )
-        new = jax.tree.map(lambda old, a: to_jax(a, old.dtype), self.numbers, numbers)
-        for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
-            if a.shape != old.shape:
-                raise OsikValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
-        return new
+        """Return the names that ``replace`` accepts; a function of other numbers takes another task."""
+        return tuple(name for name in super().replaceable if name != "numbers")
 
 
 def _check_signature(function: Function) -> None:

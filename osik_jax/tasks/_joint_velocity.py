@@ -83,10 +83,8 @@ class DampingTask(VelocityTask):
 
     Args:
         robot: the robot.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -108,8 +106,7 @@ class FreezeTask(VelocityTask):
     Args:
         robot: the robot.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; the free base by its name.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
+        weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -142,10 +139,8 @@ class JointVelocityTask(VelocityTask):
         target: the velocities [rad/s or m/s], one for each row, or a scalar. Rows are in the order of v; ball joints
             have angular velocities in their own axes, a free base linear ones in the world's and angular ones in its
             own.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 
@@ -187,10 +182,8 @@ class LowAccelerationTask(VelocityTask):
     Args:
         robot: the robot.
         velocity: that of the step before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
         priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``.
 

@@ -193,11 +193,9 @@ class PoseTask(FramedTask):
         """Return the chosen rows of position and of orientation."""
         parts = []
         if any(self.kept[:3]):
-            linear = self._position_in_frame if self.axes == "frame" else self._position_outside
-            parts.append((self.kept[:3], (*linear(position, rotation, jacobian), self.position_weight)))
+            parts.append((self.kept[:3], (*self._position_rows(position, rotation, jacobian), self.position_weight)))
         if any(self.kept[3:]):
-            angular = self._orientation_in_frame if self.axes == "frame" else self._orientation_outside
-            parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
+            parts.append((self.kept[3:], (*self._orientation_rows(rotation, jacobian[3:]), self.orientation_weight)))
         return parts, _twice(rotation) if self.axes == "frame" else None
 
     def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
@@ -206,28 +204,25 @@ class PoseTask(FramedTask):
         whole = whole if wrench is None else dot(wrench, whole)
         return pose_curvature(whole[:3], whole[3:], jacobian)
 
-    def _position_outside(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
-        del rotation
-        return position - self.target[0], jacobian[:3], self.target_velocity[:3]
-
-    def _position_in_frame(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
-        offset = position - self.target[0]
+    def _position_rows(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
+        offset, velocity = position - self.target[0], self.target_velocity[:3]
+        if self.axes != "frame":
+            return offset, jacobian[:3], velocity
         # the axes turn under the offset: d/dt R'(p - p*) = R'(p' + (p - p*) x w)
         turning = dot(cross_matrix(offset), jacobian[3:])
         own = rotation.T
-        return dot(own, offset), dot(own, jacobian[:3] + turning), dot(own, self.target_velocity[:3])
+        return dot(own, offset), dot(own, jacobian[:3] + turning), dot(own, velocity)
 
-    def _orientation_outside(self, rotation: Array, jacobian: Array) -> _Parts:
+    def _orientation_rows(self, rotation: Array, jacobian: Array) -> _Parts:
         # R R*' is the turn from target to frame in the outer axes; R*' R is the same turn in the frame's axes
+        if self.axes == "frame":
+            error = rotation_log(dot(self.target[1].T, rotation))
+            factor = dot(self._factor(error).T, rotation.T)
+            return error, dot(factor, jacobian), dot(factor, self.target_velocity[3:])
         between = dot(rotation, self.target[1].T)
         error = rotation_log(between)
         factor = self._factor(error)
         return error, dot(factor, jacobian), dot(factor, dot(between, self.target_velocity[3:]))
-
-    def _orientation_in_frame(self, rotation: Array, jacobian: Array) -> _Parts:
-        error = rotation_log(dot(self.target[1].T, rotation))
-        factor = dot(self._factor(error).T, rotation.T)
-        return error, dot(factor, jacobian), dot(factor, self.target_velocity[3:])
 
     def _factor(self, error: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """Return the inverse left Jacobian (transposed: the right one), or the identity for a geometric Jacobian."""

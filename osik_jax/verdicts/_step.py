@@ -8,10 +8,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from .._errors import OsikValueError
 from ..control._checks import check_setting, check_target_names, check_tasks, checked_configuration, checked_limits
 from ..control._step import Targets, Tasks, aim, in_type_of, step, velocity_problem
+from ..inverse._task_search import is_goal, sizes_of
 from ..kinematics import forward_kinematics
 from ..limits import CollisionAvoidanceLimit, Limit, Limits, with_own_limits
 from ..robot import Robot
@@ -20,7 +23,7 @@ from ..schemes import Scheme, VelocityProblem, WeightedQP
 from ..schemes._default import scheme_for
 from ..solvers import Status
 from ..tasks import Task
-from ._goals import as_tolerances, check_concrete, errors_of, in_words
+from ..tasks._rows import rows_of
 
 _PUSHED = 1e-3
 """A bound or a task stops a goal if the goal's force on it is at least this, relative to the largest possible one."""
@@ -243,3 +246,32 @@ def _near_pairs(measured: _Measured, limits: Sequence[Limit], stops: _Stops) -> 
         if stops_it
         for at in np.flatnonzero(gaps <= max(_NEAR, gaps.min()))
     }
+
+
+def errors_of(robot: Robot, q: Float[Array, " nq"], tasks: Mapping[str, Task]) -> dict[str, Float[Array, "2"]]:
+    """Return the error of each goal at q: metres (or the task's own unit), and radians; of bounds, the part outside."""
+    # of a gain of 1 the pull is the error
+    goals = {
+        name: task.replace(gain=1.0) for name, task in tasks.items() if is_goal(task) and "gain" in task.replaceable
+    }
+    rows = rows_of(robot, forward_kinematics(robot, q), q, goals)
+    return {name: jnp.stack(sizes_of(goals[name], own)) for name, own in rows.items()}
+
+
+def as_tolerances(position: Any, orientation: Any) -> Float[np.ndarray, "2"]:
+    """Return both tolerances; raise ValueError unless they are positive numbers."""
+    found = np.array([position, orientation], float)
+    if not (np.isfinite(found) & (found > 0.0)).all():
+        raise OsikValueError(f"the tolerances are {position!r} m and {orientation!r} rad; both are positive numbers")
+    return found
+
+
+def check_concrete(where: str, *given: Any) -> None:
+    """Raise ValueError for numbers that are traced: a verdict is text, made outside of jit."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
+        raise OsikValueError(f"{where} has traced arguments; a verdict is text: call it outside of jit, vmap and grad")
+
+
+def in_words(error: Float[np.ndarray, "2"]) -> str:
+    """Return an error in metres and radians as text."""
+    return f"{error[0]:.3g} m and {error[1]:.3g} rad"

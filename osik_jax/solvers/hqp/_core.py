@@ -58,7 +58,7 @@ def answers(
     guess = warm_start or (jnp.zeros((batch, count, h), int), jnp.zeros((batch, count, m), int))
     labels = (n,), (count, h), (count, h), (count, m), (count, m), (count,), (3,)
     shapes = _library.shapes_of(batch, ((n,), (count, h), (count,), (count,), ()), labels)
-    integers = [hierarchy.is_equality, hierarchy.hard_is_equality, *guess]
+    integers = [levels.equal, hierarchy.hard_is_equality, *guess]
     x, multipliers, slack_norms, dampings, residual, *others = call(shapes, numbers, integers)
     active_bounds, active, frozen, in_cost, own, ranks, report = others
     # the derivative keeps rows that a damped level has at their bounds, frozen or not

@@ -19,7 +19,7 @@ from ...execution._rules import custom_jvp
 from ...numerics._dense import apply, product
 from .._damping import Damping, HardRows, level_damping, narrow_box
 from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
-from .._level import Level
+from .._level import PaddedLevel
 from ._padding import PaddedHierarchy
 
 
@@ -64,7 +64,7 @@ def _solve_at_active_sets(
     pinned = hierarchy.hard_is_equality[:n]
 
     def solve_level(
-        state: tuple[Array, ...], now: tuple[Array, ActiveSets, Level, Damping]
+        state: tuple[Array, ...], now: tuple[Array, ActiveSets, PaddedLevel, Damping]
     ) -> tuple[tuple[Array, ...], None]:
         k, sets, level, terms = now
         x, projector, low, high, curvature = state

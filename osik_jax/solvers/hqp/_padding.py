@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...numerics._dense import apply
 from .._damping import Damping
-from .._level import Level
+from .._level import Level, PaddedLevel
 
 
 class Layout(NamedTuple):
@@ -37,15 +37,10 @@ class Layout(NamedTuple):
 
 
 class PaddedHierarchy(NamedTuple):
-    """Numbers of a hierarchy, padded.
+    """Numbers of a hierarchy, padded."""
 
-    Which rows are equalities is decided once and never read off the bounds again: XLA may compute one bound twice, and
-    round it in two ways.
-    """
-
-    levels: Level  # with a leading axis of levels; padding rows are 0 and unbounded
+    levels: PaddedLevel  # with a leading axis of levels; padding rows are 0 and unbounded
     damping: Damping  # with a leading axis of levels
-    is_equality: Bool[Array, "L m"]
     hard: Float[Array, "h n"]
     hard_lower: Float[Array, " h"]
     hard_upper: Float[Array, " h"]
@@ -56,10 +51,9 @@ class PaddedHierarchy(NamedTuple):
 class LevelProblem(NamedTuple):
     """Problem of one level, to be minimised over the minimisers of the levels above."""
 
-    level: Level
+    level: PaddedLevel
     damping: Float[Array, ""]  # delta_k of the cost 1/2 |slack|^2 + 1/2 delta_k |x|^2
     damping_terms: Damping  # the terms from which delta_k was computed
-    is_equality: Bool[Array, " m"]  # bounds of these rows are one number, up to rounding
     hard: Float[Array, "h n"]  # the hard rows
     lower: Float[Array, " h"]
     upper: Float[Array, " h"]
@@ -95,7 +89,7 @@ class LevelProblem(NamedTuple):
 
 def pad_hierarchy(
     levels: Sequence[Level],
-    is_equality: Sequence[Bool[Array, " m"]],
+    equal: Sequence[Bool[Array, " m"]],
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     pinned: Bool[Array, " n"],
@@ -121,14 +115,15 @@ def pad_hierarchy(
     row_counts = tuple(level.matrix.shape[0] for level in levels)
     layout = Layout(n, len(levels), m, row_counts, tuple(level_of_hard), tuple(hard_of_row))
     hierarchy = PaddedHierarchy(
-        levels=jax.tree.map(lambda *a: jnp.stack(a), *(level.padded(m) for level in levels)),
+        levels=jax.tree.map(
+            lambda *a: jnp.stack(a), *(level.padded(m, e) for level, e in zip(levels, equal, strict=True))
+        ),
         damping=damping,
-        is_equality=jnp.stack([jnp.pad(rows, (0, m - len(rows))) for rows in is_equality]),
         hard=jnp.concatenate([jnp.eye(n, dtype=lower.dtype), *(level.matrix for level in mixed)]),
         hard_lower=jnp.concatenate([lower, *(level.lower for level in mixed)]),
         hard_upper=jnp.concatenate([upper, *(level.upper for level in mixed)]),
         hard_is_equality=jnp.concatenate(
-            [pinned, *(rows for level, rows in zip(levels, is_equality, strict=True) if not level.equality)]
+            [pinned, *(rows for level, rows in zip(levels, equal, strict=True) if not level.equality)]
         ),
         hard_level=jnp.array(level_of_hard, jnp.int32),
     )

@@ -54,7 +54,7 @@ def primal_active_set(
     def iterate(s: PrimalState) -> PrimalState:
         value = apply(level.matrix, s.x)
         slack = value - jnp.clip(value, level.lower, level.upper)
-        in_cost = (slack != 0.0) | problem.is_equality
+        in_cost = (slack != 0.0) | problem.level.equal
         rows = jax.lax.optimization_barrier(factor_active_rows(problem, s.active, tolerances.rank))
         least_squares_step, rank = factor_least_squares(problem, in_cost, rows, tolerances)
         step = apply(problem.projector, least_squares_step(s.x, slack))

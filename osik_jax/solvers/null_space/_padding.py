@@ -7,30 +7,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ...numerics._constants import ENTRY_ROUNDOFF
-from ...numerics._dense import apply
 from .._damping import Damping
-from ..hqp import Level
-
-
-class PaddedLevel(NamedTuple):
-    """Level padded with zero rows without bounds, with the interface of ``Level``.
-
-    Which rows are equalities is decided once, and not by comparing bounds again: XLA may compute those twice, with
-    different roundoff.
-    """
-
-    matrix: Float[Array, "m n"]
-    lower: Float[Array, " m"]
-    upper: Float[Array, " m"]
-    equal: Bool[Array, " m"]
-
-    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Return A x minus the nearest point of its interval; a clip would halve the derivative at equalities."""
-        value = apply(self.matrix, x)
-        return value - jnp.where(self.equal, self.lower, jnp.clip(value, self.lower, self.upper))
+from .._level import Level, PaddedLevel
 
 
 class Problem(NamedTuple):
@@ -65,7 +46,7 @@ def pad_levels(
         levels = [*levels, Level(jnp.zeros((0, n), dtype), no_bounds, no_bounds)]
         targets, damping = [*targets, secondary], [*damping, jax.tree.map(jnp.zeros_like, damping[0])]
     count = max(1, *(len(level.lower) for level in levels))
-    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(_pad(level, count) for level in levels))
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(level.padded(count, level.equal) for level in levels))
     return Problem(
         stacked,
         jax.tree.map(lambda *a: jnp.stack(a), *damping),
@@ -74,12 +55,6 @@ def pad_levels(
         upper,
         jnp.asarray(rank_tol, dtype),
     )
-
-
-def _pad(level: Level, count: int) -> PaddedLevel:
-    padded = level.padded(count)
-    equal = jnp.pad(level.equal, (0, count - len(level.lower)))
-    return PaddedLevel(padded.matrix, padded.lower, padded.upper, equal)
 
 
 def without_roundoff(problem: Problem) -> Problem:

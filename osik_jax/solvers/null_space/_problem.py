@@ -10,8 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...numerics._dense import apply
-from ..hqp import Level
-from ._padding import PaddedLevel
+from .._level import Level, PaddedLevel
 
 
 class NullSpaceSolution(eqx.Module):

@@ -15,7 +15,6 @@ Where a level loses rank against those above it, the levels below jump.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -26,8 +25,7 @@ from ...numerics._dense import apply, product
 from ...numerics._guarded import greatest, quotient
 from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
-from ..hqp import Level
-from ._padding import PaddedLevel
+from .._level import Level, PaddedLevel
 from ._problem import ActiveTask
 
 
@@ -84,7 +82,7 @@ def level_motion(
         return jnp.zeros_like(x), projector, jnp.zeros_like(x[0])
     task = ActiveTask.at(level, x, rank_tol)
     unbounded = jnp.full_like(x, jnp.inf)
-    total = level_damping(damping, cast(Level, level), x, projector, -unbounded, unbounded)
+    total = level_damping(damping, level, x, projector, -unbounded, unbounded)
     # with P = P_{k-1}: the rows J_k P, and the motion P J_k' (J_k P J_k' + damping I)^-1 error
     restricted = product(task.rows, projector)
     space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, backend=backend)

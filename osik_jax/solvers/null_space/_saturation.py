@@ -43,10 +43,10 @@ from ...execution._rules import found as kept
 from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
-from ..hqp import Level
+from .._level import Level, PaddedLevel
 from . import _cuda
 from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
-from ._padding import PaddedLevel, Problem, initial_point, pad_levels, without_roundoff
+from ._padding import Problem, initial_point, pad_levels, without_roundoff
 from ._projection import level_motion
 from ._scale_path import least_cost
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -14,13 +13,13 @@ from ...numerics._constants import AT_LOWER, AT_UPPER, BOUND_MULTIPLIER, INACTIV
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import largest_of_each, relative_kkt_residual
-from ._cost import LeastSquares, Quadratic
+from ._cost import LeastSquares
 
 
 class QP(eqx.Module):
     """Problem min cost(x) + 1/2 sum_i t_i^2 / compliance_i subject to lower <= [x; C x + t] <= upper."""
 
-    cost: Quadratic | LeastSquares  # of x, strictly convex
+    cost: LeastSquares  # of x, strictly convex
     rows: Float[Array, "p n"]  # C; p may be 0
     compliance: Float[Array, " p"]  # of the rows; 0 for a hard row (t = 0), 1 / weight for a soft one
     lower: Float[Array, " n+p"]  # lower bounds of x, then of the rows; -inf allowed
@@ -33,17 +32,6 @@ class QP(eqx.Module):
         """Return which constraints are equalities: those declared so, and those with equal bounds, (n + p,)."""
         equal = self.lower == self.upper
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
-
-
-def arrays(qp: QP) -> list[Any]:
-    """Return the cost's matrix, then all other arrays in the order of ``pack``."""
-    return jax.tree.leaves(qp)
-
-
-def pack(qp: QP) -> tuple[Array | np.ndarray, Array]:
-    """Return the cost's matrix, and all other arrays concatenated; NumPy arrays are accepted."""
-    matrix, *others = arrays(qp)
-    return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
 
 
 class QPSolution(eqx.Module):
