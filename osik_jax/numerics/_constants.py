@@ -129,6 +129,8 @@ and 1e-4; 1e-11: 3e-6 and 5e-4; 1e-12: 3e-5 and 4e-3; 1e-13: 9e-4 and 7e-2. In s
 random families is 0.9 with 1e-11, and 2e-3 with 1e-6."""
 KKT_RIDGE = {jnp.dtype("float64"): 10.0, jnp.dtype("float32"): 1.0}
 """Ridge in units of machine epsilon times the diagonal; it keeps the factor of a semidefinite Hessian positive."""
+QUADRATIC_RIDGE = 10.0
+"""The same for the square root of a Hessian given as a matrix, relative to its largest diagonal element."""
 SCHUR_RIDGE = 10.0
 """The same for the system of the active rows."""
 LAST_CORRECTION = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-6}

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 from ...core import _library
 from ...execution._computed import side_by_side
 from ...numerics._constants import INACTIVE, KKT_TOLERANCE, REDUNDANT
+from ._cost import LeastSquares
 from ._problem import QP
 
 CERTIFIED = 2
@@ -39,6 +40,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
         max_iterations: limit on the changes of the active set (static).
     """
     cost = qp.cost
+    assert isinstance(cost, LeastSquares)
     batch, _, n = cost.matrix.shape
     p, (matrix, *others) = qp.rows.shape[1], jax.tree.leaves(qp)
     tolerances = jnp.stack([tolerance, jnp.full_like(tolerance, KKT_TOLERANCE[tolerance.dtype])], 1)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from ...core import _cuda, _library
 from ...numerics._constants import KKT_TOLERANCE, SINGLE_TOL
 from ._core import Candidate, of_core
+from ._cost import LeastSquares
 from ._problem import QP
 
 _KERNEL = """
@@ -39,8 +40,8 @@ extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
 
 
 def fits(qp: QP) -> bool:
-    """Return whether the GPU kernel supports a problem: one that fits its shared memory."""
-    if not _cuda.installed():
+    """Return whether the GPU kernel supports a problem: least squares that fit its shared memory."""
+    if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
         return False
     m, n = qp.cost.matrix.shape[-2:]
     return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.shared_bytes()
@@ -62,6 +63,7 @@ def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: i
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
     """Return candidates for a batch from the GPU, in the precision of the data; arguments as for ``_core.solve``."""
     cost = qp.cost
+    assert isinstance(cost, LeastSquares)
     batch, m, n = cost.matrix.shape
     p, kind = qp.rows.shape[1], cost.matrix.dtype
     sizes = m, n, p, kind == jnp.float32

@@ -20,6 +20,7 @@ from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import EQUALITY, INACTIVE, SINGLE_TOL
 from . import _core, _cuda
 from ._core import CERTIFIED, Candidate
+from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
 from ._problem import QP
 from ._search import SearchResult, search
@@ -47,7 +48,7 @@ def _solve_on_platform(
     kernels = {}
     if takes(backend, "core-cuda", fits=_cuda.fits(qp)):
         kernels["core-cuda"] = kernel_candidates(max_iterations, _cuda.solve)
-    if takes(backend, "core", fits=True):
+    if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
         kernels["core"] = kernel_candidates(max_iterations, _core.solve, FEW_ON_CPU)
 
     def search_all(qp: QP, _: AsGiven, guess: Array, tolerance: Array) -> SearchResult:
@@ -119,6 +120,7 @@ def _solve_kkt_on_platform() -> Callable[[QP, Array, Array], Array]:
 def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
     """Solve the KKT system as a QP whose active constraints are equalities and whose others have no bounds."""
     cost = qp.cost
+    assert isinstance(cost, LeastSquares)
     n = cost.damping.shape[1]
     free, active_rows = active[:, :n] == INACTIVE, active[:, n:] != INACTIVE
     # the right side of stationarity is the gradient of the damping at x = 0

@@ -13,13 +13,13 @@ from ...numerics._constants import AT_LOWER, AT_UPPER, BOUND_MULTIPLIER, INACTIV
 from ...numerics._dense import apply
 from .._box import violation
 from .._certificate import largest_of_each, relative_kkt_residual
-from ._cost import LeastSquares
+from ._cost import LeastSquares, Quadratic
 
 
 class QP(eqx.Module):
     """Problem min cost(x) + 1/2 sum_i t_i^2 / compliance_i subject to lower <= [x; C x + t] <= upper."""
 
-    cost: LeastSquares  # of x, strictly convex
+    cost: Quadratic | LeastSquares  # of x, strictly convex
     rows: Float[Array, "p n"]  # C; p may be 0
     compliance: Float[Array, " p"]  # of the rows; 0 for a hard row (t = 0), 1 / weight for a soft one
     lower: Float[Array, " n+p"]  # lower bounds of x, then of the rows; -inf allowed

@@ -19,7 +19,7 @@ from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
 from .._level import bounds_exist
 from .._status import Status
-from ._cost import LeastSquares
+from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
 from ._problem import QP, QPSolution
@@ -60,7 +60,7 @@ def solve_qp(
         warm_start: ``active`` of the solution of a problem nearby. It changes the time, not the answer. (n + p,)
         max_iterations: limit on the changes of the active set (static); default 20 (n + p).
         tolerance: violation that counts as none, relative to the scale of the constraint; default 1e-12.
-        backend: as in ``solve_least_squares_qp`` (static).
+        backend: "auto" or "jax" (static): there is no kernel for this form.
 
     Returns:
         The solution; never raises inside jit. x satisfies its box exactly, whatever the status.
@@ -69,13 +69,8 @@ def solve_qp(
     n = gradient.shape[0]
     if hessian.shape != (n, n):
         raise OsikValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
-    # H = L L', so the cost is 1/2 |L'x + L^-1 g|^2 but for a constant; NaN where H is not positive definite
-    root = jnp.linalg.cholesky(hessian)
-    target = -jax.scipy.linalg.solve_triangular(root, gradient, lower=True)
-    cost = LeastSquares(root.T, target, jnp.ones(n, root.dtype), *jnp.zeros((2, n), root.dtype))
-    qp = _problem(cost, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
-    # the kernel of the derivative needs a damping
-    return _solve(qp, warm_start, max_iterations, tolerance, backend, rates="jax")
+    qp = _problem(Quadratic(hessian, gradient), lower, upper, rows, rows_lower, rows_upper, rows_compliance)
+    return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "rows_equalities", "backend"))
@@ -130,11 +125,11 @@ def solve_least_squares_qp(
     diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *diagonal)
     qp = _problem(cost, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
-    return _solve(qp, warm_start, max_iterations, tolerance, backend, rates=backend)
+    return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
 def _problem(
-    cost: LeastSquares,
+    cost: Quadratic | LeastSquares,
     lower: ArrayLike,
     upper: ArrayLike,
     rows: ArrayLike | None,
@@ -176,10 +171,8 @@ def _solve(
     max_iterations: int | None,
     tolerance: ArrayLike | None,
     backend: Backend,
-    *,
-    rates: Backend,
 ) -> QPSolution:
-    """Solve, certify and attach the derivative, whose systems are solved by ``rates``."""
+    """Solve, certify and attach the derivative."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
     tolerance = jnp.asarray(FEASIBILITY if tolerance is None else tolerance, dtype)
@@ -193,7 +186,7 @@ def _solve(
     solve = qp_solver(limit, check_backend(backend))
     # the search is not differentiated: its answer is, at the active set that was found
     result = _rules.found(solve(*jax.lax.stop_gradient((safe, (given, is_valid), start, tolerance))))
-    x, y, is_finite = _differentiable(safe, result, is_valid, rates)
+    x, y, is_finite = _differentiable(safe, result, is_valid, backend)
     # at the end x is inside the box that was given, to the last bit
     box = (jnp.where(is_valid, b, own)[:n] for b, own in ((safe.lower, qp.lower), (safe.upper, qp.upper)))
     x = clip_roundoff(x, *box)
@@ -262,6 +255,5 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
         known_equalities=qp.known_equalities,
     )
     finite = [jnp.isfinite(a).all() for a in jax.tree.leaves((qp.cost, qp.rows, qp.compliance))]
-    signs = jnp.all(qp.cost.weight >= 0.0), jnp.all(qp.cost.damping >= 0.0), bounds_exist(qp.lower, qp.upper)
-    is_valid = jnp.stack([*finite, *signs]).all()
+    is_valid = jnp.stack([*finite, qp.cost.has_valid_signs(), bounds_exist(qp.lower, qp.upper)]).all()
     return jax.tree.map(lambda a, b: jnp.where(is_valid, a, b), qp, placeholder), is_valid
