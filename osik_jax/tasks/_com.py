@@ -49,8 +49,6 @@ class ComTask(Task):
         subtree: name of a body: the centre of mass of it and all that hangs from it. Default: the whole robot.
         weight: of each squared row: a scalar, or one for each axis or edge of the polygon.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such body.

@@ -77,8 +77,6 @@ class FrameTask(PoseTask):
             the task can be met; where it cannot, they weigh the residual across the error's axis differently, by a
             factor (angle/2) / sin(angle/2), at most pi/2.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.

@@ -52,8 +52,6 @@ class FunctionTask(Task):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         weight: of each squared row: a scalar, or one for each.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: a target and bounds, or a function that is none.

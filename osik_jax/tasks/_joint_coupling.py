@@ -41,8 +41,6 @@ class JointCouplingTask(Task):
         upper: upper bound; one of the two may be left out.
         weight: of the squared row.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.

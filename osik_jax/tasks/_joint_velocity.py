@@ -85,8 +85,6 @@ class DampingTask(VelocityTask):
         robot: the robot.
         joints: names and globs, as of a ``PostureTask``; default: all but the free base.
         weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -107,8 +105,6 @@ class FreezeTask(VelocityTask):
         robot: the robot.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; the free base by its name.
         weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -141,8 +137,6 @@ class JointVelocityTask(VelocityTask):
             own.
         joints: names and globs, as of a ``PostureTask``; default: all but the free base.
         weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -184,8 +178,6 @@ class LowAccelerationTask(VelocityTask):
         velocity: that of the step before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
         joints: names and globs, as of a ``PostureTask``; default: all but the free base.
         weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.

@@ -32,8 +32,6 @@ class LimitTask(Task):
         robot: the robot.
         limit: any limit.
         weight: of each squared row [rad/s, m/s, or the unit of the limit's row].
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: something that is no limit.

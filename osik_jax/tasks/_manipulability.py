@@ -57,8 +57,6 @@ class ManipulabilityTask(Task):
         log: whether x is ln m.
         weight: of each squared row.
         gain: [1/s], a number or an ``AdaptiveGain``; without target and bounds, the speed for a gradient of 1.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame or joint.

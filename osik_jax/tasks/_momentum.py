@@ -38,8 +38,6 @@ class AngularMomentumTask(MotionTask):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         axes: which of the world's axes, e.g. ``"xyz"``, ``"z"``.
         weight: of each squared row: a scalar, or one for each.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: a target and bounds.
@@ -112,7 +110,6 @@ class KineticEnergyTask(MotionTask):
     Args:
         robot: the robot.
         weight: of the energy against the other tasks' squared rows, halved [1/J].
-        priority: 1 is the most important.
         hard: makes it a constraint, see ``Task``: nothing moves.
 
     Raises:

@@ -82,8 +82,6 @@ class ContactTask(PlaneTask):
             Default: the one along the normal in the anchor.
         weight: of each squared row: a scalar, or one for each.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.
@@ -241,8 +239,6 @@ class WheelTask(PlaneTask):
         offset: of the plane along its normal [m].
         weight: of each squared row: a scalar, or one for each.
         gain: of the height [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.

@@ -171,8 +171,6 @@ class AxisAlignTask(PointingTask):
         half_angle: makes an inequality task: half the cone's opening [rad], above 0.
         weight: of each squared row.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.
@@ -236,8 +234,6 @@ class LookAtTask(PointingTask):
         half_angle: makes an inequality task: half the cone's opening [rad], above 0.
         weight: of each squared row.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.

@@ -45,8 +45,6 @@ class PostureTask(Task):
             bounds; for a target of the whole robot 1e-4, so that other tasks win, and less on a robot whose size s, the
             longest way along its links, is below half a metre: 1e-4 (s / 0.5 m)^2.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower; in ``joints`` or ``weight``.

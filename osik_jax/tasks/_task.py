@@ -149,7 +149,8 @@ POSE, CENTER, POSTURE, GIVEN = range(4)
 class Task(MadeForRobot, Replaceable):
     """Base of all tasks: an immutable pytree.
 
-    To make your own, subclass it, add fields and write ``rows`` (``TaskRows.of``).
+    To make your own, subclass it, add fields and write ``rows`` (``TaskRows.of``). Every task takes ``priority`` and
+    ``hard``.
 
     Attributes:
         priority: 1 is the most important; static.

@@ -91,7 +91,7 @@ def solve_hqp(
     result = _rules.found(solve(*jax.lax.stop_gradient((hierarchy, traced, warm_start))))
     # the derivative is computed in the precision of the data: no singular value below its roundoff is inverted
     singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, SINGULAR_TOL * jnp.finfo(dtype).eps)
-    x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol)
+    x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol, backend)
     return _solution(levels, result, x, is_finite, bounds_are_ordered, lower, upper)
 
 

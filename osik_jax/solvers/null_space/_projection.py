@@ -85,7 +85,7 @@ def level_motion(
     total = level_damping(damping, level, x, projector, -unbounded, unbounded)
     # with P = P_{k-1}: the rows J_k P, and the motion P J_k' (J_k P J_k' + damping I)^-1 error
     restricted = product(task.rows, projector)
-    space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, backend=backend)
+    space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, None, backend=backend)
     # roundoff over small singular values has components outside the projector's range, so the motion is projected
     return apply(projector, motion), projector - product(projector, product(space, projector)), total
 

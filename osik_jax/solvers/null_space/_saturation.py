@@ -196,7 +196,7 @@ def _after_level(
     # the blocking joints can move no more: their columns are removed from the projector
     columns = jnp.where((blocking != 0)[:, None], motion.projector, 0.0)
     zero = jnp.zeros((), columns.dtype)
-    space, _ = row_space_and_motion(columns, columns[:, 0], zero + BLOCKING_RANK, zero, backend=backend)
+    space, _ = row_space_and_motion(columns, columns[:, 0], zero + BLOCKING_RANK, zero, None, backend=backend)
     keep = (blocking == 0)[:, None] & (blocking == 0)[None, :]
     fixed = jnp.where(state.fixed == 0, blocking, state.fixed)
     x = jnp.where(
