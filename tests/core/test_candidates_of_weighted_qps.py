@@ -19,7 +19,7 @@ from osik_jax.execution._computed import side_by_side
 from osik_jax.execution._lanes import FEW_ON_CPU, first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _cuda, _dispatch, _search
+from osik_jax.solvers.qp import _core, _dispatch, _search
 from osik_jax.solvers.qp._core import CERTIFIED, Candidate
 from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._dispatch import kernel_candidates
@@ -224,7 +224,7 @@ def beside_a_gpu(monkeypatch):
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
-    monkeypatch.setattr(_cuda, "solve", solve)
+    monkeypatch.setattr(_core, "solve_on_gpu", solve)
     jax.clear_caches()
     yield asked
     jax.clear_caches()

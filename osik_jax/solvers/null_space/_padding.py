@@ -30,13 +30,13 @@ def pad_levels(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Sequence[Damping],
+    damping: Damping,
     rank_tol: Array | float,
 ) -> Problem:
     """Return the padded problem; a secondary motion is one more level without rows.
 
-    Levels are in the order of priority, weights multiplied in. Rows of a relative length under ``rank_tol`` count as
-    dependent.
+    Levels are in the order of priority, weights multiplied in; the damping has an axis of levels. Rows of a relative
+    length under ``rank_tol`` count as dependent.
     """
     n, dtype = len(lower), lower.dtype
     targets = [jnp.zeros(n, dtype)] * len(levels)
@@ -44,12 +44,13 @@ def pad_levels(
         # a level without rows keeps nothing and asks for the motion towards its target
         no_bounds = jnp.zeros(0, dtype)
         levels = [*levels, Level(jnp.zeros((0, n), dtype), no_bounds, no_bounds)]
-        targets, damping = [*targets, secondary], [*damping, jax.tree.map(jnp.zeros_like, damping[0])]
+        targets = [*targets, secondary]
+        damping = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), damping)
     count = max(1, *(len(level.lower) for level in levels))
     stacked = jax.tree.map(lambda *a: jnp.stack(a), *(level.padded(count, level.equal) for level in levels))
     return Problem(
         stacked,
-        jax.tree.map(lambda *a: jnp.stack(a), *damping),
+        damping,
         jnp.stack(targets),
         lower,
         upper,

@@ -68,7 +68,7 @@ def solve_saturated(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Sequence[Damping],
+    damping: Damping,
     rank_tol: Array | float,
     max_iterations: int,
     backend: Backend = "jax",

@@ -18,8 +18,8 @@ from .._damping import Damping, per_level
 from .._level import are_finite, bounds_exist
 from .._status import Status
 from ..hqp import Level
-from ._dispatch import project
 from ._problem import NullSpaceSolution
+from ._projection import project
 from ._saturation import BoundedAnswer, solve_saturated
 
 
@@ -80,7 +80,6 @@ def solve_nullspace(
     valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
     scaled = [level.scaled() for level in valid]
     rank_tol = NULL_SPACE_RANK[dtype] if rank_tolerance is None else rank_tolerance
-    one_each = [Damping(*parts) for parts in zip(*dampings, strict=True)]
     if box is None:
         answer = _unbounded(*project(scaled, motion, dampings, rank_tol, backend), count=len(levels))
         return _solution(valid, answer, is_valid, bounds_are_ordered, jnp.zeros(n, dtype))
@@ -88,7 +87,7 @@ def solve_nullspace(
     low, high, empty = ordered_bounds(*box)
     safe = jnp.where(is_valid, low, -1.0), jnp.where(is_valid, high, 1.0)
     target = None if secondary is None else motion
-    answer = solve_saturated(scaled, *safe, target, one_each, rank_tol, limit, backend)
+    answer = solve_saturated(scaled, *safe, target, dampings, rank_tol, limit, backend)
     return _solution(valid, answer, is_valid, bounds_are_ordered & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
 
 
