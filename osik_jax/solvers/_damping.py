@@ -52,7 +52,7 @@ class Damping(NamedTuple):
     bends: Any = 0.0  # Float[Array, " n"]
 
 
-def per_level(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
+def per_level(damping: Any, count: int, n: int, dtype: Any) -> Damping:
     """Return the dampings of ``count`` levels of n variables as one object with a leading axis of levels.
 
     ``damping`` is a number or a ``Damping`` for all levels, or a sequence with one for each.

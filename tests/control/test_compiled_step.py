@@ -32,8 +32,7 @@ from osik_jax.core import _library
 from osik_jax.execution._computed import side_by_side
 from osik_jax.limits import with_own_limits
 from osik_jax.solvers.qp import _core
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP, kkt_residual
+from osik_jax.solvers.qp._problem import QP, LeastSquares, kkt_residual
 
 pytestmark = needs_core
 

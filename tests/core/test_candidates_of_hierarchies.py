@@ -14,7 +14,7 @@ from osik_jax.execution import _backends
 from osik_jax.solvers import Level, Tolerances, solve_hqp
 from osik_jax.solvers._damping import per_level
 from osik_jax.solvers.hqp import _cascade, _core, _dispatch
-from osik_jax.solvers.hqp._padding import Layout, PaddedHierarchy, pad_hierarchy
+from osik_jax.solvers.hqp._problem import Layout, PaddedHierarchy, pad_hierarchy
 
 COUNT, CAP = 12, 200
 

@@ -21,9 +21,8 @@ from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _core, _dispatch, _search
 from osik_jax.solvers.qp._core import CERTIFIED, Candidate
-from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._dispatch import kernel_candidates
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 
 CAP = 1000
 SOFT = 3

@@ -9,7 +9,7 @@ from core_checks import needs_core
 from osik_jax.core import _cuda
 from osik_jax.retargeting import _banded as banded
 from osik_jax.solvers.hqp import _core as hierarchy
-from osik_jax.solvers.hqp._padding import Layout
+from osik_jax.solvers.hqp._problem import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
 from osik_jax.solvers.qp import _core as weighted_qp
 

@@ -25,8 +25,7 @@ from osik_jax.solvers.null_space import _cuda as null_space
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.null_space._padding import pad_levels
 from osik_jax.solvers.qp import _core
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 
 usable = _backends.cuda_is_default() and core_cuda.installed()
 pytestmark = pytest.mark.skipif(not usable, reason="needs JAX_PLATFORMS=cuda,cpu, a CUDA device and the compiled core")

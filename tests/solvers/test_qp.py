@@ -10,8 +10,7 @@ from recorded import QP_DAMPING, recorded_qps
 from refusals import refuses
 
 from osik_jax.solvers import Level, Status, solve_least_squares_qp, solve_qp
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 from osik_jax.solvers.qp._solve import _with_placeholder
 
 batched_qp = jax.jit(jax.vmap(solve_qp))

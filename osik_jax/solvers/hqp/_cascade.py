@@ -21,9 +21,8 @@ from .._level import PaddedLevel
 from ._active_rows import drop_dependent, factor_active_rows
 from ._freeze import CascadeState, LevelOutcome, freeze, skip
 from ._implicit_diff import ActiveSets
-from ._padding import Layout, LevelProblem, PaddedHierarchy
 from ._primal_active_set import PrimalState, primal_active_set
-from ._problem import Tolerances, WorkingSet
+from ._problem import Layout, LevelProblem, PaddedHierarchy, Tolerances, WorkingSet
 from ._working_set_solve import WorkingSetSolution, solve_on_working_set
 
 

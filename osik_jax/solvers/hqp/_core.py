@@ -12,8 +12,7 @@ from jaxtyping import Array
 from ...core import _cuda, _library
 from ._cascade import CascadeResult
 from ._implicit_diff import ActiveSets
-from ._padding import Layout, PaddedHierarchy
-from ._problem import Tolerances, WorkingSet
+from ._problem import Layout, PaddedHierarchy, Tolerances, WorkingSet
 
 
 def solve(

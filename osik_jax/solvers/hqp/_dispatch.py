@@ -21,8 +21,7 @@ from ...execution._lanes import in_lanes, with_the_rest
 from ...numerics._constants import BOX_TOLERANCE
 from . import _core
 from ._cascade import CascadeResult, certify_levels, solve_cascade
-from ._padding import Layout, PaddedHierarchy
-from ._problem import Tolerances, WorkingSet
+from ._problem import Layout, PaddedHierarchy, Tolerances, WorkingSet
 
 _BLOCK = 256
 """Number of problems that the search solves together; on a GPU its many small operations cost the same for one."""

@@ -16,9 +16,8 @@ from ...numerics._constants import ZERO_PIVOT
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._implicit_diff import ActiveSets
-from ._padding import LevelProblem
 from ._primal_active_set import PrimalState
-from ._problem import Tolerances, WorkingSet
+from ._problem import LevelProblem, Tolerances, WorkingSet
 from ._working_set_solve import gradient_roundoff, slack_roundoff
 
 

@@ -22,7 +22,7 @@ from ...numerics._dense import apply, product
 from .._damping import Damping, HardRows, level_damping, narrow_box
 from .._inverses import row_space_and_motion
 from .._level import PaddedLevel
-from ._padding import PaddedHierarchy
+from ._problem import PaddedHierarchy
 
 
 class ActiveSets(NamedTuple):

@@ -22,8 +22,7 @@ from ...execution._double import first_smallest
 from ...numerics._constants import EXTRA_DAMPING, MAX_STALLED, STATIONARITY_TOL
 from ...numerics._dense import apply
 from ._active_rows import ActiveRows, factor_active_rows, multipliers
-from ._padding import LevelProblem
-from ._problem import Tolerances
+from ._problem import LevelProblem, Tolerances
 from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_signs
 
 

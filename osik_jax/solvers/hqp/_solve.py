@@ -19,8 +19,7 @@ from .._status import Status
 from ._cascade import CascadeResult
 from ._dispatch import hierarchy_solver
 from ._implicit_diff import with_derivative
-from ._padding import pad_hierarchy
-from ._problem import HQPSolution, Tolerances, WorkingSet
+from ._problem import HQPSolution, Tolerances, WorkingSet, pad_hierarchy
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))

@@ -13,8 +13,7 @@ from ...numerics._constants import DAMPED_RANK, WORKING_SET_SOLVES
 from ...numerics._dense import apply, product
 from .._level import PaddedLevel
 from ._active_rows import ActiveRows, drop_dependent, factor_active_rows, multipliers, restoring_step
-from ._padding import LevelProblem
-from ._problem import Tolerances, WorkingSet
+from ._problem import LevelProblem, Tolerances, WorkingSet
 
 
 class WorkingSetSolution(NamedTuple):

@@ -33,7 +33,7 @@ from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
 from .._level import Level, PaddedLevel
 from . import _cuda
-from ._problem import ActiveTask
+from ._padding import ActiveTask
 
 Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
 """Answer x, and the projector onto the null space of all levels."""

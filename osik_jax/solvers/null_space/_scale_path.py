@@ -28,7 +28,7 @@ from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_END, PATH_SEARCHE
 from ...numerics._dense import apply, product
 from ...numerics._guarded import quotient
 from .._level import PaddedLevel
-from ._problem import ActiveTask
+from ._padding import ActiveTask
 from ._projection import damped_step_length
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 

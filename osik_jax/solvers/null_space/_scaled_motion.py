@@ -35,9 +35,8 @@ from .._box import clip_to_box
 from .._damping import Damping
 from .._level import PaddedLevel
 from ..hqp._active_rows import drop_dependent, factor_active_rows
-from ..hqp._padding import LevelProblem
 from ..hqp._primal_active_set import PrimalState, primal_active_set
-from ..hqp._problem import Tolerances
+from ..hqp._problem import LevelProblem, Tolerances
 
 
 class ScaledMotion(NamedTuple):

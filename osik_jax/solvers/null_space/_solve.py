@@ -18,7 +18,7 @@ from .._damping import Damping, per_level
 from .._level import are_finite, bounds_exist
 from .._status import Status
 from ..hqp import Level
-from ._problem import NullSpaceSolution
+from ._padding import NullSpaceSolution
 from ._projection import project
 from ._saturation import BoundedAnswer, solve_saturated
 

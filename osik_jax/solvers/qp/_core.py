@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, Int
 from ...core import _cuda, _library
 from ...execution._computed import side_by_side
 from ...numerics._constants import INACTIVE, KKT_TOLERANCE, REDUNDANT, SINGLE_TOL
-from ._cost import LeastSquares
-from ._problem import QP
+from ._problem import QP, LeastSquares
 
 CERTIFIED = 2
 """``Candidate.converged`` of a candidate that solves its problem; 1: there is one."""

@@ -20,9 +20,8 @@ from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import EQUALITY, INACTIVE, SINGLE_TOL
 from . import _core
 from ._core import CERTIFIED, Candidate
-from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
-from ._problem import QP
+from ._problem import QP, LeastSquares
 from ._search import SearchResult, search
 
 _BLOCKS, _MIN_BLOCK = 16, 1024

@@ -19,10 +19,9 @@ from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
 from .._level import bounds_exist
 from .._status import Status
-from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
-from ._problem import QP, QPSolution
+from ._problem import QP, LeastSquares, QPSolution, Quadratic
 from ._search import SearchResult
 
 
