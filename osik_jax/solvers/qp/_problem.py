@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...execution._platform import cuda_is_default
 from ...numerics._constants import (
     AT_LOWER,
     AT_UPPER,
@@ -21,7 +22,6 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply, product
 from .._box import violation
-from .._certificate import largest_of_each, relative_kkt_residual
 
 
 class Quadratic(eqx.Module):
@@ -286,3 +286,33 @@ def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: I
     scale = constraint_scales(qp, qp.cost.diagonal(), x, y).value[n:]
     stationarity = jnp.maximum(jnp.where(at_bound, 0.0, jnp.abs(gradient)), wrong_sign[:n])
     return relative_kkt_residual(stationarity, gradient_scale(qp, x, y), wrong_sign[n:], gap, scale)
+
+
+def relative_kkt_residual(
+    stationarity: Float[Array, " n"],
+    gradient_scale: Float[Array, " n"],
+    wrong_sign: Float[Array, " p"],
+    violation: Float[Array, " p"],
+    violation_scale: Float[Array, " p"],
+) -> Float[Array, ""]:
+    """Return the KKT residual of a point without units, comparable between problems of any weights.
+
+    It is the larger of two: the largest stationarity residual or wrong multiplier over the largest gradient scale, and
+    the largest violation of a row over the size of its terms and bounds. ``stationarity`` has the gradient of the
+    Lagrangian at variables without an active bound, and at the others multipliers of the wrong sign (not positive where
+    the sign is right). A gradient scale is the sum of the gradient's absolute terms; ``wrong_sign`` is in units of the
+    gradient.
+    """
+    residual, scale = largest_of_each(stationarity, gradient_scale)
+    # stationarity and signs in units of the forces; feasibility in those of the rows' own terms
+    dual = jnp.maximum(residual, jnp.max(wrong_sign, initial=0.0)) / jnp.where(scale > 0.0, scale, 1.0)
+    relative = violation / jnp.where(violation_scale > 0.0, violation_scale, 1.0)
+    primal = jnp.where(violation > 0.0, relative, 0.0)
+    return jnp.maximum(dual, jnp.max(primal, initial=0.0))
+
+
+def largest_of_each(*arrays: Float[Array, " n"]) -> list[Array]:
+    """Return the largest entry of each array, at least 0: one operation for all, but on a GPU, where XLA's is slow."""
+    if cuda_is_default():
+        return [jnp.max(a, initial=0.0) for a in arrays]
+    return list(jnp.max(jnp.stack(arrays), 1, initial=0.0))
