@@ -27,7 +27,7 @@ from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._forward import kinematics_by
 from ..kinematics._kernels import dof_columns, tree_integers
-from ..limits import Limit, LimitRows, NoLimits, limit_box, limit_rows
+from ..limits import Limit, LimitRows, limit_box, limit_rows
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
@@ -83,11 +83,6 @@ def _fits(
 def row_count(of_limits: LimitRows | None) -> int:
     """Return how many rows limits have."""
     return 0 if of_limits is None else of_limits.lower.shape[-1]
-
-
-def has_box(limit: Limit) -> bool:
-    """Return whether a limit bounds single dofs, and not rows alone."""
-    return any(type(part).box is not Limit.box for part in limit.parts()) or isinstance(limit, NoLimits)
 
 
 def unknown_scheme(scheme: Scheme) -> str | None:
@@ -417,7 +412,8 @@ def _by_core(packed: _Arrays, *arrays: Array) -> Solution:
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    by_limits = all(a.core_has_box and not a.has_rows(robot) for a in limits if has_box(a))  # JAX computes ball joints
+    boxed = [limit for limit in limits if any(type(part).box is not Limit.box for part in limit.parts())]
+    by_limits = all(limit.core_has_box and not limit.has_rows(robot) for limit in boxed)  # JAX computes ball joints
     if not (q.dtype == jnp.float64 and by_limits):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):
