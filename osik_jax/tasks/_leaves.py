@@ -19,6 +19,7 @@ from ..numerics._arguments import as_scalar as as_scalar
 from ..numerics._arguments import as_vector as as_vector
 from ..numerics._arguments import check_bounds as check_bounds
 from ..numerics._arguments import check_finite as check_finite
+from ..numerics._arguments import check_not_nan
 from ..numerics._arguments import check_not_negative as check_not_negative
 from ..numerics._arguments import concrete as concrete
 from ..numerics._host import on_host, repeated
@@ -48,6 +49,7 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
     if out.shape not in ((), (rows,)):
         each = "" if rows is None else f", or ({rows},): one for each row"
         raise OsikValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
+    check_not_nan(out, "weight")
     check_not_negative(out, "weight")
     return out if out.shape else repeated(out, like)
 
