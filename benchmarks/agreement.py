@@ -1,6 +1,6 @@
 """Kernels beside plain JAX, problem by problem: random problems solved by both.
 
-    python -m benchmarks.agreement --solver qp|hqp|nullspace|reverse|saturated [--count 1000000]
+    python -m benchmarks.agreement --solver qp|hqp|nullspace|saturated [--count 1000000]
         [--backend core] [--precision float64] [--seed 0] [--batch 4096] [--keep FILE]
 
 Each family is drawn as often as the others: in ``tests/support``, for weighted QPs those of ``weighted_families.py``
@@ -11,7 +11,7 @@ their
 size, and the largest such difference; and those that the kernel left to the search. ``--keep`` writes the problems
 that differ to a file, for ``kept`` to read: who is right is a third method's to say.
 
-Null spaces without bounds (``nullspace``, ``reverse``) are given the same levels without their box. There an inequality
+Null spaces without bounds (``nullspace``) are given the same levels without their box. There an inequality
 counts where the levels above leave it violated, so where these put it on its bound, roundoff decides whether it counts:
 some problems of the degenerate families differ for that reason alone.
 """
@@ -152,7 +152,7 @@ def solve_levels(p: Hierarchies, backend: Any, *, solver: str) -> Any:
         return solve_hqp(levels, p.lower, p.upper, backend=backend)
     if solver == "saturated":
         return solve_nullspace(levels, p.lower, p.upper, backend=backend)
-    return solve_nullspace(levels, order="reverse" if solver == "reverse" else "forward", backend=backend)
+    return solve_nullspace(levels, backend=backend)
 
 
 def levels_difference(p: Hierarchies, mine: Any, plain: Any) -> np.ndarray:
@@ -198,7 +198,7 @@ def count_left_over() -> list[int]:
 def main() -> None:
     """Print a line for each family."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.agreement", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--solver", default="hqp", choices=("qp", "hqp", "nullspace", "reverse", "saturated"))
+    parser.add_argument("--solver", default="hqp", choices=("qp", "hqp", "nullspace", "saturated"))
     parser.add_argument("--count", type=int, default=100_000)
     parser.add_argument("--backend", default="core")
     parser.add_argument("--precision", default="float64", choices=("float64", "float32"), help="of the problems")

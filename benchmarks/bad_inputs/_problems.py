@@ -95,7 +95,7 @@ def problems(add: Add) -> None:
     add("a damping for each joint", lambda: W(damping=np.ones(7)), V, "scalar")
     add("max_iterations=10.0", lambda: W(max_iterations=10.0), V, "integer")
     add("max_iterations=-1", lambda: H(max_iterations=-1), V, "integer")
-    add("a method that does not exist", lambda: N(method="backward"), V, "reverse")
+    add("a method that does not exist", lambda: N(method="backward"), V, "saturated")
     add("dt 0", lambda: solve(dt=0.0), V, "positive")
     add("dt negative", lambda: solve(dt=-0.01), V, "positive")
     add("dt NaN", lambda: solve(dt=np.nan), V, "finite")

@@ -27,7 +27,7 @@ from ..execution._lanes import lanes_of
 from ..execution._rules import custom_jvp
 from ..kinematics._forward import kinematics_by
 from ..kinematics._kernels import dof_columns, tree_integers
-from ..limits import ConfigurationLimit, Limit, LimitRows, NoLimits, VelocityLimit, limit_box, limit_rows
+from ..limits import Limit, LimitRows, limit_box, limit_rows
 from ..numerics._constants import ENTRY_ROUNDOFF, FEASIBILITY, HIERARCHY_RANK, KKT_TOLERANCE
 from ..numerics._placeholder import never_infinite, positive, with_placeholder
 from ..robot import Robot
@@ -40,8 +40,6 @@ from ..tasks._task import GIVEN, POSTURE, CoreCard
 from ._checks import check_rows
 from ._solution import Solution
 
-_LIMITS = (ConfigurationLimit, VelocityLimit, NoLimits)
-"""Limits whose box the core computes; JAX computes the box of others."""
 _WEIGHTED, _HIERARCHICAL, _CLASSICAL, _SATURATED = range(4)
 _HARD_ROWS = 2
 """``StepLimit`` of the core."""
@@ -87,16 +85,10 @@ def row_count(of_limits: LimitRows | None) -> int:
     return 0 if of_limits is None else of_limits.lower.shape[-1]
 
 
-def has_box(limit: Limit) -> bool:
-    """Return whether a limit bounds single dofs, and not rows alone."""
-    return any(type(part).box is not Limit.box for part in limit.parts()) or isinstance(limit, NoLimits)
-
-
 def unknown_scheme(scheme: Scheme) -> str | None:
     """Return a scheme that the core does not know in words; None if it knows it."""
     if _kind(scheme) is None:
-        method = f" with method={scheme.method!r}" if type(scheme) is NullSpace else ""
-        return f"the scheme {type(scheme).__name__}{method}"
+        return f"the scheme {type(scheme).__name__}"
     if getattr(scheme, "max_iterations", None) is not None:  # what a search has then is its own
         return f"a {type(scheme).__name__} with max_iterations"
     return None
@@ -107,7 +99,7 @@ def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits
     if unknown_scheme(scheme) is not None:
         return unknown_scheme(scheme)
     for limit in limits:
-        if type(limit) not in _LIMITS:
+        if not limit.core_has_box:
             return f"the limit {type(limit).__name__}"
         if limit.has_rows(robot):
             return "the limit ConfigurationLimit of a robot with ball joints"
@@ -118,7 +110,7 @@ def missing_part(robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits
 def _kind(scheme: Scheme) -> int | None:
     """Return the core's number of a scheme (``StepScheme``), None for one that it does not know."""
     if type(scheme) is NullSpace:
-        return {"classical": _CLASSICAL, "saturated": _SATURATED}.get(scheme.method)
+        return _SATURATED if scheme.saturates else _CLASSICAL
     return {WeightedQP: _WEIGHTED, HierarchicalQP: _HIERARCHICAL}.get(type(scheme))
 
 
@@ -289,9 +281,7 @@ class Layout:
         """
         robot, q, tasks, scheme, limits, dt, _ = numbered
         tree, nv, by_weight = self.robot.tree, self.robot.nv, self.kind == _WEIGHTED
-        of_limits = [
-            _leaves_of_limit(limit) for limit in limits if isinstance(limit, ConfigurationLimit | VelocityLimit)
-        ]
+        of_limits = [leaves for limit in limits if (leaves := limit.core_leaves())]
         if limit_rows:
             of_limits.append([_HARD_ROWS, *limit_rows, limit_rows[0]])
         bodies, joints, full = len(tree.body_names), len(tree.joint_types), len(tree.dof_joint)
@@ -341,12 +331,6 @@ class Layout:
         else:
             tolerances = [ENTRY_ROUNDOFF * jnp.finfo(dtype).eps]
         return np.concatenate([tree.qpos_source[1], dof_columns(tree)[1], [jnp.finfo(dtype).max, *tolerances]])
-
-
-def _leaves_of_limit(limit: Any) -> list[Any]:
-    if isinstance(limit, ConfigurationLimit):
-        return [1, limit.lower, limit.upper, limit.gain, limit.return_speed]
-    return [0, *[limit.velocity] * 4]
 
 
 def _placed(
@@ -428,7 +412,8 @@ def _by_core(packed: _Arrays, *arrays: Array) -> Solution:
     nowhere = np.iinfo(np.int32).max  # of integers, which the core does not look at
     places = {leaf: (own[0] if own[0] < len(given) else nowhere, *own[1:]) for leaf, own in packed.places.items()}
     guesses = [a.reshape(len(a), -1) for a in guesses] + [np.zeros((1, 0), np.int32)] * (2 - len(guesses))
-    by_limits = all(type(a) in _LIMITS and not a.has_rows(robot) for a in limits if has_box(a))  # of ball joints JAX
+    boxed = [limit for limit in limits if any(type(part).box is not Limit.box for part in limit.parts())]
+    by_limits = all(limit.core_has_box and not limit.has_rows(robot) for limit in boxed)  # JAX computes ball joints
     if not (q.dtype == jnp.float64 and by_limits):
         box = len(places)
         for bound in over_lanes(lambda robot, q, limits, dt: limit_box(robot, q, limits, dt))(robot, q, limits, dt):

@@ -1,10 +1,10 @@
 """Choice of backend: the table of kernels, and the dispatch by platform.
 
 A solver takes a kernel's candidate, certifies it in plain JAX, and searches if that fails. The search is the definition
-and needs no kernel. ``backend``, a static option of solvers and schemes, chooses. Kernels of null-space projection, of
-kinematics and of task rows replace plain JAX without a search (``_computed.py``): all of the classical order, and the
-factors of the levels in the reverse order. With bounds a null-space kernel searches, and plain JAX searches again for
-problems that it cannot solve. A scheme's backend is that of its whole step.
+and needs no kernel. ``backend``, a static option of solvers and schemes, chooses. Kernels of the classical null-space
+projection, of kinematics and of task rows replace plain JAX without a search (``_computed.py``). With bounds a
+null-space kernel searches, and plain JAX searches again for problems that it cannot solve. A scheme's backend is that
+of its whole step.
 
     backend   weighted QP                          hierarchy                           null space
     "core"    CPUs: any precision, least squares   CPUs: any precision, any shape      CPUs: any precision,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
-from ..limits import CollisionAvoidanceLimit, Limit, PositionBarrier
+from ..limits import Limit
 from ..robot import Robot
 from ..schemes import Scheme
 from ..schemes._default import scheme_for
@@ -57,7 +57,7 @@ def read_problem(
     for name in poses:
         robot.tree.frame(name)
     goal, rows, count = read_poses(robot, poses) if poses else (None, (), None)
-    boxed = not any(isinstance(limit, CollisionAvoidanceLimit | PositionBarrier) for limit in limits or ())
+    boxed = not any(limit.sees_places for limit in limits or ())
     plain = len(poses) == len(tasks) and is_plain(robot.tree, tuple(poses))
     if goal is not None and plain and boxed and scheme is None:
         if targets is not None:

@@ -17,10 +17,9 @@ from ..numerics._arguments import check_bounds, concrete, entries
 from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
-from ._box import Kind, Limit, limit_box
+from ._box import Box, Kind, Limit, Time, limit_box
 from ._configuration import ConfigurationLimit, check_return_speed
 
-_Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
 _ROUNDOFF = 32.0  # machine epsilons of the way to a bound that braking leaves over
 _MOST_STEPS = 1e6  # of braking
 
@@ -65,6 +64,7 @@ class AccelerationLimit(Limit):
     """
 
     kind: ClassVar[Kind] = "acceleration"
+    bound_name: ClassVar[str] = "acceleration limit"
     acceleration: Float[Array, " nv"]
     velocity: Float[Array, " nv"]
     lower: Float[Array, " nv"]
@@ -97,7 +97,7 @@ class AccelerationLimit(Limit):
         stopping = _Stopping(self.acceleration, self.lower, self.upper, self.return_speed)
         return _Reachable(self.acceleration, self.velocity), stopping
 
-    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         """Return the bounds of both parts together."""
         return limit_box(robot, q, self.parts(), dt)
 
@@ -120,7 +120,7 @@ class _Reachable(Limit):
     acceleration: Float[Array, " nv"]
     velocity: Float[Array, " nv"]
 
-    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         del robot, q
         # infinite minus infinite would be NaN, also in derivatives
         free = jnp.isinf(self.acceleration)
@@ -138,7 +138,7 @@ class _Stopping(Limit):
     upper: Float[Array, " nv"]
     return_speed: Float[Array, " nv"]
 
-    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> _Box:
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         """Return the bounds by braking.
 
         A joint outside its range returns at the return speed, or slower to stop at the other end.
@@ -167,9 +167,7 @@ def _way(bound: Float[Array, " nv"], position: Float[Array, " nv"]) -> Float[Arr
     return jnp.where(free, bound, way - _ROUNDOFF * jnp.finfo(way.dtype).eps * jnp.abs(way))
 
 
-def stopping_speed(
-    way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Float[Array, ""] | float
-) -> Float[Array, " nv"]:
+def stopping_speed(way: Float[Array, " nv"], acceleration: Float[Array, " nv"], dt: Time) -> Float[Array, " nv"]:
     """Return the greatest velocity from which braking in whole steps stops within a distance.
 
     See ``AccelerationLimit``. The velocity is continuous and piecewise linear in ``way``, the distance [rad or m], with

@@ -19,6 +19,7 @@ from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._balls import ball_rotation, independent_balls
 from ..robot._joint_selection import dofs_of
+from ._box import Time
 
 MARGIN = 0.002
 """Share of the range that is kept clear of its end."""
@@ -43,7 +44,7 @@ def ball_rates(
     upper: Float[Array, " nv"],
     gain: Float[Array, " nv"],
     return_speed: Float[Array, " nv"],
-    dt: Float[Array, ""] | float,
+    dt: Time,
     *,
     margin: float,
     shortest: float,

@@ -3,25 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..numerics._arguments import concrete
+from ..numerics._dense import apply
 from ..numerics._guarded import clipped
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
-from ._rows import LimitRows
 
 Kind = Literal["acceleration", "velocity", "braking", "position"]
+Time = Float[Array, ""] | float
+Box = tuple[Float[Array, " nv"], Float[Array, " nv"]]
+"""Lower and upper bounds on the velocity."""
 _COMPUTED: tuple[Kind, ...] = ("acceleration", "braking")
 # machine epsilons by which two evaluations of the same bound may differ
 _ROUNDOFF = 4.0
 _ORDER: tuple[Kind, ...] = ("acceleration", "velocity", "braking", "position")
+
+
+class LimitRows(eqx.Module):
+    """Rows of a limit at one configuration, beside its box: ``lower <= jacobian @ v <= upper``, hard.
+
+    Attributes:
+        jacobian: of what is bounded. (m, nv)
+        lower: of its rate, -inf for none. (m,)
+        upper: of its rate, inf for none. (m,)
+    """
+
+    jacobian: Float[Array, "m nv"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+
+    def violation(self, velocity: Float[Array, " nv"]) -> Float[Array, " m"]:
+        """Return the distance of each row's value outside its bounds; 0 if the row holds. (m,)."""
+        value = apply(self.jacobian, velocity)
+        return jnp.maximum(jnp.maximum(self.lower - value, value - self.upper), 0.0)
 
 
 class Limit(MadeForRobot, Replaceable):
@@ -34,28 +57,37 @@ class Limit(MadeForRobot, Replaceable):
     Attributes:
         kind: limits are applied in the order ``"acceleration"``, ``"velocity"``, ``"braking"``, ``"position"``. If two
             contradict each other, the one applied first holds.
+        bound_name: what a bound on a single joint is called in verdicts; empty: by the class.
+        sees_places: whether the limit keeps places of bodies, such as a hand before a wall; not joints alone.
     """
 
     kind: ClassVar[Kind] = "velocity"
+    bound_name: ClassVar[str] = ""
+    sees_places: ClassVar[bool] = False
 
     def parts(self) -> Sequence[Limit]:
         """Return the parts that are applied in place of this limit, if it is of several kinds."""
         return (self,)
 
-    def box(
-        self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         """Return lower and upper bounds on v [rad/s or m/s], lower <= upper, +-inf where free. Default: all free."""
         del dt
         free = jnp.full(robot.nv, jnp.inf, jnp.result_type(jnp.asarray(q), robot.q0))
         return -free, free
 
-    def rows(
-        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> LimitRows | None:
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Time) -> LimitRows | None:
         """Return bounds on linear functions of v at configuration q. Default: none."""
         del robot, kinematics, q, dt
         return None
+
+    def core_leaves(self) -> list[Any]:
+        """Return ``StepLimit`` of the core and the leaves that it reads; empty: it reads none."""
+        return []
+
+    @property
+    def core_has_box(self) -> bool:
+        """Return whether the core computes the box; of a subclass JAX does, which may have a box of its own."""
+        return "core_leaves" in vars(type(self))
 
     def has_rows(self, robot: Robot) -> bool:
         """Return whether the limit has rows beside its box, for this robot."""
@@ -79,9 +111,7 @@ class Limit(MadeForRobot, Replaceable):
         return self
 
 
-def limit_box(
-    robot: Robot, q: Float[Array, " nq"], limits: Sequence[Limit], dt: Float[Array, ""] | float
-) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+def limit_box(robot: Robot, q: Float[Array, " nq"], limits: Sequence[Limit], dt: Time) -> Box:
     """Return the box of all limits on v for a step of dt [s]; lower <= upper always.
 
     Acceleration and velocity limits first; then each position limit is clipped into the box so far:
@@ -127,7 +157,7 @@ def limit_rows(
     kinematics: Kinematics,
     q: Float[Array, " nq"],
     limits: Sequence[Limit],
-    dt: Float[Array, ""] | float,
+    dt: Time,
 ) -> LimitRows | None:
     """Return the rows of all limits, in the order of the limits; None if there are none.
 

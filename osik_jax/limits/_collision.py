@@ -29,8 +29,7 @@ from ..numerics._arguments import as_scalar, as_vector, concrete
 from ..numerics._guarded import at_most_inverse
 from ..numerics._host import Numbers, is_traced, to_jax, tree_to_jax
 from ..robot import Robot
-from ._box import Limit
-from ._rows import LimitRows
+from ._box import Limit, LimitRows, Time
 
 
 class CollisionAvoidanceLimit(Limit):
@@ -91,6 +90,7 @@ class CollisionAvoidanceLimit(Limit):
     """
 
     kind: ClassVar[Literal["velocity", "position"]] = "velocity"
+    sees_places: ClassVar[bool] = True
     minimum_distance: Float[Array, ""]
     detection_distance: Float[Array, ""]
     gain: Float[Array, ""]
@@ -182,9 +182,7 @@ class CollisionAvoidanceLimit(Limit):
         del robot
         return self.replace(gain=1.0)
 
-    def rows(
-        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> LimitRows:
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Time) -> LimitRows:
         """Return lower bounds [m/s] on the rates of distances that could vanish soonest; -inf where free."""
         del q
         if self.kept is not None and self.scene is not None:
@@ -204,7 +202,7 @@ class CollisionAvoidanceLimit(Limit):
         """Return names that ``replace`` takes; for shapes use ``moved``."""
         return _NUMBERS if self.scene is None else (*_NUMBERS, "scene")
 
-    def numbers(self, dt: Float[Array, ""] | float) -> Float[Numbers, "5"]:
+    def numbers(self, dt: Time) -> Float[Numbers, "5"]:
         """Return what the core reads of the limit (``AvoidanceNumbers``), by NumPy unless traced."""
         own = *(getattr(self, name) for name in _NUMBERS), dt
         numbers = jnp if is_traced(own) else np

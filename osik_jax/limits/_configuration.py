@@ -20,8 +20,7 @@ from ..robot import Robot
 from ..robot._balls import independent_balls
 from ..robot._joint_selection import dof_names, dof_values, dofs_of, scalar_layout
 from ._ball import MARGIN, SHORTEST, BallRates, ball_rates
-from ._box import Kind, Limit
-from ._rows import LimitRows
+from ._box import Box, Kind, Limit, LimitRows, Time
 
 _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE = 0.5, 0.25
 """[rad/s] and [m/s]. ISO 10218-1 calls 0.25 m/s reduced speed; half a metre from a hinge, 0.5 rad/s is the same."""
@@ -61,6 +60,7 @@ class ConfigurationLimit(Limit):
     """
 
     kind: ClassVar[Kind] = "position"
+    bound_name: ClassVar[str] = "limit"
     ball_margin: ClassVar[float] = MARGIN
     ball_step: ClassVar[float] = SHORTEST
     lower: Float[Array, " nv"]
@@ -86,9 +86,7 @@ class ConfigurationLimit(Limit):
         self.return_speed = dof_values(robot, return_speed, _own_return_speed(robot), "return_speed")
         check_return_speed(self.return_speed, dof_names(robot))
 
-    def box(
-        self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
+    def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         """Return the velocities that lead to the ends of each range in one step of dt [s], or back at return speed."""
         scalar, index = scalar_layout(robot)
         position = jnp.asarray(q)[index]
@@ -101,9 +99,7 @@ class ConfigurationLimit(Limit):
             lower, upper = jnp.maximum(lower, -fastest), jnp.minimum(upper, fastest)
         return jnp.minimum(lower, upper), upper
 
-    def rows(
-        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> LimitRows | None:
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Time) -> LimitRows | None:
         """Return bounds on the rate of each ball joint's angle; None for a robot without ball joints."""
         del kinematics
         balls = self._balls(robot, q, dt)
@@ -118,19 +114,23 @@ class ConfigurationLimit(Limit):
         """Return whether the robot has ball joints, or a class of one's own has rows."""
         return type(self).rows is not ConfigurationLimit.rows or bool(independent_balls(robot.tree))
 
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves of the range."""
+        return [1, self.lower, self.upper, self.gain, self.return_speed]
+
     def sought(self, robot: Robot) -> Limit:
         """Return the limit with a gain of 1 and return in one step."""
         del robot
         return self.replace(gain=jnp.ones_like(self.gain), return_speed=jnp.full_like(self.upper, jnp.inf))
 
-    def _balls(self, robot: Robot, q: Float[Array, " nq"], dt: Float[Array, ""] | float) -> BallRates | None:
+    def _balls(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> BallRates | None:
         gain = jnp.broadcast_to(self.gain, self.upper.shape)
         q = jnp.asarray(q, jnp.result_type(jnp.asarray(q), self.upper))
         form = dict(margin=self.ball_margin, shortest=self.ball_step)
         return ball_rates(robot, q, self.upper, gain, self.return_speed, dt, **form)
 
     def _reach(
-        self, bound: Float[Array, " nv"], position: Float[Array, " nv"], dt: Float[Array, ""] | float, *, inward: float
+        self, bound: Float[Array, " nv"], position: Float[Array, " nv"], dt: Time, *, inward: float
     ) -> Float[Array, " nv"]:
         """Return the velocity to the bound, rounded inward; infinite bounds stay infinite, with gradients 0."""
         free = jnp.isinf(bound)

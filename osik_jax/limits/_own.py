@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from ..robot import Robot
 from ._box import Limit
@@ -19,6 +19,10 @@ class NoLimits(Limit):
     def parts(self) -> Sequence[Limit]:
         """Return no parts: the marker bounds nothing."""
         return ()
+
+    def core_leaves(self) -> list[Any]:
+        """Return nothing: the marker bounds nothing."""
+        return []
 
     def __repr__(self) -> str:
         """Return the expression that names it."""

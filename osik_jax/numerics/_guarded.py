@@ -42,6 +42,12 @@ def at_most_inverse(gain: Float[Array, ""], dt: Float[Array, ""] | float) -> Flo
     return jnp.where(is_capped, 1.0 / jnp.where(is_capped, dt, 1.0), gain)
 
 
+def approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return ``rate (bound - value)``; an infinite bound stays infinite at any rate, with gradients of 0."""
+    free = jnp.isinf(bound)
+    return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))
+
+
 def rate_of_way(way: Float[Array, "*S"], dt: Float[Array, "*#S"] | float) -> Float[Array, "*S"]:
     """Return way / dt; a rate above ``_FASTEST``, which bounds nothing, has the derivative 0, not an infinite one."""
     dt = jnp.asarray(dt, way.dtype)

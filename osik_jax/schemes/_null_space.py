@@ -1,4 +1,4 @@
-"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8); two other methods."""
+"""Prioritised projection with a joint-limit potential in the last null space (eqs. 7 and 8); or with hard limits."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..solvers import Level, solve_nullspace
 from ..solvers.null_space import NullSpaceSolution
 from ._scheme import Scheme, SchemeAnswer, VelocityProblem, as_leaf, status_with
 
-NullSpaceMethod = Literal["classical", "reverse", "saturated"]
+NullSpaceMethod = Literal["classical", "saturated"]
 METHODS: tuple[str, ...] = get_args(NullSpaceMethod)
 
 
@@ -31,16 +31,12 @@ class NullSpace(Scheme):
     ``method="saturated"`` makes the limits hard (saturation in the null space). The other joints take over from joints
     at their limits. A priority that cannot be met inside the limits is scaled down and keeps its direction.
 
-    ``method="reverse"`` builds the motion from the potential and the lowest priority up. The first priority is exact up
-    to its damping, and nothing jumps if a priority becomes dependent on those above. Limits are not hard. Inequality
-    rows count only while the lower priorities leave them violated.
-
     Hard tasks and limits with rows are the first level, without damping. If it cannot be met, the status is INFEASIBLE.
     Its inequality rows count only if standing still violates them; the levels below may violate the others, and
     ``box_violation`` covers that for limits.
 
     Attributes:
-        method: "classical", from the first priority down; "reverse"; or "saturated" (static).
+        method: "classical" or "saturated" (static).
         damping: damping of each priority's motion: s / (s^2 + damping) replaces 1 / s; 0 allowed.
         curvature_damping: kappa, the factor of the damping for the second-order terms that the linear model omits,
             doubled for priorities below others; 0 for none. It vanishes where the tasks are met
@@ -76,14 +72,11 @@ class NullSpace(Scheme):
         descent = -self.potential_gain * limit_potential_gradient(
             problem.position, problem.position_lower, problem.position_upper, self.margin
         )
-        below_others = self.method != "reverse"
-        damping = problem.dampings(constraints, self.damping, self.curvature_damping, below_others=below_others)
         answer = solve_nullspace(
             levels,
             *((problem.lower, problem.upper) if self.saturates else ()),
-            order="reverse" if self.method == "reverse" else "forward",
             secondary=descent,
-            damping=damping,
+            damping=problem.dampings(constraints, self.damping, self.curvature_damping),
             rank_tolerance=self.rank_tolerance,
             backend=self.backend,
         )

@@ -109,12 +109,7 @@ class VelocityProblem(eqx.Module):
         return self.dt * jnp.stack([own.curvature for own in rows]) if rows else jnp.zeros(0, self.dt.dtype)
 
     def dampings(
-        self,
-        constraints: Level | None,
-        constant: Float[Array, ""],
-        curvature: Float[Array, ""] | float,
-        *,
-        below_others: bool = True,
+        self, constraints: Level | None, constant: Float[Array, ""], curvature: Float[Array, ""] | float
     ) -> list[Damping]:
         """Return the damping of each level of ``levels``.
 
@@ -124,14 +119,14 @@ class VelocityProblem(eqx.Module):
             constraints: answer of ``constraints()``.
             constant: constant damping of each priority.
             curvature: kappa, the factor of each priority's curvature damping.
-            below_others: whether rows of the levels above balance the unmet demand of a priority.
         """
         found, above = [], list(self.hard)
         if constraints is not None:
             found.append(Damping(bends=curvature * self.bends(self.hard)) if self.hard else Damping())
         for names in self.by_priority():
             residuals = [positive_root(rows.weight) * rows.pull for rows in map(self.rows.__getitem__, names)]
-            factor = (BELOW_OTHERS if below_others and found else 1.0) * curvature
+            # the rows of the levels above balance the unmet demand of a priority, and bend too
+            factor = (BELOW_OTHERS if found else 1.0) * curvature
             found.append(
                 Damping(
                     constant,

@@ -11,12 +11,12 @@ damping is ``max(0, unmet - s^2)`` for a singular value s: a threshold on singul
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from ..numerics._constants import (
@@ -32,25 +32,7 @@ from ..numerics._constants import (
 )
 from ..numerics._dense import apply, product
 from ..numerics._guarded import clipped, positive_root, quotient, safe_norm
-
-
-@runtime_checkable
-class Rows(Protocol):
-    """Rows of a level with weights multiplied in."""
-
-    @property
-    def matrix(self) -> Float[Array, "m n"]:
-        """Return the matrix A."""
-        ...
-
-    @property
-    def equal(self) -> Bool[Array, " m"]:
-        """Return which rows are equalities."""
-        ...
-
-    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Return A x minus the nearest point of each row's interval."""
-        ...
+from ._level import Level, PaddedLevel
 
 
 class Damping(NamedTuple):
@@ -70,7 +52,7 @@ class Damping(NamedTuple):
     bends: Any = 0.0  # Float[Array, " n"]
 
 
-def per_level(damping: Any, count: int, n: int, dtype: jnp.dtype) -> Damping:
+def per_level(damping: Any, count: int, n: int, dtype: Any) -> Damping:
     """Return the dampings of ``count`` levels of n variables as one object with a leading axis of levels.
 
     ``damping`` is a number or a ``Damping`` for all levels, or a sequence with one for each.
@@ -93,7 +75,7 @@ def _fields(dampings: Sequence[Damping]) -> list[list]:
 
 def level_damping(
     damping: Damping,
-    level: Rows,
+    level: Level | PaddedLevel,
     x: Float[Array, " n"],
     projector: Float[Array, "n n"],
     lower: Float[Array, " n"],
@@ -171,7 +153,7 @@ def _kept_inside(x: Float[Array, " n"], blocking: _Blocking) -> Float[Array, " n
 
 def narrow_box(
     damping: Damping,
-    level: Rows,
+    level: Level | PaddedLevel,
     curvature: Float[Array, " n"],
     x: Float[Array, " n"],
     lower: Float[Array, " n"],

@@ -27,6 +27,7 @@ def row_space_and_motion(
     target: Float[Array, " m"],
     cutoff: Float[Array, ""],
     damping: Float[Array, ""],
+    rank: Int[Array, ""] | None,
     *,
     backend: Backend = "jax",
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
@@ -35,11 +36,25 @@ def row_space_and_motion(
     The rank is decided by pivots: rows that have no more than the cutoff outside the span of the longer ones count as
     dependent. The projector comes from an orthonormal basis and not from an inverse, so it is idempotent to roundoff
     however dependent the rows are. Derivatives are those at constant rank. ``cutoff`` is the smallest pivot that is not
-    0; the damping is in squared singular values.
+    0; the damping is in squared singular values. With a ``rank``, the pivots beyond it count as 0 too.
     """
-    factors = row_factors(matrix, cutoff, damping, backend)
+    factors = _factors(matrix, cutoff, damping, rank, backend)
     motion = apply(factors.basis.T, _solved(factors, target))
     return product(factors.basis.T, factors.basis), motion
+
+
+def _factors(matrix: Array, cutoff: Array, damping: Array, rank: Array | None, backend: Backend) -> RowFactors:
+    """Return the factors up to a rank at most: each pivot depends on those before it alone."""
+    found = row_factors(matrix, cutoff, damping, backend)
+    if rank is None:
+        return found
+    keep = jnp.arange(len(matrix)) < rank
+    eye = jnp.eye(len(matrix), dtype=matrix.dtype)
+    return RowFactors(
+        basis=jnp.where(keep[:, None], found.basis, 0.0),
+        orthonormal=jnp.where(keep, found.orthonormal, 0.0),
+        triangle=jnp.where(keep[:, None] & keep, found.triangle, eye),
+    )
 
 
 def _solved(factors: RowFactors, target: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
@@ -50,9 +65,11 @@ def _solved(factors: RowFactors, target: Float[Array, "m ..."]) -> Float[Array, 
 
 
 @custom_jvp
-def _by_row_factors(matrix: Array, cutoff: Array, damping: Array, *, backend: Backend) -> tuple[Array, Array, Array]:
+def _by_row_factors(
+    matrix: Array, cutoff: Array, damping: Array, rank: Array | None, *, backend: Backend
+) -> tuple[Array, Array, Array]:
     """Return the projector onto the row space, the Moore-Penrose inverse and the damped inverse."""
-    both = [row_factors(matrix, cutoff, each, backend) for each in (jnp.zeros_like(damping), damping)]
+    both = [_factors(matrix, cutoff, each, rank, backend) for each in (jnp.zeros_like(damping), damping)]
     eye = jnp.eye(len(matrix), dtype=matrix.dtype)
     plain, damped = (product(factors.basis.T, _solved(factors, eye)) for factors in both)
     return product(both[0].basis.T, both[0].basis), plain, damped
@@ -60,8 +77,8 @@ def _by_row_factors(matrix: Array, cutoff: Array, damping: Array, *, backend: Ba
 
 @_by_row_factors.defjvp
 def _by_row_factors_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Any, Any]:
-    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
+    (a, cutoff, damping, rank), (da, _, d_damping, _) = primals, tangents
+    space, X, D = _by_row_factors(a, cutoff, damping, rank, backend=backend)
     dX = _columns(lambda w: _inverse_rate(a, X, da, w), a)
     dD = _columns(lambda w: _damped_rate(a, X, D, damping, da, d_damping, w), a)
     return (space, X, D), (_space_rate(space, X, da), dX, dD)
@@ -75,54 +92,9 @@ def _row_space_and_motion_jvp(
     size = largest(primals[0])
     (a, target, cutoff), (da, d_target) = ([each / size for each in some] for some in (primals[:3], tangents[:2]))
     damping, d_damping = primals[3] / size**2, tangents[3] / size**2
-    space, X, D = _by_row_factors(a, cutoff, damping, backend=backend)
+    space, X, D = _by_row_factors(a, cutoff, damping, primals[4], backend=backend)
     rate = _damped_rate(a, X, D, damping, da, d_damping, target) + apply(D, d_target)
     return (space, apply(D, target)), (_space_rate(space, X, da), rate)
-
-
-@custom_jvp
-def row_space_and_motion_of_rank(
-    matrix: Float[Array, "m n"], target: Float[Array, " m"], rank: Int[Array, ""], cutoff: Float[Array, ""]
-) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
-    """Return the projector on the rows and the least motion for a target, without damping, for a given rank.
-
-    Pivots up to the cutoff count as 0 even if the rank is higher.
-    """
-    space, inverse = _by_pivots(matrix, rank, cutoff)
-    return space, apply(inverse, target)
-
-
-@custom_jvp
-def _by_pivots(matrix: Array, rank: Array, cutoff: Array) -> tuple[Array, Array]:
-    """Return projector and inverse by a complete orthogonal factorisation, A = permutation U S' Q'."""
-    m, n = matrix.shape
-    Q, R, order = jax.scipy.linalg.qr(matrix.T, mode="economic", pivoting=True)
-    pivots = jnp.abs(jnp.diagonal(R))
-    keep = (jnp.arange(min(m, n)) < rank) & (pivots > cutoff)
-    # A' permuted is Q R; of the rank's rows of R a second QR makes R' = U S, so that A^+ = Q S^-1 U'
-    Q = jnp.where(keep, Q, 0.0)
-    U, S = jnp.linalg.qr(jnp.where(keep[:, None], R, 0.0).T)
-    S = jnp.where(keep[:, None] & keep[None, :], S, jnp.eye(len(keep), dtype=S.dtype))
-    solved = jax.scipy.linalg.solve_triangular(S, jnp.where(keep[:, None], U.T, 0.0))
-    inverse = jnp.zeros((n, m), matrix.dtype).at[:, order].set(product(Q, solved))
-    return product(Q, Q.T), inverse
-
-
-@_by_pivots.defjvp
-def _by_pivots_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    (a, rank, cutoff), (da, *_) = primals, tangents
-    space, X = _by_pivots(a, rank, cutoff)
-    return (space, X), (_space_rate(space, X, da), _columns(lambda w: _inverse_rate(a, X, da, w), a))
-
-
-@row_space_and_motion_of_rank.defjvp
-def _row_space_and_motion_of_rank_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    (a, target, rank, cutoff), (da, d_target, *_) = primals, tangents
-    size = largest(a)  # as above: rows of size 1
-    a, target, cutoff, da, d_target = (each / size for each in (a, target, cutoff, da, d_target))
-    space, X = _by_pivots(a, rank, cutoff)
-    rate = _inverse_rate(a, X, da, target) + apply(X, d_target)
-    return (space, apply(X, target)), (_space_rate(space, X, da), rate)
 
 
 def _space_rate(space: Float[Array, "n n"], X: Float[Array, "n m"], da: Float[Array, "m n"]) -> Float[Array, "n n"]:
@@ -196,58 +168,3 @@ def _transposed_rate(
     wide = apply(da, apply(X, y))
     tall = apply(X.T, apply(X, apply(da, v - apply(X, apply(a, v)))))
     return wide - apply(a, apply(X, wide)) + tall - apply(X.T, apply(da.T, y))
-
-
-def regularised_inverse(
-    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
-) -> Float[Array, "n m"]:
-    """Return (A'A + damping I)^-1 A'; for damping 0 the Moore-Penrose inverse, which alone uses the cutoff."""
-    return _by_singular_values(matrix, cutoff, damping)[0]
-
-
-def regularised_space(
-    matrix: Float[Array, "m n"], cutoff: Float[Array, ""], damping: Float[Array, ""]
-) -> Float[Array, "n n"]:
-    """Return the regularised inverse times the matrix: the projector onto its row space for damping 0.
-
-    Their product has roundoff in proportion to the ratio of the singular values; this has not.
-    """
-    return _by_singular_values(matrix, cutoff, damping)[2]
-
-
-@custom_jvp
-def _by_singular_values(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """Return the damped inverse D of A (Moore-Penrose for damping 0), K with D = K A', and S = D A.
-
-    K is (A'A + damping I)^-1, or (A'A)^+ for a damping of 0.
-    """
-    # D = V diag(s / (s^2 + damping)) U'; K = V diag(1 / (s^2 + damping)) V', and 1 / damping outside the row space
-    u, s, vt = jnp.linalg.svd(matrix, full_matrices=False)
-    damped = damping > 0.0
-    kept = damped | (s > cutoff)
-    square = jnp.where(kept, s**2 + damping, 1.0)
-    inverse = product(vt.T * jnp.where(kept, s / square, 0.0), u.T)
-    outside = jnp.where(damped, 1.0 / jnp.where(damped, damping, 1.0), 0.0)
-    gram = product(vt.T * (jnp.where(kept, 1.0 / square, 0.0) - outside), vt)
-    space = product(vt.T * jnp.where(kept, s**2 / square, 0.0), vt)
-    return inverse, gram + outside * jnp.eye(matrix.shape[1], dtype=matrix.dtype), space
-
-
-@_by_singular_values.defjvp
-def _by_singular_values_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
-    """Return the derivatives of the inverse, the Gram inverse K and the projector S.
-
-    Damped: those of K A', K and I - damping K. Undamped: at constant rank, by Golub and Pereyra (1973).
-    """
-    (a, cutoff, damping), (da, _, d_damping) = primals, tangents
-    D, K, S = _by_singular_values(a, cutoff, damping)
-    damped = damping > 0.0
-    wide = da.T - product(product(da.T, a), D)  # da' (I - A D)
-    tall = product(da.T, product(D.T, D))
-    tall = jnp.where(damped, 0.0, tall - product(D, product(a, tall)))  # (I - D A) da' D' D
-    dD = product(K, wide) - product(D, product(da, D)) + tall - d_damping * product(K, D)
-    half = product(D, product(da, K))  # K A' dA K
-    undamped = product(dD, D.T)  # K = D D'
-    dK = jnp.where(damped, -half - half.T - d_damping * product(K, K), undamped + undamped.T)
-    dS = jnp.where(damped, damping * (half + half.T) - d_damping * product(K, S), _space_rate(S, D, da))
-    return (D, K, S), (dD, dK, dS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -76,11 +77,6 @@ class Level(eqx.Module):
         """Return the Euclidean norm of each row, (m,)."""
         return jnp.sqrt(jnp.sum(self.matrix**2, -1))
 
-    @property
-    def size(self) -> Float[Array, ""]:
-        """Return the Euclidean norm of the longest row."""
-        return jnp.max(self.length, initial=0.0)
-
     def scaled(self) -> Level:
         """Return the level with the square roots of the weights multiplied in; a weight of 0 removes its row."""
         if self.weight is None:
@@ -102,19 +98,48 @@ class Level(eqx.Module):
         lower, upper, unordered = ordered_bounds(self.lower, jnp.where(known, self.lower, self.upper))
         return Level(self.matrix, lower, upper, self.weight, self.equalities), unordered
 
-    def padded(self, rows: int) -> Level:
-        """Return the level of weight 1 with rows of zeros up to a count; these are unbounded, so met everywhere."""
+    def padded(self, rows: int, equal: Bool[Array, " m"]) -> PaddedLevel:
+        """Return the rows of a level of weight 1, then rows of zeros without bounds, which are met everywhere."""
         more = rows - len(self.lower)
-        return Level(
+        return PaddedLevel(
             jnp.pad(self.matrix, ((0, more), (0, 0))),
             jnp.pad(self.lower, (0, more), constant_values=-jnp.inf),
             jnp.pad(self.upper, (0, more), constant_values=jnp.inf),
+            jnp.pad(equal, (0, more)),
         )
 
     def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Return A x minus the nearest point of its interval: the slack, 0 where the row holds, (m,)."""
         value = apply(self.matrix, x)
         return value - jnp.clip(value, self.lower, self.upper)
+
+
+class PaddedLevel(NamedTuple):
+    """Rows of a level with weights multiplied in, padded to the number of rows of the longest level.
+
+    Which rows are equalities is decided once and never read off the bounds again: XLA may compute one bound twice, and
+    round it in two ways.
+    """
+
+    matrix: Float[Array, "m n"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+    equal: Bool[Array, " m"]
+
+    @property
+    def length(self) -> Float[Array, " m"]:
+        """Return the Euclidean norm of each row, (m,)."""
+        return jnp.sqrt(jnp.sum(self.matrix**2, -1))
+
+    @property
+    def size(self) -> Float[Array, ""]:
+        """Return the Euclidean norm of the longest row."""
+        return jnp.max(self.length, initial=0.0)
+
+    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Return A x minus the nearest point of its interval; a clip would halve the derivative at equalities."""
+        value = apply(self.matrix, x)
+        return value - jnp.where(self.equal, self.lower, jnp.clip(value, self.lower, self.upper))
 
 
 def bounds_exist(lower: Array, upper: Array) -> Bool[Array, ""]:

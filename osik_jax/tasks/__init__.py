@@ -1,11 +1,9 @@
 """Tasks: errors, Jacobians and wanted velocities."""
 
-from ._angular_momentum import AngularMomentumTask as AngularMomentumTask
-from ._axis_align import AxisAlignTask as AxisAlignTask
 from ._com import ComTask as ComTask
-from ._contact import ContactTask as ContactTask
 from ._equality_constraint import EqualityConstraintTask as EqualityConstraintTask
 from ._frame import FrameTask as FrameTask
+from ._frame import RelativeFrameTask as RelativeFrameTask
 from ._function import FunctionTask as FunctionTask
 from ._gain import AdaptiveGain as AdaptiveGain
 from ._joint_coupling import JointCouplingTask as JointCouplingTask
@@ -13,14 +11,16 @@ from ._joint_velocity import DampingTask as DampingTask
 from ._joint_velocity import FreezeTask as FreezeTask
 from ._joint_velocity import JointVelocityTask as JointVelocityTask
 from ._joint_velocity import LowAccelerationTask as LowAccelerationTask
-from ._kinetic_energy import KineticEnergyTask as KineticEnergyTask
 from ._limit import LimitTask as LimitTask
-from ._look_at import LookAtTask as LookAtTask
 from ._manipulability import ManipulabilityTask as ManipulabilityTask
+from ._momentum import AngularMomentumTask as AngularMomentumTask
+from ._momentum import KineticEnergyTask as KineticEnergyTask
+from ._plane import ContactTask as ContactTask
+from ._plane import WheelTask as WheelTask
+from ._pointing import AxisAlignTask as AxisAlignTask
+from ._pointing import LookAtTask as LookAtTask
 from ._polygon import SupportPolygon as SupportPolygon
 from ._polygon import support_polygon as support_polygon
 from ._posture import PostureTask as PostureTask
-from ._relative_frame import RelativeFrameTask as RelativeFrameTask
 from ._task import Task as Task
 from ._task import TaskRows as TaskRows
-from ._wheel import WheelTask as WheelTask

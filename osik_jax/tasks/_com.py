@@ -21,12 +21,12 @@ from ..kinematics._forward import body_masses, moving_center
 from ..kinematics._kernels import Call, center_arguments
 from ..numerics._host import on_host, to_jax
 from ..robot import Robot
-from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
 from ._curvature import jacobian_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_array, as_bounds, as_vector, as_weight, check_finite, home_kinematics
+from ._gain import AdaptiveGain
+from ._leaves import as_array, as_vector, check_finite, home_kinematics
 from ._polygon import SupportPolygon
-from ._task import CENTER, DEFAULT_GAIN, CoreCard, Task, TaskRows, check_priority
+from ._pose import Fields, equality_rows, fields_by_core, fields_of
+from ._task import CENTER, DEFAULT_GAIN, CoreCard, Task, TaskRows
 
 
 class ComTask(Task):
@@ -49,8 +49,6 @@ class ComTask(Task):
         subtree: name of a body: the centre of mass of it and all that hangs from it. Default: the whole robot.
         weight: of each squared row: a scalar, or one for each axis or edge of the polygon.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such body.
@@ -89,17 +87,14 @@ class ComTask(Task):
         if subtree is not None:
             robot.tree.frame(subtree)
         self.axes, self.subtree = check_axes(axes), subtree
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.gain = as_gain(gain, dtype)
-        self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
-        self.polygon = None if polygon is None else _cast(polygon, dtype)
-        self.weight = as_weight(weight, self._weight_rows, dtype)
+        self.polygon = None if polygon is None else _cast(polygon, robot.q0.dtype)
+        dtype = self._set_up(robot, weight, priority, hard, gain)
         self.target = self.target_velocity = None
+        has_target = self._set_bounds(target, lower, upper, len(axes), dtype)
         if polygon is None:
             velocity = 0.0 if target_velocity is None else target_velocity
             self.target_velocity = along_axes(velocity, self.axes, "target_velocity", dtype)
-            if self.lower is None:
+            if has_target:
                 point = center_of_mass(robot, home_kinematics(robot), subtree) if target is None else target
                 self.target = along_axes(point, self.axes, "target", dtype)
 
@@ -112,10 +107,7 @@ class ComTask(Task):
             return equality_rows(*_by_kernel(self, *alike))
         return self._plain_rows(robot, kinematics)
 
-    def core(self, robot: Robot) -> CoreCard | str:
-        """Return the card of the centre of mass."""
-        if type(self) is not ComTask:
-            return super().core(robot)
+    def _card(self, robot: Robot) -> CoreCard | str:
         tree, edges = robot.tree, self.polygon is not None
         rows = self.polygon.offsets.shape[-1] if self.polygon is not None else len(self.axes)
         axes = [0] * rows if edges else axis_numbers(self.axes).tolist()
@@ -230,12 +222,9 @@ def check_axes(axes: str) -> str:
 
 
 def _check_exclusive(target: Any, velocity: Any, lower: Any, upper: Any, polygon: Any, axes: str) -> None:
-    bounds = lower is not None or upper is not None
-    if target is not None and bounds:
-        raise OsikTypeError("a ComTask has a target or bounds (lower, upper), not both")
     if polygon is None:
         return
     if not isinstance(polygon, SupportPolygon):
         raise OsikTypeError(f"polygon is a SupportPolygon (see support_polygon), got {type(polygon).__name__}")
-    if target is not None or velocity is not None or bounds or axes != "xyz":
+    if any(given is not None for given in (target, velocity, lower, upper)) or axes != "xyz":
         raise OsikTypeError("a ComTask with a polygon takes no target, target_velocity, lower, upper or axes")

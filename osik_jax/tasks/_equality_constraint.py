@@ -26,10 +26,9 @@ from ..robot._tree import KinematicTree
 from ..robot.loading._equalities import KINDS, constraint_ends, is_in_tree
 from ..robot.loading._mjmodel import element_names
 from ._curvature import jacobian_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_weight
+from ._gain import AdaptiveGain
 from ._rotation import cross_matrix
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 _Rows = tuple[Float[Array, " m"], Float[Array, "m nv"]]
 
@@ -64,8 +63,6 @@ class EqualityConstraintTask(Task):
             joints.
         weight: of each squared row: a scalar, or one for each constraint.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such constraint.
@@ -97,10 +94,7 @@ class EqualityConstraintTask(Task):
     ):
         chosen = _selected(robot, constraints)
         self.constraints = tuple(_structure(robot, e) for e in chosen)
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.weight = as_weight(weight, self._weight_rows, dtype)
-        self.gain = as_gain(gain, dtype)
+        dtype = self._set_up(robot, weight, priority, hard, gain)
         model = robot.mj_model
         kinds = [constraint.kind for constraint in self.constraints]
         spatial = [e for e, kind in zip(chosen, kinds, strict=True) if kind != "joint"]
@@ -114,8 +108,8 @@ class EqualityConstraintTask(Task):
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return 3, 6 or 1 rows per connect, weld or joint constraint."""
-        by_kind = {"joint": iter(self._joint_rows(robot, q)), **self._spatial_rows(robot, kinematics)}
-        parts = [next(by_kind[constraint.kind]) for constraint in self.constraints]
+        joints, spatial = iter(self._joint_rows(robot, q)), iter(self._spatial_rows(robot, kinematics))
+        parts = [next(joints if constraint.kind == "joint" else spatial) for constraint in self.constraints]
         error, jacobian = (jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
         counts = np.array([len(own) for own, _ in parts])
         # one weight for each constraint, which its 3, 6 or 1 rows share
@@ -133,11 +127,11 @@ class EqualityConstraintTask(Task):
     def _weight_rows(self) -> int:
         return len(self.constraints)
 
-    def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> dict[str, Any]:
-        """Return the parts of the rows of connects and welds."""
+    def _spatial_rows(self, robot: Robot, kinematics: Kinematics) -> list[_Rows]:
+        """Return the rows of each connect and weld."""
         spatial = [constraint for constraint in self.constraints if constraint.kind != "joint"]
         if not spatial:
-            return {}
+            return []
         frames = [frame for constraint in spatial for frame in constraint.ends]
         origins, turns = kinematics.frame_poses(robot, frames)
         arms = rotate(turns, self.anchors.reshape(-1, 3))
@@ -146,13 +140,12 @@ class EqualityConstraintTask(Task):
         points, linear, angular, turns = (
             a.reshape(len(spatial), 2, *a.shape[1:]) for a in (origins + arms, linear, jacobians[:, 3:], turns)
         )
-        apart = list(zip(points[:, 0] - points[:, 1], linear[:, 0] - linear[:, 1], strict=True))
-        kinds = [constraint.kind for constraint in spatial]
-        at = [place for place, kind in enumerate(kinds) if kind == "weld"]
-        turned = [self._turned(k, turns[place], angular[place]) for k, place in enumerate(at)]
-        welds = [_joined(apart[place], rotation) for place, rotation in zip(at, turned, strict=True)]
-        connects = [rows for rows, kind in zip(apart, kinds, strict=True) if kind == "connect"]
-        return {"connect": iter(connects), "weld": iter(welds)}
+        rows = list(zip(points[:, 0] - points[:, 1], linear[:, 0] - linear[:, 1], strict=True))
+        welds = [place for place, constraint in enumerate(spatial) if constraint.kind == "weld"]
+        for weld, place in enumerate(welds):
+            turned = self._turned(weld, turns[place], angular[place])
+            rows[place] = jnp.concatenate([rows[place][0], turned[0]]), jnp.concatenate([rows[place][1], turned[1]])
+        return rows
 
     def _turned(self, weld: int, turns: Float[Array, "2 3 3"], angular: Float[Array, "2 3 nv"]) -> _Rows:
         """Return the rotation rows of a weld."""
@@ -178,10 +171,6 @@ class EqualityConstraintTask(Task):
                 jacobian = jacobian - derivative * _column(tree, other, q.dtype)
             rows.append((error[None], independent_columns(tree, jacobian)[None]))
         return rows
-
-
-def _joined(a: _Rows, b: _Rows) -> _Rows:
-    return jnp.concatenate([a[0], b[0]]), jnp.concatenate([a[1], b[1]])
 
 
 def _qpos(tree: KinematicTree, joint: str) -> int:

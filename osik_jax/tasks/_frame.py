@@ -1,16 +1,19 @@
-"""A task on the pose of a frame."""
+"""Tasks on the pose of a frame, in the world or in another frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from .._errors import OsikValueError
 from ..execution._backends import Backend
 from ..execution._computed import by_kernel, side_by_side
 from ..kinematics import Kinematics
@@ -18,11 +21,19 @@ from ..kinematics._forward import moving_frames
 from ..kinematics._kernels import Call, dof_columns
 from ..kinematics._pose_forms import PoseLike
 from ..robot import Robot
-from ._core_rows import Fields, equality_rows, fields_by_core
+from ._bases import Frames
 from ._gain import AdaptiveGain
-from ._leaves import home_kinematics
-from ._pose import RADIAN, PoseTask, goal_arguments, pose_fields
-from ._task import DEFAULT_GAIN, CoreCard, TaskRows
+from ._pose import (
+    RADIAN,
+    Fields,
+    PoseTask,
+    equality_rows,
+    fields_by_core,
+    goal_arguments,
+    pose_fields,
+)
+from ._rotation import cross_matrix, dot
+from ._task import DEFAULT_GAIN, TaskRows
 
 
 class FrameTask(PoseTask):
@@ -66,56 +77,13 @@ class FrameTask(PoseTask):
             the task can be met; where it cannot, they weigh the residual across the error's axis differently, by a
             factor (angle/2) / sin(angle/2), at most pi/2.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame.
         ValueError: a wrong shape, a rotation that is not one, a negative weight, lower > upper, an unknown option.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        frame: str,
-        *,
-        target: PoseLike | None = None,
-        target_velocity: ArrayLike | Array | None = None,
-        lower: ArrayLike | Array | None = None,
-        upper: ArrayLike | Array | None = None,
-        position_weight: ArrayLike | Array = 1.0,
-        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
-        orientation_weight: ArrayLike | Array = RADIAN**2,
-        weight: ArrayLike | Array = 1.0,
-        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
-        axes: Literal["world", "frame"] | None = None,
-        error: Literal["decoupled", "se3"] = "decoupled",
-        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
-        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
-        priority: int = 1,
-        hard: bool = False,
-    ):
-        robot.tree.frame(frame)
-        super().__init__(
-            robot,
-            frame,
-            home=home_kinematics(robot).frame_pose(robot, frame),
-            target=target,
-            target_velocity=target_velocity,
-            lower=lower,
-            upper=upper,
-            position_weight=position_weight,
-            orientation_weight=orientation_weight,
-            weight=weight,
-            rows=rows,
-            axes=axes,
-            outer_axes="world",
-            error=error,
-            orientation_jacobian=orientation_jacobian,
-            gain=gain,
-            priority=priority,
-            hard=hard,
-        )
+    __init__, _card = PoseTask.__init__, PoseTask._card
 
     @property
     def frames(self) -> tuple[str, ...]:
@@ -129,10 +97,6 @@ class FrameTask(PoseTask):
             return equality_rows(*_by_kernel(self, robot, replace(kinematics, backend="jax")))
         return super().rows(robot, kinematics, q)
 
-    def core(self, robot: Robot) -> CoreCard | str:
-        """Return the card of a pose, or in words why there is none."""
-        return self._core_card(robot) if type(self) is FrameTask else super().core(robot)
-
     def grip(self) -> tuple[Array, Array | None] | None:
         """Return the target's pose, or None if the task has bounds."""
         position, rotation = self.target
@@ -142,19 +106,94 @@ class FrameTask(PoseTask):
         """Return the target at a pose; a target that does not turn keeps its rotation."""
         return position, rotation if any(self.kept[3:]) else self.target[1]
 
-    def rows_at(
-        self,
-        positions: Float[Array, "1 3"],
-        rotations: Float[Array, "1 3 3"],
-        jacobians: Float[Array, "1 6 nv"],
-        backend: Backend = "jax",
-    ) -> TaskRows:
+    def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
-        return self.pose_rows(positions[0], rotations[0], jacobians[0], backend)
+        return self.pose_rows(frames.positions[0], frames.rotations[0], frames.jacobians[0], backend)
 
     def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
         del q
         return dict(target=kinematics.frame_pose(robot, self.frame))
+
+
+class RelativeFrameTask(PoseTask):
+    """Task that brings a frame to a pose in another frame, its root, or keeps it within bounds around one.
+
+    A ``FrameTask`` whose world is the root: p and R are the frame's pose in the root, ``p = R_r' (p_f - p_r)`` and
+    ``R = R_r' R_f``, with the Jacobians ``R_r' (J_f,lin - J_r,lin + [p_f - p_r] J_r,ang)`` and
+    ``R_r' (J_f,ang - J_r,ang)``. The robot may move either of the two, or both as one: two hands on one tray, a foot
+    under the pelvis.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        root: the frame that the pose is in; another one.
+        target: the pose in the root, in any of the forms that ``FrameTask`` takes; default: what holds at
+            ``robot.q0``.
+        target_velocity: of the target in the root, (6,), [linear; angular] in the root's axes [m/s, rad/s]; default 0.
+        axes: ``"root"`` or ``"frame"``; default: the root's, the frame's for ``error="se3"``.
+        lower: this and all others as those of a ``FrameTask``.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: frame and root are the same, a wrong shape, a rotation that is not one, a negative weight,
+            lower > upper, an unknown option.
+    """
+
+    outer_axes: ClassVar[str] = "root"
+    root: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        root: str,
+        *,
+        target: PoseLike | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
+        orientation_weight: ArrayLike | Array = RADIAN**2,
+        weight: ArrayLike | Array = 1.0,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
+        axes: Literal["root", "frame"] | None = None,
+        error: Literal["decoupled", "se3"] = "decoupled",
+        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        options = {name: given for name, given in locals().items() if name not in ("self", "robot", "frame", "root")}
+        robot.tree.frame(frame)
+        robot.tree.frame(root)
+        if frame == root:
+            raise OsikValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
+        self.root = root
+        PoseTask.__init__(self, robot, frame, **options)
+
+    _card = PoseTask._card
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Return the name of the frame, then of its root."""
+        return self.frame, self.root
+
+    def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
+        """Return the chosen rows in the order x, y, z, rotation x, y, z. (m <= 6)."""
+        positions, rotations, (frame, root) = frames
+        turn = rotations[1].T
+        apart = positions[0] - positions[1]
+        # seen from a root that turns by w, a point at rest moves by apart x w
+        linear = frame[:3] - root[:3] + dot(cross_matrix(apart), root[3:])
+        jacobian = jnp.concatenate([dot(turn, linear), dot(turn, frame[3:] - root[3:])])
+        return self.pose_rows(dot(turn, apart), dot(turn, rotations[0]), jacobian, backend)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        del q
+        positions, rotations = kinematics.frame_poses(robot, self.frames)
+        turn = rotations[1].T
+        return dict(target=(dot(turn, positions[0] - positions[1]), dot(turn, rotations[0])))
 
 
 def _fields(task: FrameTask, robot: Robot, kinematics: Kinematics) -> Fields:

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -21,9 +21,9 @@ from ..kinematics._rates import kinematics_rates
 from ..numerics._host import to_jax
 from ..robot import Robot
 from ._curvature import jacobian_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_vector, as_weight
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._gain import AdaptiveGain
+from ._leaves import as_vector
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 Function = Callable[[Robot, Kinematics, Float[Array, " nq"]], Float[Array, " m"] | Float[Array, ""]]
 
@@ -38,9 +38,9 @@ class FunctionTask(Task):
     - a target: ``e = x - target``, ``e' = J v - target'``, asked to be ``-gain(e) e``;
     - bounds: ``gain (lower - x) <= J v - target' <= gain (upper - x)``.
 
-    A function that is a pytree, such as an ``equinox.Module`` with ``__call__``, may change its numbers (arrays and
-    floats; integers are static) without compiling: ``task.replace(function=...)``. Any other function compiles once for
-    each object: define it once and keep it, for a lambda made anew in a loop compiles anew.
+    The numbers of a function that is a pytree, such as an ``equinox.Module`` with ``__call__``, are traced (arrays and
+    floats; integers are static): a new task of such a function with other numbers compiles nothing. Any other function
+    compiles once for each object: define it once and keep it, for a lambda made anew in a loop compiles anew.
 
     Args:
         robot: the robot.
@@ -52,8 +52,6 @@ class FunctionTask(Task):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         weight: of each squared row: a scalar, or one for each.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: a target and bounds, or a function that is none.
@@ -85,20 +83,14 @@ class FunctionTask(Task):
         if not callable(function):
             raise OsikTypeError(f"function is a {type(function).__name__}; it is called with (robot, kinematics, q)")
         _check_signature(function)
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
+        dtype, rows = robot.q0.dtype, _length(robot, function)
         numbers, self.structure = taken_apart(function)
         self.numbers = jax.tree.map(lambda a: to_jax(a, dtype if isinstance(a, float) else None), numbers)
-        self.gain = as_gain(gain, dtype)
-        rows = _length(robot, function)
-        self.weight = as_weight(weight, rows, dtype)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
-        self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
-        if target is not None and self.lower is not None:
-            raise OsikTypeError("a FunctionTask has a target or bounds (lower, upper), not both")
+        self._set_up(robot, weight, priority, hard, gain)
         self.target = None
-        if self.lower is None:
+        if self._set_bounds(target, lower, upper, rows, dtype):
             self.target = as_vector(0.0 if target is None else target, (rows,), "target", dtype)
 
     @property
@@ -141,38 +133,10 @@ class FunctionTask(Task):
             return super()._held(robot, kinematics, q)
         return dict(target=jnp.atleast_1d(self.function(robot, kinematics, q)))
 
-    def replace(self, **changes: Any) -> Self:
-        """Return the task with other numbers; ``function`` takes one of the same structure (see ``Task.replace``).
-
-        Raises:
-            TypeError: a name that is not one of this task's numbers, or a function of another structure.
-            ValueError: a wrong shape or value.
-        """
-        if "function" not in changes or "function" not in self.replaceable:
-            return super().replace(**changes)
-        numbers = self._numbers(changes.pop("function"))
-        return eqx.tree_at(lambda task: task.numbers, self, numbers).replace(**changes)
-
     @property
     def replaceable(self) -> tuple[str, ...]:
-        """Return the names that ``replace`` accepts; ``function`` is among them if it has numbers."""
-        names = super().replaceable
-        own = ("function",) if jax.tree.leaves(self.numbers) else ()
-        return tuple(name for name in names if name != "numbers") + own
-
-    def _numbers(self, function: Any) -> Any:
-        """Return the numbers of a new function of the present structure, in the dtypes of the present numbers."""
-        numbers, structure = taken_apart(function)
-        if structure != self.structure:
-            raise OsikTypeError(
-                "the function's structure differs, not its numbers alone (an integer is structure: write 0.0 for 0); "
-                "make another FunctionTask of it"
-            )
-        new = jax.tree.map(lambda old, a: to_jax(a, old.dtype), self.numbers, numbers)
-        for old, a in zip(jax.tree.leaves(self.numbers), jax.tree.leaves(new), strict=True):
-            if a.shape != old.shape:
-                raise OsikValueError(f"an array of the function has shape {a.shape}, expected {old.shape}")
-        return new
+        """Return the names that ``replace`` accepts; a function of other numbers takes another task."""
+        return tuple(name for name in super().replaceable if name != "numbers")
 
 
 def _check_signature(function: Function) -> None:

@@ -18,10 +18,10 @@ from ..numerics._host import to_jax
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, is_scalar, select_joints
 from ._curvature import no_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector
+from ._gain import AdaptiveGain
+from ._leaves import as_vector
 from ._rotation import dot
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 
 class JointCouplingTask(Task):
@@ -41,8 +41,6 @@ class JointCouplingTask(Task):
         upper: upper bound; one of the two may be left out.
         weight: of the squared row.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -75,18 +73,12 @@ class JointCouplingTask(Task):
     ):
         by_joint = _by_joint(robot, ratios)
         self.joints = tuple(by_joint)
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
+        dtype = self._set_up(robot, weight, priority, hard, gain)
         self.ratios = to_jax(list(by_joint.values()), dtype)
-        self.weight = as_scalar(weight, "weight", dtype)
-        self.gain = as_gain(gain, dtype)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (1,), "target_velocity", dtype)
-        self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
-        if target is not None and self.lower is not None:
-            raise OsikTypeError("a JointCouplingTask has a target or bounds (lower, upper), not both")
         self.target = None
-        if self.lower is None:
+        if self._set_bounds(target, lower, upper, 1, dtype):
             self.target = as_vector(0.0 if target is None else target, (1,), "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:

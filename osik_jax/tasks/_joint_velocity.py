@@ -15,10 +15,9 @@ from .._errors import OsikValueError
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, select_all
-from ._background import background_weight
-from ._leaves import WeightLike, as_joint_weight, as_scalar, as_vector
-from ._stay import MotionTask
-from ._task import TaskRows, check_priority
+from ._bases import MotionTask
+from ._leaves import WeightLike, as_vector, background_weight, joint_weight
+from ._task import TaskRows
 
 
 class VelocityTask(MotionTask):
@@ -31,13 +30,21 @@ class VelocityTask(MotionTask):
     joints: tuple[int, ...] = eqx.field(static=True)
     row_count: int = eqx.field(static=True)
 
-    def __init__(self, robot: Robot, joints: Iterable[str] | None, *, weight: WeightLike, priority: int, hard: bool):
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: WeightLike | None = None,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        # by default far below a goal's weight: at the same weight calm would be bought with errors of the goals
+        weight = background_weight(robot) if weight is None else weight
         self.joints = tuple(select_all(robot, joints))
-        self.priority, self.hard = check_priority(priority), hard
         dofs = dofs_of(robot, self.joints)
         self.row_count = len(dofs)
-        self.weight = as_joint_weight(robot, weight, dofs)
-        self.gain = as_scalar(0.0, "gain", robot.q0.dtype)
+        self._set_up(robot, joint_weight(robot, weight, dofs), priority, hard)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
         """Return the wanted velocities of the chosen dofs [rad/s or m/s]: 0 unless a subclass says otherwise."""
@@ -76,12 +83,8 @@ class DampingTask(VelocityTask):
 
     Args:
         robot: the robot.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -89,19 +92,7 @@ class DampingTask(VelocityTask):
     """
 
     calms: ClassVar[bool] = True
-
-    def __init__(
-        self,
-        robot: Robot,
-        *,
-        joints: Iterable[str] | None = None,
-        weight: WeightLike | None = None,
-        priority: int = 1,
-        hard: bool = False,
-    ):
-        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
-        weight = background_weight(robot) if weight is None else weight
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+    __init__ = VelocityTask.__init__
 
 
 class FreezeTask(VelocityTask):
@@ -113,10 +104,7 @@ class FreezeTask(VelocityTask):
     Args:
         robot: the robot.
         joints: names and globs, e.g. ``("Head*", "LElbowRoll")``; the free base by its name.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
+        weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -134,7 +122,7 @@ class FreezeTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         if not self.joints:
             raise OsikValueError("a FreezeTask needs at least one joint")
 
@@ -147,12 +135,8 @@ class JointVelocityTask(VelocityTask):
         target: the velocities [rad/s or m/s], one for each row, or a scalar. Rows are in the order of v; ball joints
             have angular velocities in their own axes, a free base linear ones in the world's and angular ones in its
             own.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms of a ``PostureTask``'s; default 1.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -171,7 +155,7 @@ class JointVelocityTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         self.target = as_vector(target, (self.row_count,), "target", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:
@@ -192,12 +176,8 @@ class LowAccelerationTask(VelocityTask):
     Args:
         robot: the robot.
         velocity: that of the step before (nv,) [rad/s or m/s], or a scalar; default 0, a robot at rest.
-        joints: names and globs, e.g. ``("Head*", "LElbowRoll")``. Default: all but the free base, which has to be named
-            to take part.
-        weight: of each squared row: a scalar, one for each row or for each entry of v, or a mapping from joint names or
-            globs to weights, in which a joint that is not named has 0. Default: as that of a ``PostureTask``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
+        joints: names and globs, as of a ``PostureTask``; default: all but the free base.
+        weight: of each squared row, in the forms and with the default of a ``PostureTask``'s.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower.
@@ -218,9 +198,7 @@ class LowAccelerationTask(VelocityTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        # far below a goal's weight: at the same weight calm would be bought with errors of the goals
-        weight = background_weight(robot) if weight is None else weight
-        super().__init__(robot, joints, weight=weight, priority=priority, hard=hard)
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
         self.velocity = as_vector(velocity, (robot.nv,), "velocity", robot.q0.dtype)
 
     def wanted(self, dofs: list[int]) -> Float[Array, " m"]:

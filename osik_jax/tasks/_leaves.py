@@ -19,11 +19,13 @@ from ..numerics._arguments import as_scalar as as_scalar
 from ..numerics._arguments import as_vector as as_vector
 from ..numerics._arguments import check_bounds as check_bounds
 from ..numerics._arguments import check_finite as check_finite
+from ..numerics._arguments import check_not_nan
 from ..numerics._arguments import check_not_negative as check_not_negative
 from ..numerics._arguments import concrete as concrete
 from ..numerics._host import on_host, repeated
 from ..robot import Robot
 from ..robot._joint_selection import dof_values
+from ..robot._size import robot_size
 
 WeightLike = ArrayLike | Array | Mapping[str, float]
 """One weight, one per row, or weights by joint name."""
@@ -47,16 +49,39 @@ def as_weight(value: Any, rows: int | None, dtype: Any, *, like: tuple[int, ...]
     if out.shape not in ((), (rows,)):
         each = "" if rows is None else f", or ({rows},): one for each row"
         raise OsikValueError(f"weight has shape {out.shape}, expected a scalar{each}. Batch with jax.vmap.")
+    check_not_nan(out, "weight")
     check_not_negative(out, "weight")
     return out if out.shape else repeated(out, like)
 
 
-def as_joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Float[Array, "..."]:
-    """Return one weight per row of some dofs.
-
-    It is given as a scalar, in the order of these rows, in the order of v, or by joint names.
-    """
-    dtype = robot.q0.dtype
+def joint_weight(robot: Robot, value: Any, dofs: list[int]) -> Any:
+    """Return a weight of the rows of some dofs that is given by joint names or in the order of v; others unchanged."""
     if isinstance(value, Mapping) or (np.shape(value) == (robot.nv,) and len(dofs) != robot.nv):
-        value = on_host(dof_values(robot, value, np.zeros(robot.nv), "weight"))[np.array(dofs, int)]
-    return as_weight(value, len(dofs), dtype)
+        return on_host(dof_values(robot, value, np.zeros(robot.nv), "weight"))[np.array(dofs, int)]
+    return value
+
+
+_BACKGROUND = 1e-4
+"""Default weight of a background task: small against the positions and, 100 times less so, orientations of a pose."""
+_FULL_SIZE = 0.5
+"""Robot size [m] from which joint angles have their full weight."""
+_LEAST_SIZE = 0.016
+"""Robot size [m] below which the weight stays constant, so that it stays above the schemes' damping."""
+
+
+def background_weight(robot: Robot) -> Float[Array, ""] | float:
+    """Return the default weight of background rows of joint angles: 1e-4 for robots of half a metre or more.
+
+    A joint moves a frame by its angle times a lever arm, so squared angles outweigh squared distances on a small robot.
+    Below half a metre the weight falls with the square of the robot's size (``robot_size``).
+    """
+    return _BACKGROUND * angle_scale(robot)
+
+
+def angle_scale(robot: Robot) -> Float[Array, ""] | float:
+    """Return the factor on weights of joint angles relative to distances: 1 for robots of half a metre or more."""
+    size = robot_size(robot)
+    if isinstance(size, float):
+        # squared, because weights multiply squared errors
+        return min(max(size / _FULL_SIZE, _LEAST_SIZE / _FULL_SIZE), 1.0) ** 2
+    return jnp.clip(size / _FULL_SIZE, _LEAST_SIZE / _FULL_SIZE, 1.0) ** 2

@@ -18,7 +18,7 @@ from ..robot import Robot
 from ..robot._made_for import check_made_for
 from ._gain import evaluate_gain
 from ._leaves import as_scalar
-from ._task import Task, TaskRows, check_priority
+from ._task import Task, TaskRows
 
 
 class LimitTask(Task):
@@ -32,8 +32,6 @@ class LimitTask(Task):
         robot: the robot.
         limit: any limit.
         weight: of each squared row [rad/s, m/s, or the unit of the limit's row].
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: something that is no limit.
@@ -56,11 +54,7 @@ class LimitTask(Task):
             raise OsikTypeError(f"limit is a {type(limit).__name__}, not a Limit")
         check_made_for(limit, robot, "limit")
         self.limit = limit
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
-        self.gain = as_scalar(0.0, "gain", dtype)
-        self.dt = as_scalar(1.0, "dt", dtype)
+        self.dt = as_scalar(1.0, "dt", self._set_up(robot, weight, priority, hard))
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per dof, then the limit's rows, for the step of ``during`` (1 s by default)."""

@@ -18,10 +18,10 @@ from ..numerics._constants import ROW_ROUNDOFF
 from ..robot import Robot
 from ..robot._joint_selection import select_all
 from ..robot._tree import DOF_WIDTH, KinematicTree
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector
+from ._gain import AdaptiveGain
+from ._leaves import as_vector
 from ._pose import option, row_mask
-from ._task import DEFAULT_GAIN, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, Task, TaskRows
 
 
 class ManipulabilityTask(Task):
@@ -57,8 +57,6 @@ class ManipulabilityTask(Task):
         log: whether x is ln m.
         weight: of each squared row.
         gain: [1/s], a number or an ``AdaptiveGain``; without target and bounds, the speed for a gradient of 1.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such frame or joint.
@@ -104,14 +102,8 @@ class ManipulabilityTask(Task):
                 f"{len(self.dofs)} dofs of the chosen joints move {frame!r}, which cannot go {sum(self.kept)} ways: "
                 "its manipulability is 0 everywhere. Choose fewer rows or more joints"
             )
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.weight = as_scalar(weight, "weight", dtype)
-        self.gain = as_gain(gain, dtype)
-        self.lower, self.upper = as_bounds(lower, upper, 1, dtype)
-        if target is not None and self.lower is not None:
-            raise OsikTypeError("a ManipulabilityTask has a target or bounds (lower, upper), not both")
-        climbs = target is None and self.lower is None
+        dtype = self._set_up(robot, weight, priority, hard, gain)
+        climbs = self._set_bounds(target, lower, upper, 1, dtype) and target is None
         if climbs and target_velocity is not None:
             raise OsikTypeError("a target_velocity is that of a target or of bounds; there are none")
         velocity = 0.0 if target_velocity is None else target_velocity

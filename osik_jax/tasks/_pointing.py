@@ -1,10 +1,12 @@
-"""Common parts of tasks that point a frame's axis: the angle to a direction, as two rows or as a cone."""
+"""Tasks that point a frame's axis along a direction or at a point: the angle to it, as two rows or as a cone."""
 
 from __future__ import annotations
 
+import abc
 import math
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,16 +15,18 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
+from ..execution._backends import Backend
+from ..kinematics import Kinematics
 from ..numerics._constants import POINTING_SINE_SQUARED
 from ..numerics._guarded import safe_norm
-from ..numerics._host import Numbers, module_of
+from ..numerics._host import Numbers, module_of, on_host
 from ..robot import Robot
+from ._bases import FramedTask, Frames
 from ._curvature import jacobian_curvature
-from ._framed import FramedTask
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_scalar, as_vector, concrete
-from ._rotation import dot
-from ._task import TaskRows, check_priority
+from ._gain import AdaptiveGain
+from ._leaves import as_vector, concrete, home_kinematics
+from ._rotation import cross_matrix, dot
+from ._task import DEFAULT_GAIN, TaskRows
 
 _BEHIND = -0.5
 """Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
@@ -30,6 +34,8 @@ plus the cosine.
 """
 _LEAST_SINE = 0.1
 """Least sine of the error's angle that is divided by; angle / sine has no bound near the opposite direction."""
+_NEAREST = 1e-3
+"""Distance [m] below which there is no line of sight."""
 _TIP = 0.01
 """Angle [rad] below which a cone's angle is rounded off, so that its gradient is 0 at 0."""
 
@@ -60,26 +66,37 @@ class PointingTask(FramedTask):
         self,
         robot: Robot,
         frame: str,
-        target_frame: str | None,
         *,
-        axis: ArrayLike | Array,
-        target: ArrayLike | Array,
-        target_velocity: ArrayLike | Array,
-        half_angle: ArrayLike | Array | None,
-        weight: ArrayLike | Array,
-        gain: ArrayLike | Array | AdaptiveGain,
-        priority: int,
-        hard: bool,
+        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
+        target: ArrayLike | Array | None = None,
+        target_frame: str | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        half_angle: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
     ):
+        for name in (frame,) if target_frame is None else (frame, target_frame):
+            robot.tree.frame(name)
+        if frame == target_frame:
+            raise OsikValueError(
+                f"frame and target_frame are both {frame!r}; the one never moves as seen from the other"
+            )
         self.frame, self.target_frame = frame, target_frame
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
+        dtype = self._set_up(robot, weight, priority, hard, gain)
         self.axis = as_direction(axis, "axis", dtype)
-        self.target = as_vector(target, (3,), "target", dtype)
-        self.target_velocity = as_vector(target_velocity, (3,), "target_velocity", dtype)
+        self.target = self._as_target(self._ahead(robot, home_kinematics(robot)) if target is None else target, dtype)
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target_velocity = as_vector(velocity, (3,), "target_velocity", dtype)
         self.half_angle = None if half_angle is None else _as_half_angle(half_angle, dtype)
-        self.weight = as_scalar(weight, "weight", dtype)
-        self.gain = as_gain(gain, dtype)
+
+    @abc.abstractmethod
+    def _ahead(self, robot: Robot, kinematics: Kinematics) -> Any:
+        """Return the default target."""
+
+    def _as_target(self, value: Any, dtype: Any) -> Float[Array, "3"]:
+        return as_vector(value, (3,), "target", dtype)
 
     def are_lengths(self, count: int) -> Bool[np.ndarray, " m"]:
         """Return that no row is in metres."""
@@ -128,18 +145,139 @@ class PointingTask(FramedTask):
     def _convert(self, name: str, value: Any) -> Any:
         if name == "axis":
             return as_direction(value, name, self.weight.dtype)
+        if name == "target":
+            return self._as_target(value, self.weight.dtype)
         if name == "half_angle":
             return _as_half_angle(value, self.weight.dtype)
         return super()._convert(name, value)
 
 
-def check_frames(robot: Robot, frame: str, target_frame: str | None) -> None:
-    """Raise KeyError if a frame does not exist, ValueError if both are the same."""
-    robot.tree.frame(frame)
-    if target_frame is not None:
-        robot.tree.frame(target_frame)
-    if frame == target_frame:
-        raise OsikValueError(f"frame and target_frame are both {frame!r}; the one never moves as seen from the other")
+class AxisAlignTask(PointingTask):
+    """Task that aligns an axis of a frame with a direction, or keeps it in a cone around one.
+
+    With R the frame's rotation and x* the direction (world), ``d = R' x*`` is the direction in the frame's axes. The
+    rows are those of a ``LookAtTask`` at a point infinitely far away: two [rad], whose norm is the angle t between the
+    axis and d. With ``half_angle`` there is one inequality row, ``t <= half_angle``: a cup that may tilt that much. The
+    turn about the axis stays free. An axis that points the opposite way is turned round about a fixed axis.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom.
+        axis: in the frame's axes, of any length.
+        target: the direction (3,), of any length, in the world's or the target frame's axes. Default: where the axis
+            points at ``robot.q0``.
+        target_frame: a frame of the robot in which the direction is fixed. Default: the world.
+        target_velocity: angular velocity of the direction (3,) [rad/s], in the same axes; default 0.
+        half_angle: makes an inequality task: half the cone's opening [rad], above 0.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: frame and target frame are the same, a wrong shape, a direction of length 0, a negative weight.
+    """
+
+    units: ClassVar[Mapping[str, str]] = {
+        "": "rad",
+        "axis": "1 (direction)",
+        "target": "1 (direction)",
+        "target_velocity": "rad/s",
+    }
+
+    __init__ = PointingTask.__init__
+
+    def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
+        """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
+        del backend
+        _, rotations, jacobians = frames
+        turn, spin = rotations[0].T, jacobians[0, 3:]
+        direction, velocity = unit(self.target), self.target_velocity
+        if self.target_frame is not None:
+            direction, velocity = dot(rotations[1], direction), dot(rotations[1], velocity)
+            # where the direction turns with another frame, the relative turn counts
+            spin = spin - jacobians[1, 3:]
+        # a direction d, seen from a frame that turns by w, changes by d x w; its own turning has the other sign
+        turned = dot(turn, cross_matrix(direction))
+        return self.pointing_rows(dot(turn, direction), dot(turned, spin), -dot(turned, velocity))
+
+    def _ahead(self, robot: Robot, kinematics: Kinematics) -> Float[Numbers, "3"]:
+        """Return the direction of the axis, in the world or in the target frame."""
+        _, rotations = kinematics.frame_poses(robot, self.frames)
+        direction = dot(rotations[0], unit(on_host(self.axis)))
+        return direction if self.target_frame is None else dot(rotations[1].T, direction)
+
+    def _as_target(self, value: Any, dtype: Any) -> Float[Array, "3"]:
+        return as_direction(value, "target", dtype)
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        del q
+        return dict(target=self._ahead(robot, kinematics))
+
+
+class LookAtTask(PointingTask):
+    """Task that points an axis of a frame at a point, or keeps the point in the frame's field of view.
+
+    With p, R the frame's pose and x* the point (world), the direction is ``d = R' (x* - p) / |x* - p|``; frame and
+    point may both move. Two rows [rad], of which the norm is the angle t between axis and line of sight; with
+    ``half_angle`` one inequality row, ``t <= half_angle``, a visual field (Ramos). Both ask for the shortest turn, and
+    the turn about the axis stays free. A point right behind is looked at by a half turn about a fixed axis. Closer
+    than 1 mm there is no line of sight, and the task asks for nothing.
+
+    Args:
+        robot: the robot.
+        frame: name of a body, link, site or geom: a camera, a head.
+        axis: what looks, in the frame's axes, of any length.
+        target: the point (3,) [m], in the world or in ``target_frame``. Default: 1 m ahead at ``robot.q0``; with a
+            ``target_frame`` its origin.
+        target_frame: a frame of the robot that carries the point, such as a hand. Default: the world.
+        target_velocity: of the point (3,) [m/s], in the world's or the target frame's axes; default 0.
+        half_angle: makes an inequality task: half the cone's opening [rad], above 0.
+        weight: of each squared row.
+        gain: [1/s], a number or an ``AdaptiveGain``.
+
+    Raises:
+        KeyError: no such frame.
+        ValueError: frame and target frame are the same, a wrong shape, an axis of length 0, a negative weight.
+    """
+
+    units: ClassVar[Mapping[str, str]] = {"": "rad", "axis": "1 (direction)", "target": "m", "target_velocity": "m/s"}
+
+    __init__ = PointingTask.__init__
+
+    def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
+        """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
+        del backend
+        positions, rotations, jacobians = frames
+        position, rotation, jacobian = positions[0], rotations[0], jacobians[0]
+        point, velocity, moves = self.target, self.target_velocity, jnp.zeros_like(jacobian[:3])
+        if self.target_frame is not None:
+            arm = dot(rotations[1], self.target)
+            point, velocity = positions[1] + arm, dot(rotations[1], self.target_velocity)
+            moves = jacobians[1, :3] - dot(cross_matrix(arm), jacobians[1, 3:])
+        line = point - position
+        squared = jnp.sum(line**2)
+        near = squared < _NEAREST**2
+        distance = jnp.sqrt(jnp.where(near, 1.0, squared))
+        sight = jnp.where(near, dot(rotation, unit(self.axis)), line / distance)
+        narrowing = (jnp.eye(3, dtype=sight.dtype) - jnp.outer(sight, sight)) / distance
+        turn = jnp.where(near, 0.0, rotation.T)
+        # the line follows the point and leaves the camera: minus its motion; seen from the turning camera, + sight x w
+        rate = dot(narrowing, moves - jacobian[:3]) + dot(cross_matrix(sight), jacobian[3:])
+        return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
+
+    def _ahead(self, robot: Robot, kinematics: Kinematics) -> Any:
+        """Return the point 1 m along the axis [m]; with a target frame, its origin."""
+        if self.target_frame is not None:
+            return 0.0
+        position, rotation = kinematics.frame_pose(robot, self.frame)
+        return position + dot(rotation, unit(on_host(self.axis)))
+
+    def _held(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> dict[str, Any]:
+        """Return the field ``target`` that the camera sees at q: a point 1 m ahead, in the frame that carries it."""
+        del q
+        positions, rotations = kinematics.frame_poses(robot, self.frames)
+        point = positions[0] + dot(rotations[0], unit(self.axis))
+        return dict(target=point if self.target_frame is None else dot(rotations[1].T, point - positions[1]))
 
 
 def as_direction(value: Any, what: str, dtype: Any) -> Float[Array, "3"]:

@@ -19,14 +19,13 @@ from ..execution._computed import by_kernel, side_by_side
 from ..kinematics._kernels import Call
 from ..kinematics._pose_forms import Pose, PoseLike, as_pose
 from ..robot import Robot
-from ._core_rows import Fields, equality_rows, fields_by_core, fields_of
+from ._bases import FramedTask
 from ._curvature import pose_curvature
-from ._framed import FramedTask
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import as_bounds, as_scalar, as_vector, check_not_negative
+from ._gain import AdaptiveGain
+from ._leaves import as_bounds, as_vector, check_not_negative, home_kinematics
 from ._repr import ROWS
 from ._rotation import cross_matrix, dot, inverse_left_jacobian, rotation_log
-from ._task import POSE, CoreCard, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, POSE, CoreCard, TaskRows
 
 RADIAN = 0.1
 """Length [m] that an error of one radian counts as in pose tasks by default, and in ``inverse_kinematics``: a hand that
@@ -60,48 +59,54 @@ class PoseTask(FramedTask):
     position_weight: Float[Array, "3"]
     orientation_weight: Float[Array, "3"]
 
+    outer_axes: ClassVar[str] = "world"
+
     def __init__(
         self,
         robot: Robot,
         frame: str,
         *,
-        home: Pose,
-        target: PoseLike | None,
-        target_velocity: ArrayLike | Array | None,
-        lower: ArrayLike | Array | None,
-        upper: ArrayLike | Array | None,
-        position_weight: ArrayLike | Array,
-        orientation_weight: ArrayLike | Array,
-        weight: ArrayLike | Array,
-        rows: Literal["pose", "position", "orientation"] | Sequence[bool],
-        axes: str | None,
-        outer_axes: str,
-        error: Literal["decoupled", "se3"],
-        orientation_jacobian: Literal["analytic", "geometric"],
-        gain: ArrayLike | Array | AdaptiveGain,
-        priority: int,
-        hard: bool,
+        target: PoseLike | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+        position_weight: ArrayLike | Array = 1.0,
+        # a square, because weights multiply squared errors: a radian counts as RADIAN metres
+        orientation_weight: ArrayLike | Array = RADIAN**2,
+        weight: ArrayLike | Array = 1.0,
+        rows: Literal["pose", "position", "orientation"] | Sequence[bool] = "pose",
+        axes: Literal["world", "root", "frame"] | None = None,
+        error: Literal["decoupled", "se3"] = "decoupled",
+        orientation_jacobian: Literal["analytic", "geometric"] = "analytic",
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
     ):
-        self.frame = frame
-        self.kept = row_mask(rows)
+        robot.tree.frame(frame)
+        self.frame, self.kept = frame, row_mask(rows)
         self.error = option("error", error, ("decoupled", "se3"))
-        self.axes = _axes(axes, outer_axes, self.error)
+        self.axes = self._row_axes(axes)
         self.orientation_jacobian = option("orientation_jacobian", orientation_jacobian, ("analytic", "geometric"))
         if self.coupled and self.orientation_jacobian == "geometric":
             raise OsikValueError(
                 "error='se3' has its own Jacobian; orientation_jacobian='geometric' goes with 'decoupled'"
             )
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
+        dtype = self._set_up(robot, weight, priority, hard, gain)
+        home: Pose = self._held(robot, home_kinematics(robot), robot.q0)["target"]
         self.target = as_pose(home if target is None else target, dtype, rest=_rest(home, self.kept, self.coupled))
-        self.target_velocity = as_vector(
-            0.0 if target_velocity is None else target_velocity, (6,), "target_velocity", dtype
-        )
+        velocity = 0.0 if target_velocity is None else target_velocity
+        self.target_velocity = as_vector(velocity, (6,), "target_velocity", dtype)
         self.lower, self.upper = as_bounds(lower, upper, sum(self.kept), dtype)
         self.position_weight = _row_weight(position_weight, "position_weight", dtype)
         self.orientation_weight = _row_weight(orientation_weight, "orientation_weight", dtype)
-        self.weight = as_scalar(weight, "weight", dtype)
-        self.gain = as_gain(gain, dtype)
+
+    def _row_axes(self, axes: str | None) -> str:
+        """Return the axes of the rows: the outer ones by default, the frame's own for a twist."""
+        if not self.coupled:
+            return self.outer_axes if axes is None else option("axes", axes, (self.outer_axes, "frame"))
+        if axes not in (None, "frame"):
+            raise OsikValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
+        return "frame"
 
     @property
     def bounded(self) -> bool:
@@ -123,7 +128,7 @@ class PoseTask(FramedTask):
         bounds, weights = (self.lower, self.upper), (self.position_weight, self.orientation_weight)
         return [self.gain, self.weight, self.target_velocity, *bounds, *self.target, *weights]
 
-    def _core_card(self, robot: Robot) -> CoreCard | str:
+    def _card(self, robot: Robot) -> CoreCard | str:
         if self.coupled:
             return "has error='se3'"
         tree = robot.tree
@@ -188,11 +193,9 @@ class PoseTask(FramedTask):
         """Return the chosen rows of position and of orientation."""
         parts = []
         if any(self.kept[:3]):
-            linear = self._position_in_frame if self.axes == "frame" else self._position_outside
-            parts.append((self.kept[:3], (*linear(position, rotation, jacobian), self.position_weight)))
+            parts.append((self.kept[:3], (*self._position_rows(position, rotation, jacobian), self.position_weight)))
         if any(self.kept[3:]):
-            angular = self._orientation_in_frame if self.axes == "frame" else self._orientation_outside
-            parts.append((self.kept[3:], (*angular(rotation, jacobian[3:]), self.orientation_weight)))
+            parts.append((self.kept[3:], (*self._orientation_rows(rotation, jacobian[3:]), self.orientation_weight)))
         return parts, _twice(rotation) if self.axes == "frame" else None
 
     def _curvature(self, pull: Float[Array, " m"], wrench: _Wrench, jacobian: Float[Array, "6 nv"]) -> Float[Array, ""]:
@@ -201,28 +204,25 @@ class PoseTask(FramedTask):
         whole = whole if wrench is None else dot(wrench, whole)
         return pose_curvature(whole[:3], whole[3:], jacobian)
 
-    def _position_outside(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
-        del rotation
-        return position - self.target[0], jacobian[:3], self.target_velocity[:3]
-
-    def _position_in_frame(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
-        offset = position - self.target[0]
+    def _position_rows(self, position: Array, rotation: Array, jacobian: Array) -> _Parts:
+        offset, velocity = position - self.target[0], self.target_velocity[:3]
+        if self.axes != "frame":
+            return offset, jacobian[:3], velocity
         # the axes turn under the offset: d/dt R'(p - p*) = R'(p' + (p - p*) x w)
         turning = dot(cross_matrix(offset), jacobian[3:])
         own = rotation.T
-        return dot(own, offset), dot(own, jacobian[:3] + turning), dot(own, self.target_velocity[:3])
+        return dot(own, offset), dot(own, jacobian[:3] + turning), dot(own, velocity)
 
-    def _orientation_outside(self, rotation: Array, jacobian: Array) -> _Parts:
+    def _orientation_rows(self, rotation: Array, jacobian: Array) -> _Parts:
         # R R*' is the turn from target to frame in the outer axes; R*' R is the same turn in the frame's axes
+        if self.axes == "frame":
+            error = rotation_log(dot(self.target[1].T, rotation))
+            factor = dot(self._factor(error).T, rotation.T)
+            return error, dot(factor, jacobian), dot(factor, self.target_velocity[3:])
         between = dot(rotation, self.target[1].T)
         error = rotation_log(between)
         factor = self._factor(error)
         return error, dot(factor, jacobian), dot(factor, dot(between, self.target_velocity[3:]))
-
-    def _orientation_in_frame(self, rotation: Array, jacobian: Array) -> _Parts:
-        error = rotation_log(dot(self.target[1].T, rotation))
-        factor = dot(self._factor(error).T, rotation.T)
-        return error, dot(factor, jacobian), dot(factor, self.target_velocity[3:])
 
     def _factor(self, error: Float[Array, "3"]) -> Float[Array, "3 3"]:
         """Return the inverse left Jacobian (transposed: the right one), or the identity for a geometric Jacobian."""
@@ -248,6 +248,41 @@ def _rest(pose: Pose, kept: Sequence[bool], coupled: bool) -> tuple[Any, Any]:
     return (None if any(kept[:3]) else position), (None if any(kept[3:]) else rotation)
 
 
+Fields = tuple[Array, Array, Array, Array, Array, Array, Array, Array]
+
+
+def fields_of(rows: TaskRows) -> Fields:
+    """Return the arguments of ``equality_rows`` that give these rows; ``lower`` is used for both bounds."""
+    fields = rows.error, rows.jacobian, rows.lower, rows.weight, rows.curvature, rows.pull, rows.levers
+    return *fields, rows.squared_lengths()
+
+
+def fields_by_core(
+    call: Call, method: str, nv: int, weight: Float[Array, "lanes m"], *given: Array | np.ndarray
+) -> Fields:
+    """Return the arguments of ``equality_rows`` for a batch: arrays with an axis of lanes, or of length 1, in front."""
+    count, lanes = weight.shape[1], max(len(a) for a in given if jnp.issubdtype(a.dtype, jnp.floating))
+    shapes = (lanes, count), (lanes, count, nv), (lanes, count), (lanes,), (lanes, count), (lanes, nv), (lanes, count)
+    error, rows, wanted, *rest = call(method, [(shape, float) for shape in shapes], *given)
+    curvature, pull, levers, squares = rest
+    return error, rows, wanted, jnp.broadcast_to(weight, error.shape), curvature, pull, levers, squares
+
+
+def equality_rows(
+    error: Array,
+    jacobian: Array,
+    wanted: Array,
+    weight: Array,
+    curvature: Array,
+    pull: Array,
+    levers: Array,
+    squares: Array,
+) -> TaskRows:
+    """Return the rows of an equality from their fields, as the compiled core computes them."""
+    fields = error, jacobian, wanted, wanted, weight, curvature, pull, levers
+    return TaskRows(*fields, is_equality=True, squares=squares)
+
+
 def pose_fields(task: PoseTask, position: Array, rotation: Array, jacobian: Array) -> Fields:
     """Return the arguments of ``equality_rows`` for a pose task."""
     return fields_of(task._plain_rows(position, rotation, jacobian))
@@ -270,15 +305,6 @@ def goal_arguments(task: PoseTask) -> tuple[tuple[Array, ...], np.ndarray, Float
 
 
 _by_kernel = by_kernel(pose_fields, _fields_by_kernel)
-
-
-def _axes(axes: str | None, outer_axes: str, error: str) -> str:
-    """Return the axes of the rows: the outer ones by default, the frame's own for a twist."""
-    if error == "se3":
-        if axes not in (None, "frame"):
-            raise OsikValueError(f"axes is {axes!r}; the rows of error='se3' are along the frame's own axes, 'frame'")
-        return "frame"
-    return outer_axes if axes is None else option("axes", axes, (outer_axes, "frame"))
 
 
 def _twice(rotation: Float[Array, "3 3"]) -> Float[Array, "6 6"]:

@@ -11,17 +11,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikValueError
 from ..kinematics import Kinematics, difference
 from ..robot import Robot
 from ..robot._joint_selection import dofs_of, is_scalar, select_all
 from ..robot._tree import BALL, DOF_WIDTH, FREE
-from ._background import background_weight
 from ._curvature import no_curvature
-from ._gain import AdaptiveGain, as_gain
-from ._leaves import WeightLike, as_array, as_bounds, as_joint_weight, as_vector, check_finite
+from ._gain import AdaptiveGain
+from ._leaves import WeightLike, as_array, as_vector, background_weight, check_finite, joint_weight
 from ._rotation import inverse_left_jacobian
-from ._task import DEFAULT_GAIN, POSTURE, CoreCard, Task, TaskRows, check_priority
+from ._task import DEFAULT_GAIN, POSTURE, CoreCard, Task, TaskRows
 
 
 class PostureTask(Task):
@@ -46,8 +45,6 @@ class PostureTask(Task):
             bounds; for a target of the whole robot 1e-4, so that other tasks win, and less on a robot whose size s, the
             longest way along its links, is below half a metre: 1e-4 (s / 0.5 m)^2.
         gain: [1/s], a number or an ``AdaptiveGain``.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         KeyError: no such joint, or it is locked or a mimic follower; in ``joints`` or ``weight``.
@@ -81,24 +78,22 @@ class PostureTask(Task):
         hard: bool = False,
     ):
         self.joints = tuple(select_all(robot, joints))
-        self.priority, self.hard = check_priority(priority), hard
-        dtype = robot.q0.dtype
-        self.gain = as_gain(gain, dtype)
-        dofs = dofs_of(robot, self.joints)
+        dofs, dtype = dofs_of(robot, self.joints), robot.q0.dtype
         rows = len(dofs)
         if weight is None:
             # a whole-body posture settles what goals leave open; named joints and bounds are goals themselves
             weight = background_weight(robot) if joints is None and lower is None and upper is None else 1.0
-        self.weight = as_joint_weight(robot, weight, dofs)
         velocity = 0.0 if target_velocity is None else target_velocity
         self.target_velocity = as_vector(velocity, (rows,), "target_velocity", dtype)
-        self.lower, self.upper = as_bounds(lower, upper, rows, dtype)
+        self._set_up(robot, joint_weight(robot, weight, dofs), priority, hard, gain)
         self.target = None
-        if self.lower is None:
+        if self._set_bounds(target, lower, upper, rows, dtype):
             self.target = as_array(robot.q0 if target is None else target, "target", dtype)
             robot.check_configuration(self.target, "target")
-        else:
-            _check_bounded(robot, self.joints, target)
+            return
+        turning = [robot.tree.joint_names[j] for j in self.joints if not is_scalar(robot, j)]
+        if turning:
+            raise OsikValueError(f"bounds are on the values of hinges and slides; leave out {', '.join(turning)}")
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
         """Return one row per dof of the chosen joints, in the order of v."""
@@ -123,11 +118,8 @@ class PostureTask(Task):
             curvature=no_curvature,
         )
 
-    def core(self, robot: Robot) -> CoreCard | str:
-        """Return the card of a posture, or in words why there is none."""
-        if type(self) is not PostureTask:
-            return super().core(robot)
-        if not all(is_scalar(robot, joint) for joint in self.joints):
+    def _card(self, robot: Robot) -> CoreCard | str:
+        if not self._adds(robot):
             return "has joints that turn as a ball"
         dofs = dofs_of(robot, self.joints)
         return CoreCard(POSTURE, len(dofs), [*(robot.tree.qpos_address[joint] for joint in self.joints), *dofs])
@@ -183,12 +175,3 @@ class PostureTask(Task):
         if target.shape != self.target.shape:
             raise OsikValueError(f"target has shape {target.shape}, expected {self.target.shape}. Batch with jax.vmap.")
         return target
-
-
-def _check_bounded(robot: Robot, joints: tuple[int, ...], target: Any) -> None:
-    """Raise ValueError if bounds are not possible for these joints."""
-    if target is not None:
-        raise OsikTypeError("a PostureTask has a target or bounds (lower, upper), not both")
-    turning = [robot.tree.joint_names[j] for j in joints if not is_scalar(robot, j)]
-    if turning:
-        raise OsikValueError(f"bounds are on the values of hinges and slides; leave out {', '.join(turning)}")

@@ -15,14 +15,11 @@ from ..execution._platform import cuda_is_default
 from ..kinematics import Kinematics
 from ..kinematics._forward import moving_frames
 from ..robot import Robot
-from ._axis_align import AxisAlignTask
-from ._contact import ContactTask
-from ._frame import FrameTask
-from ._framed import FramedTask
-from ._look_at import LookAtTask
-from ._relative_frame import RelativeFrameTask
+from ._bases import FramedTask, Frames
+from ._frame import FrameTask, RelativeFrameTask
+from ._plane import ContactTask, WheelTask
+from ._pointing import AxisAlignTask, LookAtTask
 from ._task import Task, TaskRows
-from ._wheel import WheelTask
 
 _TOGETHER = (FrameTask, RelativeFrameTask, LookAtTask, AxisAlignTask, ContactTask, WheelTask)
 """Task classes that are evaluated in batches; a subclass may define rows of its own."""
@@ -66,10 +63,10 @@ def _framed_rows(robot: Robot, kinematics: Kinematics, tasks: Mapping[str, Frame
     found = moving_frames(robot, kinematics, frames)
     by_task = [a.reshape(len(tasks), len(first.frames), *a.shape[1:]) for a in found]
 
-    def rows_at(task: FramedTask, *frames: Array) -> TaskRows:
-        return task.rows_at(*frames, backend=kinematics.backend)
+    def rows_at(task: FramedTask, frames: Frames) -> TaskRows:
+        return task.rows_at(frames, kinematics.backend)
 
-    rows = jax.vmap(rows_at)(together, *by_task)
+    rows = jax.vmap(rows_at)(together, Frames(*by_task))
     apart = [jax.tree.map(partial(_of_task, i), rows) for i in np.arange(len(tasks))]
     if not first.bounded:  # one array for both bounds
         apart = [dataclasses.replace(one, upper=one.lower) for one in apart]

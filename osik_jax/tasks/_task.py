@@ -16,12 +16,13 @@ from jaxtyping import Array, Bool, Float
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics import Kinematics, forward_kinematics
 from ..numerics._dense import short_sum
+from ..numerics._guarded import approach
 from ..numerics._replace import Replaceable
 from ..robot import Robot
 from ..robot._made_for import MadeForRobot
 from ._curvature import jacobian_curvature, levers, no_curvature
 from ._gain import Gain, as_gain, capped_gain, evaluate_gain
-from ._leaves import as_own_weight, as_weight, check_bounds
+from ._leaves import as_bounds, as_own_weight, as_weight, check_bounds
 from ._repr import short_repr
 
 DEFAULT_GAIN = 10.0
@@ -124,7 +125,7 @@ class TaskRows(eqx.Module):
         # signed like an error: positive above the interval, so that minus the pull leads back
         outside = jnp.maximum(error - upper, 0.0) - jnp.maximum(lower - error, 0.0)
         rate = evaluate_gain(gain, jnp.where(weight > 0.0, outside, 0.0))
-        low, high = (_approach(rate, bound, error) + shift for bound in (lower, upper))
+        low, high = (approach(rate, bound, error) + shift for bound in (lower, upper))
         pull = rate * outside
         return cls(error, jacobian, low, high, weight, curvature_of(weight * pull), pull, arms, dofs, is_equality=False)
 
@@ -148,7 +149,8 @@ POSE, CENTER, POSTURE, GIVEN = range(4)
 class Task(MadeForRobot, Replaceable):
     """Base of all tasks: an immutable pytree.
 
-    To make your own, subclass it, add fields and write ``rows`` (``TaskRows.of``).
+    To make your own, subclass it, add fields and write ``rows`` (``TaskRows.of``). Every task takes ``priority`` and
+    ``hard``.
 
     Attributes:
         priority: 1 is the most important; static.
@@ -182,6 +184,21 @@ class Task(MadeForRobot, Replaceable):
         check_priority(self.priority)
         if not isinstance(self.hard, bool | np.bool_):
             raise OsikTypeError(f"hard is {self.hard!r}; it is True (a constraint, above every priority) or False")
+
+    def _set_up(self, robot: Robot, weight: Any, priority: int, hard: bool, gain: Any = 0.0) -> Any:
+        """Set the fields of every task, where ``_weight_rows`` is known; return the dtype of the robot's numbers."""
+        dtype = robot.q0.dtype
+        self.priority, self.hard = check_priority(priority), hard
+        self.weight, self.gain = as_weight(weight, self._weight_rows, dtype), as_gain(gain, dtype)
+        return dtype
+
+    def _set_bounds(self, target: Any, lower: Any, upper: Any, rows: int, dtype: Any) -> bool:
+        """Set ``lower`` and ``upper``; return whether the task has a target in their place, TypeError for both."""
+        own: Any = self
+        own.lower, own.upper = as_bounds(lower, upper, rows, dtype)
+        if own.lower is not None and target is not None:
+            raise OsikTypeError(f"this {type(self).__name__} has a target or bounds (lower, upper), not both")
+        return own.lower is None
 
     @abc.abstractmethod
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
@@ -245,8 +262,11 @@ class Task(MadeForRobot, Replaceable):
 
         A subclass inherits no card: it may have rows of its own.
         """
-        del robot
-        return f"is of the class {type(self).__name__}"
+        return self._card(robot) if "_card" in vars(type(self)) else f"is of the class {type(self).__name__}"
+
+    def _card(self, robot: Robot) -> CoreCard | str:
+        """Return what ``core`` returns, in each class that has a card."""
+        raise NotImplementedError
 
     def core_leaves(self) -> list[Any]:
         """Return the leaves of a task with a card in the order of ``StepRows::add_task``; None for a missing one."""
@@ -302,10 +322,3 @@ def check_priority(priority: int) -> int:
             f"a priority is an integer, 1 for the most important task, 2 for the next; got {priority!r}"
         )
     return int(priority)
-
-
-def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Return ``rate (bound - value)``; an infinite bound stays infinite at rate 0, with gradients of 0."""
-    free = jnp.isinf(bound)
-    gap = jnp.where(free, 0.0, bound) - value
-    return jnp.where(free, bound, rate * gap)

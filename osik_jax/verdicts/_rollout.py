@@ -19,8 +19,7 @@ from ..limits import Limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ..solvers import Status
-from ._goals import as_tolerances, check_concrete, errors_of, in_words
-from ._step import StepVerdict, explain_step
+from ._step import StepVerdict, as_tolerances, check_concrete, errors_of, explain_step, in_words
 
 
 class RolloutVerdict(NamedTuple):

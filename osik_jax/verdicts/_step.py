@@ -8,27 +8,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from .._errors import OsikValueError
 from ..control._checks import check_setting, check_target_names, check_tasks, checked_configuration, checked_limits
 from ..control._step import Targets, Tasks, aim, in_type_of, step, velocity_problem
+from ..inverse._task_search import is_goal, sizes_of
 from ..kinematics import forward_kinematics
-from ..limits import (
-    AccelerationLimit,
-    CollisionAvoidanceLimit,
-    ConfigurationLimit,
-    Limit,
-    Limits,
-    VelocityLimit,
-    with_own_limits,
-)
+from ..limits import CollisionAvoidanceLimit, Limit, Limits, with_own_limits
 from ..robot import Robot
 from ..robot._joint_selection import dof_names
 from ..schemes import Scheme, VelocityProblem, WeightedQP
 from ..schemes._default import scheme_for
 from ..solvers import Status
 from ..tasks import Task
-from ._goals import as_tolerances, check_concrete, errors_of, in_words
+from ..tasks._rows import rows_of
 
 _PUSHED = 1e-3
 """A bound or a task stops a goal if the goal's force on it is at least this, relative to the largest possible one."""
@@ -38,7 +33,6 @@ _AT_REST = 1e-3
 """Speed of the fastest joint [rad/s or m/s] up to which a robot counts as at rest."""
 _NEAR = 5e-3
 """Pairs of shapes are named if they are nearer than this to their least distance [m]."""
-_BOUNDS = {ConfigurationLimit: "limit", VelocityLimit: "speed limit", AccelerationLimit: "acceleration limit"}
 
 
 class StepVerdict(NamedTuple):
@@ -222,8 +216,9 @@ def _reasons(robot: Robot, measured: _Measured, limits: Sequence[Limit], goal: s
     stops, names = measured.stops[goal], dof_names(robot)
     dofs, pairs = np.flatnonzero(stops.joints), _near_pairs(measured, limits, stops)
     lines = [
-        f"{names[i]} is at its {('lower', 'upper')[upper]} {_bound(limits[int(measured.tightest[upper, i])])}"
+        f"{names[i]} is at its {('lower', 'upper')[upper]} {bound.bound_name or f'bound of a {type(bound).__name__}'}"
         for i, upper in ((i, int(stops.joints[i] > 0)) for i in dofs)
+        for bound in (limits[int(measured.tightest[upper, i])],)
     ]
     for (one, other), gap in pairs.items():
         lines.append(f"{one} and {other} are {round(gap, 6) + 0.0:+.3g} m from as near as they may be")
@@ -253,6 +248,30 @@ def _near_pairs(measured: _Measured, limits: Sequence[Limit], stops: _Stops) -> 
     }
 
 
-def _bound(limit: Limit) -> str:
-    """Return what the bound of a limit is called."""
-    return _BOUNDS.get(type(limit), f"bound of a {type(limit).__name__}")
+def errors_of(robot: Robot, q: Float[Array, " nq"], tasks: Mapping[str, Task]) -> dict[str, Float[Array, "2"]]:
+    """Return the error of each goal at q: metres (or the task's own unit), and radians; of bounds, the part outside."""
+    # of a gain of 1 the pull is the error
+    goals = {
+        name: task.replace(gain=1.0) for name, task in tasks.items() if is_goal(task) and "gain" in task.replaceable
+    }
+    rows = rows_of(robot, forward_kinematics(robot, q), q, goals)
+    return {name: jnp.stack(sizes_of(goals[name], own)) for name, own in rows.items()}
+
+
+def as_tolerances(position: Any, orientation: Any) -> Float[np.ndarray, "2"]:
+    """Return both tolerances; raise ValueError unless they are positive numbers."""
+    found = np.array([position, orientation], float)
+    if not (np.isfinite(found) & (found > 0.0)).all():
+        raise OsikValueError(f"the tolerances are {position!r} m and {orientation!r} rad; both are positive numbers")
+    return found
+
+
+def check_concrete(where: str, *given: Any) -> None:
+    """Raise ValueError for numbers that are traced: a verdict is text, made outside of jit."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(given)):
+        raise OsikValueError(f"{where} has traced arguments; a verdict is text: call it outside of jit, vmap and grad")
+
+
+def in_words(error: Float[np.ndarray, "2"]) -> str:
+    """Return an error in metres and radians as text."""
+    return f"{error[0]:.3g} m and {error[1]:.3g} rad"

@@ -95,7 +95,7 @@ class TestSchemes:
                 TypeError,
                 "to replace; it has: damping, curvature_damping",
             ),
-            (osik.NullSpace(), dict(method="reverse"), TypeError, "structure is fixed"),
+            (osik.NullSpace(), dict(method="saturated"), TypeError, "structure is fixed"),
         ],
     )
     def test_mistakes_are_told(self, scheme, changes, error, message):

@@ -40,8 +40,7 @@ METHODS = {
     "weighted": qp,
     "hierarchical": hqp,
     "saturated": null_space(),
-    "forward": null_space(order="forward", damping=1e-3),
-    "reverse": null_space(order="reverse", damping=1e-3),
+    "forward": null_space(damping=1e-3),
 }
 
 

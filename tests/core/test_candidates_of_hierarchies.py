@@ -13,8 +13,8 @@ from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
 from osik_jax.solvers import Level, Tolerances, solve_hqp
 from osik_jax.solvers._damping import per_level
-from osik_jax.solvers.hqp import _cascade, _cuda, _dispatch
-from osik_jax.solvers.hqp._padding import Layout, PaddedHierarchy, pad_hierarchy
+from osik_jax.solvers.hqp import _cascade, _core, _dispatch
+from osik_jax.solvers.hqp._problem import Layout, PaddedHierarchy, pad_hierarchy
 
 COUNT, CAP = 12, 200
 
@@ -126,7 +126,7 @@ def test_when_the_kernel_is_asked(monkeypatch):
         asked.append(layout.variables)
         return _cascade.solve_cascade(layout, max_iterations, hierarchy, tolerances)
 
-    monkeypatch.setattr(_cuda, "solve", solve)
+    monkeypatch.setattr(_core, "solve_on_gpu", solve)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
 
     def trace(n=3, backend="auto"):

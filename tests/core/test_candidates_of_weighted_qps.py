@@ -15,14 +15,14 @@ from recorded import QP_DAMPING, recorded_qps
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.core import _library
 from osik_jax.execution import _backends
+from osik_jax.execution._computed import side_by_side
 from osik_jax.execution._lanes import FEW_ON_CPU, first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
-from osik_jax.solvers.qp import _cuda, _dispatch, _search
+from osik_jax.solvers.qp import _core, _dispatch, _search
 from osik_jax.solvers.qp._core import CERTIFIED, Candidate
-from osik_jax.solvers.qp._cost import LeastSquares
 from osik_jax.solvers.qp._dispatch import kernel_candidates
-from osik_jax.solvers.qp._problem import QP, pack
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 
 CAP = 1000
 SOFT = 3
@@ -83,7 +83,8 @@ def completed(
 
 def judged(batch: Batch, c: Candidate) -> np.ndarray:
     """The lanes that the core certifies."""
-    matrix, packed = jax.jit(jax.vmap(pack))(batch.qp)
+    matrix, *others = jax.tree.leaves(batch.qp)
+    packed = side_by_side(*others)
     tolerances = jnp.stack([batch.tolerance, jnp.full_like(batch.tolerance, KKT_TOLERANCE[np.dtype("float64")])], 1)
     shapes = [((len(c.x),), int), ((len(c.x),), float)]
     holds, _ = _library.call(
@@ -222,7 +223,7 @@ def beside_a_gpu(monkeypatch):
 
     monkeypatch.setattr(_backends, "cuda_is_default", lambda: True)
     monkeypatch.setattr(core_cuda, "nvrtc", lambda: "libnvrtc.so")
-    monkeypatch.setattr(_cuda, "solve", solve)
+    monkeypatch.setattr(_core, "solve_on_gpu", solve)
     jax.clear_caches()
     yield asked
     jax.clear_caches()

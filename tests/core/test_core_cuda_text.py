@@ -8,10 +8,10 @@ from core_checks import needs_core
 
 from osik_jax.core import _cuda
 from osik_jax.retargeting import _banded as banded
-from osik_jax.solvers.hqp import _cuda as hierarchy
-from osik_jax.solvers.hqp._padding import Layout
+from osik_jax.solvers.hqp import _core as hierarchy
+from osik_jax.solvers.hqp._problem import Layout
 from osik_jax.solvers.null_space import _cuda as null_space
-from osik_jax.solvers.qp import _cuda as weighted_qp
+from osik_jax.solvers.qp import _core as weighted_qp
 
 NAO = Layout(3, 2, 2, (2, 1), (-1, -1, -1, 1), ((4, 4), (3, 4)))
 """Two levels of three variables; the second has one inequality row."""

@@ -25,7 +25,7 @@ pytestmark = needs_core
 
 LANES = 40
 SHAPES = ["6-5", "1-0", "1-3", "6-0", "24-30", "60-40"]
-LEVELS = ["hqp", "nullspace", "reverse", "saturated"]
+LEVELS = ["hqp", "nullspace", "saturated"]
 
 
 def hard_rows(rng, m, n):

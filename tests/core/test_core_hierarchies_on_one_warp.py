@@ -20,7 +20,7 @@ from hierarchy_families import (
 
 from osik_jax.core import _cuda
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers.hqp import _cuda as hierarchy
+from osik_jax.solvers.hqp import _core as hierarchy
 from osik_jax.solvers.hqp import _dispatch
 
 pytestmark = needs_core
@@ -61,7 +61,7 @@ def on_one_warp(monkeypatch, tmp_path):
         return jax.pure_callback(run, shapes, *inputs)
 
     _dispatch.hierarchy_solver.cache_clear()
-    monkeypatch.setattr(_dispatch._core, "solve", hierarchy.solve)
+    monkeypatch.setattr(_dispatch._core, "solve", hierarchy.solve_on_gpu)
     monkeypatch.setattr(_cuda, "call", call)
     yield
     _dispatch.hierarchy_solver.cache_clear()

@@ -20,7 +20,7 @@ from osik_jax.solvers._row_factors import row_factors
 from osik_jax.solvers.null_space import _saturation
 
 pytestmark = needs_core
-METHODS = {"forward": {}, "reverse": dict(order="reverse"), "saturated": dict(lower=-0.4, upper=0.4)}
+METHODS = {"forward": {}, "saturated": dict(lower=-0.4, upper=0.4)}
 
 
 @partial(jax.jit, static_argnames=("backend", "method"))
@@ -29,10 +29,8 @@ def solved(p: Problems, *, backend: Backend = "core", method="forward"):
 
     def one(p: Problems):
         levels, damping = [Level(*level) for level in p.levels], [Damping(*d) for d in p.damping]
-        options = METHODS[method]
-        bounds = {name: jnp.full_like(p.secondary, b) for name, b in options.items() if name != "order"}
-        order = options.get("order", "forward")
-        return solve_nullspace(levels, **bounds, order=order, secondary=p.secondary, damping=damping, backend=backend)
+        bounds = {name: jnp.full_like(p.secondary, bound) for name, bound in METHODS[method].items()}
+        return solve_nullspace(levels, **bounds, secondary=p.secondary, damping=damping, backend=backend)
 
     return jax.vmap(one)(p)
 
@@ -93,16 +91,6 @@ def test_single_precision_is_double_inside(name):
     rounded = jax.tree.map(lambda a: np.asarray(a, np.float64), single)
     expected = solved(rounded, backend="jax")
     assert np.abs(found.x - expected.x).max() < 1e-5 * (1.0 + np.abs(expected.x).max())
-
-
-@pytest.mark.variants(release=["repeated", "damped"])
-@pytest.mark.parametrize("name", ["damped", "damped inequalities", "dependent and damped", "repeated"])
-def test_the_reverse_order_with_the_factors_of_the_kernel(name):
-    p = FAMILIES[name]
-    found, expected = solved(p, method="reverse"), solved(p, backend="jax", method="reverse")
-    np.testing.assert_array_equal(found.status, expected.status)
-    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-8 * (1.0 + np.abs(expected.x).max()))
-    np.testing.assert_allclose(found.projector, expected.projector, rtol=0, atol=1e-8)
 
 
 @pytest.mark.variants(

@@ -14,8 +14,9 @@ from recorded import recorded_saturated
 
 from osik_jax.core import _cuda, _library
 from osik_jax.solvers import Damping, Level
+from osik_jax.solvers._damping import per_level
 from osik_jax.solvers.null_space import _cuda as null_space
-from osik_jax.solvers.null_space import _dispatch, _saturation
+from osik_jax.solvers.null_space import _projection, _saturation
 from osik_jax.solvers.null_space._padding import pad_levels, without_roundoff
 
 pytestmark = needs_core
@@ -49,12 +50,13 @@ def test_the_classical_projection(p, on_one_warp):
     levels = [jax.vmap(lambda *of: Level(*of).scaled())(*level) for level in p.levels]
     damping = Damping(*(jnp.stack(parts, 1) for parts in zip(*p.damping, strict=True)))
     given = levels, p.secondary, damping, jnp.full(len(p.secondary), 1e-10)
-    assert_near(_dispatch._by_core(null_space.project, *given), _dispatch._by_core(_library.call, *given))
+    assert_near(_projection._by_core(null_space.project, *given), _projection._by_core(_library.call, *given))
 
 
 def in_a_box(p, bound=0.4):
     def padded(p):
-        levels, damping = [Level(*of).scaled() for of in p.levels], [Damping(*of) for of in p.damping]
+        levels = [Level(*of).scaled() for of in p.levels]
+        damping = per_level([Damping(*of) for of in p.damping], len(levels), len(p.secondary), float)
         box = -jnp.full_like(p.secondary, bound), jnp.full_like(p.secondary, bound)
         return without_roundoff(pad_levels(levels, *box, p.secondary, damping, 1e-10))
 
@@ -64,14 +66,13 @@ def in_a_box(p, bound=0.4):
 def of_family(name):
     p = saturation_families.family(name, np.random.default_rng(7))
     p = jax.tree.map(lambda a: a[:20], p)
-    zeros = np.zeros(len(p.lower)), np.zeros(p.lower.shape)
-    damping = [Damping(zeros[0], zeros[0], zeros[0], zeros[1])] * len(p.levels)
 
-    def padded(p, damping):
+    def padded(p):
+        damping = per_level(0.0, len(p.levels), len(p.lower), float)
         levels = [level.scaled() for level in saturation_families.as_levels(p.levels)]
         return without_roundoff(pad_levels(levels, p.lower, p.upper, p.secondary, damping, 1e-10))
 
-    return jax.vmap(padded)(p, damping)
+    return jax.vmap(padded)(p)
 
 
 IN_BOXES = {name: partial(in_a_box, p) for name, p in CASES.items()}

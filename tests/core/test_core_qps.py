@@ -14,8 +14,7 @@ from weighted_families import MANY, M, N, P, Problems, problems
 from benchmarks.agreement import planted
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _core
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 
 pytestmark = needs_core
 COUNT = 200

@@ -14,7 +14,6 @@ SCHEMES = {
     "weighted": osik.WeightedQP(backend="jax"),
     "hierarchical": osik.HierarchicalQP(backend="jax"),
     "classical": osik.NullSpace(backend="jax"),
-    "reverse": osik.NullSpace(method="reverse", backend="jax"),
     "saturated": osik.NullSpace(method="saturated", backend="jax"),
 }
 
@@ -29,7 +28,7 @@ def step():
     }
 
     def made(name):
-        limits = osik.no_limits if name in ("classical", "reverse") else None
+        limits = osik.no_limits if name == "classical" else None
         return jax.jit(lambda q: osik.solve(robot, q, tasks, scheme=SCHEMES[name], limits=limits).velocity)
 
     return made, robot.q0 + 0.1
@@ -41,7 +40,7 @@ def test_a_hierarchy_is_not_exported_unasked(step):
     refuses(ValueError, "lapack_dgeqp3_ffi", jax.export.export(made("hierarchical")), q)
 
 
-@pytest.mark.variants(release=["classical", "reverse", "saturated", "hierarchical", "weighted"])
+@pytest.mark.variants(release=["classical", "saturated", "hierarchical", "weighted"])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_a_symbolic_batch_is_exported(name, step):
     """One program for batches of any size: the numbers of ``vmap`` with each size."""

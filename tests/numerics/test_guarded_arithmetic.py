@@ -199,10 +199,9 @@ SCHEMES = {
     "weighted": osik.WeightedQP,
     "hierarchy": osik.HierarchicalQP,
     "classical": osik.NullSpace,
-    "reverse": lambda: osik.NullSpace(method="reverse"),
     "saturated": lambda: osik.NullSpace(method="saturated"),
 }
-LEAST_WEIGHT = {"weighted": 0.0, "hierarchy": 1e-26, "classical": 1e-11, "reverse": 0.0, "saturated": 1e-26}
+LEAST_WEIGHT = {"weighted": 0.0, "hierarchy": 1e-26, "classical": 1e-11, "saturated": 1e-26}
 """Weights below this are among the limitations: derivatives by them may be wrong there."""
 
 

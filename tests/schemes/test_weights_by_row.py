@@ -16,6 +16,7 @@ from task_checks import rows_of_each, square
 import osik_jax as osik
 
 DT = 0.01
+COUPLING = {"joint2": 1.0, "joint5": -2.0}
 
 
 @pytest.fixture(scope="module")
@@ -23,10 +24,12 @@ def floating():
     return osik.Robot.from_mjcf(mjcf("floating_arm"))
 
 
-def assert_answers(robot, q, ours, expected):
-    solution = osik.solve(robot, q, ours, scheme=osik.WeightedQP(damping=1e-12, curvature_damping=0.0), dt=DT)
-    np.testing.assert_allclose(solution.velocity, expected, atol=1e-8)
+def assert_answers(robot, q, ours, expected, atol=1e-8):
+    scheme = osik.WeightedQP(damping=1e-12, curvature_damping=0.0)
+    solution = osik.solve(robot, q, ours, scheme=scheme, limits=osik.no_limits, dt=DT)
+    np.testing.assert_allclose(solution.velocity, expected, atol=atol)
     assert np.abs(expected).max() > 0.1
+    return solution
 
 
 class TestAgainstPeers:
@@ -72,6 +75,7 @@ class TestAgainstPeers:
         refuses(ValueError, r"expected a scalar, or \(2,\)", osik.EqualityConstraintTask, loop, weight=[1.0] * 4)
 
     def test_pink(self, arm, rng):
+        """A weighted problem: pink's ``cost**2`` is our weight, its gain is ours times dt."""
         model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
         q = np.asarray(arm.q0) + rng.uniform(-0.2, 0.2, 7)
         configuration = pink.Configuration(model, model.createData(), q)
@@ -81,21 +85,27 @@ class TestAgainstPeers:
             "posture": pink.tasks.PostureTask(costs["posture"], gain=0.1),
             "smooth": pink.tasks.LowAccelerationTask(costs["smooth"]),
             "velocity": pink.tasks.JointVelocityTask(costs["smooth"]),
+            "coupling": pink.tasks.JointCouplingTask([*COUPLING], [*COUPLING.values()], 0.8, configuration, gain=0.2),
+            "damping": pink.tasks.DampingTask(cost=0.5),
         }
         last = rng.uniform(-1.0, 1.0, 7)
         theirs["com"].set_target(np.array([0.2, 0.1, 0.4]))
         theirs["posture"].set_target(np.asarray(arm.q0))
         theirs["smooth"].set_last_integration(last, DT)
         theirs["velocity"].set_target(-last[::-1], DT)  # pink 4.4 moves the opposite way of its target
-        expected = pink.solve_ik(configuration, theirs.values(), DT, solver="daqp", limits=[])
+        expected = pink.solve_ik(configuration, theirs.values(), DT, solver="daqp", limits=[], damping=1e-12)
         squared = {name: np.square(cost) for name, cost in costs.items()}
         ours = {
             "com": osik.ComTask(arm, target=[0.2, 0.1, 0.4], weight=squared["com"], gain=0.1 / DT),
             "posture": osik.PostureTask(arm, weight=squared["posture"], gain=0.1 / DT),
             "smooth": osik.LowAccelerationTask(arm, velocity=last, weight=squared["smooth"]),
             "velocity": osik.JointVelocityTask(arm, last[::-1].copy(), weight=squared["smooth"]),
+            "coupling": osik.JointCouplingTask(arm, COUPLING, weight=0.8**2, gain=0.2 / DT),
+            "damping": osik.DampingTask(arm, weight=0.5**2),
         }
-        assert_answers(arm, q, ours, expected)
+        solution = assert_answers(arm, q, ours, expected, atol=1e-9)
+        error = theirs["coupling"].compute_error(configuration)
+        np.testing.assert_allclose(solution.error["coupling"], error, atol=1e-14)
 
 
 class TestRows:

@@ -19,13 +19,13 @@ from weighted_families import soft_problems
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
-from osik_jax.solvers import Damping, Level, Status, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers import Level, Status, solve_least_squares_qp, solve_nullspace
+from osik_jax.solvers._damping import per_level
 from osik_jax.solvers.null_space import _cuda as null_space
 from osik_jax.solvers.null_space import _saturation
 from osik_jax.solvers.null_space._padding import pad_levels
-from osik_jax.solvers.qp import _cuda
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp import _core
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 
 usable = _backends.cuda_is_default() and core_cuda.installed()
 pytestmark = pytest.mark.skipif(not usable, reason="needs JAX_PLATFORMS=cuda,cpu, a CUDA device and the compiled core")
@@ -152,7 +152,7 @@ def test_the_kernel_settles_alone(rng):
         upper,
     )
     guess, tolerance = jnp.asarray(at, jnp.int32), jnp.full(count, 1e-7, jnp.float32)
-    kernel = jax.jit(lambda *a: _cuda.solve(a[0], a[1], a[2], 1000))
+    kernel = jax.jit(lambda *a: _core.solve_on_gpu(a[0], a[1], a[2], 1000))
     found = kernel(qp, guess, tolerance)
     assert found.converged.all() and (found.factorizations == 1).all() and (found.iterations == 0).all()
     np.testing.assert_array_equal(found.active, guess)
@@ -218,8 +218,7 @@ def test_saturation_leaves_nothing_to_the_search(rng):
     p = drawn(rng, 5000)
 
     def padded(p):
-        zero = jnp.zeros(())
-        damping = [Damping(zero, zero, zero, jnp.zeros(N))] * len(p.levels)
+        damping = per_level(0.0, len(p.levels), N, float)
         levels = [level.scaled() for level in as_levels(p.levels)]
         return pad_levels(levels, p.lower, p.upper, p.secondary, damping, 1e-10)
 

@@ -10,8 +10,7 @@ from recorded import QP_DAMPING, recorded_qps
 from refusals import refuses
 
 from osik_jax.solvers import Level, Status, solve_least_squares_qp, solve_qp
-from osik_jax.solvers.qp._cost import LeastSquares
-from osik_jax.solvers.qp._problem import QP
+from osik_jax.solvers.qp._problem import QP, LeastSquares
 from osik_jax.solvers.qp._solve import _with_placeholder
 
 batched_qp = jax.jit(jax.vmap(solve_qp))
@@ -127,8 +126,7 @@ BAD_NUMBERS = [
 
 
 @pytest.mark.parametrize("name, value, fine", BAD_NUMBERS)
-def test_numbers_are_looked_at_alike_together_and_apart(monkeypatch, name, value, fine):
-    """As one array, as on CPUs, and each by itself: what cannot be computed with, and what stands in its place."""
+def test_numbers_that_cannot_be_computed_with_get_a_placeholder(name, value, fine):
     rng = np.random.default_rng(0)
     cost = LeastSquares(*(jnp.asarray(a) for a in (rng.normal(size=(3, 4)), *rng.random((2, 3)), *rng.random((2, 4)))))
     low = jnp.array([-jnp.inf, -1.0, 0.0, -2.0, -jnp.inf, 0.5])
@@ -138,14 +136,11 @@ def test_numbers_are_looked_at_alike_together_and_apart(monkeypatch, name, value
         qp = replace(qp, cost=replace(cost, **{name: getattr(cost, name).at[0].set(value)}))
     else:
         qp = replace(qp, **{name: getattr(qp, name).at[0].set(value)})
-    together, is_valid = _with_placeholder(qp)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    apart, is_valid_apart = _with_placeholder(qp)
-    assert bool(is_valid) == bool(is_valid_apart) == fine
-    jax.tree.map(np.testing.assert_array_equal, together, apart)
+    safe, is_valid = _with_placeholder(qp)
+    assert bool(is_valid) == fine
     if fine:
-        jax.tree.map(np.testing.assert_array_equal, apart, qp)
-    assert all(np.isfinite(a).all() for a in (*jax.tree.leaves(apart.cost), apart.rows, apart.compliance))
+        jax.tree.map(np.testing.assert_array_equal, safe, qp)
+    assert all(np.isfinite(a).all() for a in (*jax.tree.leaves(safe.cost), safe.rows, safe.compliance))
 
 
 @pytest.mark.slow

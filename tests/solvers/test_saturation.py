@@ -14,7 +14,6 @@ from core_checks import needs_core
 from hierarchy_families import degenerate
 from optimality import outside_cone
 from saturation_families import FAMILIES, LANES, ROWS, N, as_levels, drawn, family, solve_full
-from task_checks import kinematics_at
 
 import osik_jax as osik
 from osik_jax.solvers import Level, Status, solve_nullspace
@@ -358,12 +357,8 @@ class TestBatchesAndFailures:
             assert off.max() < 1e-3
 
     def test_mistakes(self):
-        level, wrong = [Level(np.ones((1, 3)), np.ones(1))], cast(Any, "backward")
-        with pytest.raises(ValueError, match="order is 'backward'; orders: forward, reverse"):
-            solve_nullspace(level, order=wrong)
-        with pytest.raises(ValueError, match="bounds need order='forward'"):
-            solve_nullspace(level, -np.ones(3), np.ones(3), order="reverse")
-        with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, reverse, saturated"):
+        level = [Level(np.ones((1, 3)), np.ones(1))]
+        with pytest.raises(ValueError, match="method is 'sideways'; methods: classical, saturated"):
             osik.NullSpace(method=cast(Any, "sideways"))
         with pytest.raises(ValueError, match=r"upper has shape \(2,\); the levels ask for \(3,\)"):
             solve_nullspace(level, -np.ones(3), np.ones(2))
@@ -393,19 +388,6 @@ def test_derivatives_are_finite_where_there_is_none(rng):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(rates))
     but_the_box = rates[0]._replace(lower=(), upper=()), *rates[1:]  # the answer of a failed lane is 0, clipped
     assert all((np.asarray(leaf)[7] == 0.0).all() for leaf in jax.tree.leaves(but_the_box))
-
-
-def test_the_reverse_order_is_the_forward_one_where_all_can_be_had(arm):
-    p, R = kinematics_at(arm, arm.q0).frame_pose(arm, "hand")
-    tasks = {
-        "height": osik.FrameTask(arm, "hand", rows=(False, False, True, False, False, False), priority=1),
-        "hand": osik.FrameTask(arm, "hand", rows="position", target=(p.at[0].add(0.3), R), priority=2),
-    }
-    limits = osik.ConfigurationLimit(arm), osik.VelocityLimit(arm, velocity={"*": 0.1})
-    schemes = [osik.NullSpace(damping=0.0, curvature_damping=0.0, method=m) for m in ("classical", "reverse")]
-    forward, reverse = (osik.solve(arm, arm.q0, tasks, scheme=s, limits=limits).velocity for s in schemes)
-    assert float(jnp.abs(forward).max()) > 0.1
-    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-9)
 
 
 @partial(jax.jit, static_argnames="backend")

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from osik_jax.core import _cuda as core_cuda
-from osik_jax.solvers.qp import _cuda
+from osik_jax.solvers.qp import _core
 
 SHARED = 1 << 18
 _RUN = """
@@ -50,7 +50,7 @@ class Found(NamedTuple):
 @cache
 def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
     """The kernel of a shape as a C library."""
-    return of_warps(folder, _cuda._source(m, n, p, single, 1000, 1), _cuda._bytes(m, n, p, single))
+    return of_warps(folder, _core._source(m, n, p, single, 1000, 1), _core._bytes(m, n, p, single))
 
 
 @cache

@@ -12,8 +12,9 @@ import numpy as np
 
 from osik_jax.numerics._constants import PART
 from osik_jax.solvers import Damping
+from osik_jax.solvers._level import PaddedLevel
 from osik_jax.solvers.null_space._implicit_diff import SaturatedResult
-from osik_jax.solvers.null_space._padding import PaddedLevel, Problem
+from osik_jax.solvers.null_space._padding import Problem
 
 DATA = Path(__file__).parents[1] / "data"
 FULL = os.environ.get("OSIK_REFERENCE")

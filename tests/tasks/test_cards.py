@@ -1,4 +1,4 @@
-"""What tasks say of themselves, and that no other part of the package keeps lists of their classes."""
+"""What tasks and limits say of themselves, and that no other part of the package keeps lists of their classes."""
 
 import ast
 from pathlib import Path
@@ -7,23 +7,26 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from every_class import all_tasks
+from every_class import all_limits, all_tasks
 
 import osik_jax as osik
-from osik_jax import tasks as module
+from osik_jax import limits, tasks
 from osik_jax.batching._names import leaf_names
 from osik_jax.control._units import unit_of
 from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
 from osik_jax.tasks._task import CoreCard
 
-CLASSES = {name for name, own in vars(module).items() if isinstance(own, type) and issubclass(own, osik.Task)} - {
-    "Task"
+CLASSES = {
+    name
+    for module, base in ((tasks, osik.Task), (limits, osik.Limit))
+    for name, own in vars(module).items()
+    if isinstance(own, type) and issubclass(own, base) and own is not base
 }
 PACKAGE = Path(osik.__file__).parent
 
 
 def named_in(node: ast.AST) -> set[str]:
-    """Return the task classes that a part of a file names."""
+    """Return the classes of tasks and limits that a part of a file names."""
     names = (getattr(own, "id", getattr(own, "attr", None)) for own in ast.walk(node))
     return CLASSES & set(names)
 
@@ -34,7 +37,7 @@ def is_asked(call: ast.Call) -> bool:
 
 
 def lists_of_classes(tree: ast.Module) -> list[set[str]]:
-    """Return the task classes of each function's ``isinstance``, each ``match``, ``in`` and constant."""
+    """Return the classes of each function's ``isinstance``, each ``match``, ``in`` and constant."""
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef):
@@ -54,8 +57,8 @@ def lists_of_classes(tree: ast.Module) -> list[set[str]]:
     return [own for own in found if len(own) > 1]
 
 
-def test_no_other_part_keeps_a_list_of_task_classes():
-    apart = {"tasks", "saving"}
+def test_no_other_part_keeps_a_list_of_classes():
+    apart = {"tasks", "limits", "saving"}
     files = [file for file in PACKAGE.rglob("*.py") if file.relative_to(PACKAGE).parts[0] not in apart]
     assert len(files) > 100
     lists = {str(file): lists_of_classes(ast.parse(file.read_text())) for file in files}
@@ -85,8 +88,27 @@ def test_a_class_of_ones_own_inherits_no_card(arm):
     class Own(osik.FrameTask):
         pass
 
+    class Slower(osik.VelocityLimit):
+        pass
+
     own = Own(arm, "hand")  # pyright: ignore[reportCallIssue]
     assert own.core(arm) == "is of the class Own"
+    assert not Slower(arm).core_has_box  # pyright: ignore[reportCallIssue]
+
+
+def test_a_limit_says_what_the_core_reads_of_it_and_whether_it_keeps_places(arm):
+    known = {type(limit).__name__: limit for limit in all_limits(arm)}
+    read = {name for name, limit in known.items() if limit.core_has_box}
+    assert read == {"ConfigurationLimit", "VelocityLimit", "NoLimits"}
+    for name in read:
+        leaves = known[name].core_leaves()
+        assert len(leaves) in (0, 5)
+        assert {id(leaf) for leaf in leaves[1:]} == {id(leaf) for leaf in jax.tree.leaves(known[name])}
+    assert {name for name, limit in known.items() if limit.sees_places} == {
+        "CollisionAvoidanceLimit",
+        "PositionBarrier",
+    }
+    assert all(limit.sought(arm) is not None for limit in known.values() if limit.sees_places)
 
 
 @pytest.mark.parametrize(

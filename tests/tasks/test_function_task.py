@@ -163,16 +163,12 @@ class TestCompilation:
         q, task = configurations[0], tasks["apart"]
         before = error(task, q)
         half = before[0] - 0.1
-        new = Apart(jnp.array([3.0, 4.0]), 0.0, 2, "left hand")
-        other = task.replace(function=new, gain=osik.AdaptiveGain(4, 3, 2))
-        np.testing.assert_allclose(error(other, q), [3.0 * half, 4.0 * half], rtol=1e-14)
         made = osik.FunctionTask(
             robot, Apart(jnp.array([5.0, 6.0]), 0.2, 2, "left hand"), gain=osik.AdaptiveGain(9, 8, 7)
         )
         np.testing.assert_allclose(error(made, q), [5.0 * half + 0.2, 6.0 * half + 0.2], rtol=1e-14)
         assert len(traces) == 1
-        assert other.function.offset == 0.0
-        assert isinstance(other.function, Apart)
+        assert isinstance(made.function, Apart)
 
     def test_plain_functions_are_told_apart_by_identity(self, robot, tasks, configurations):
         traces = []
@@ -223,7 +219,7 @@ class TestClosedLoop:
         q, mix = configurations[0], jnp.cos(jnp.arange(2.0 * robot.nv)).reshape(2, robot.nv)
 
         def total(scale, q):
-            task = tasks["apart"].replace(function=Apart(scale, 0.1, 2, "left hand"))
+            task = osik.FunctionTask(robot, Apart(scale, 0.1, 2, "left hand"), gain=tasks["apart"].gain)
             rows = task.rows(robot, osik.forward_kinematics(robot, q), q)
             return jnp.sum(mix * rows.jacobian) + jnp.sum(rows.lower)
 
@@ -253,9 +249,4 @@ class TestMistakes:
 
     def test_replace(self, tasks):
         refuses(TypeError, "no 'function' to replace; it has: weight, gain", tasks["tip"].replace, function=quaternion)
-        with pytest.raises(TypeError, match="structure differs"):
-            tasks["apart"].replace(function=Apart(jnp.ones(2), 0.1, 3, "left hand"))
-        refuses(TypeError, "structure differs", tasks["apart"].replace, function=quaternion)
-        with pytest.raises(ValueError, match=r"shape \(3,\), expected \(2,\)"):
-            tasks["apart"].replace(function=Apart(jnp.ones(3), 0.1, 2, "left hand"))
-        assert tasks["apart"].replaceable == ("weight", "gain", "target", "target_velocity", "function")
+        assert tasks["apart"].replaceable == ("weight", "gain", "target", "target_velocity")

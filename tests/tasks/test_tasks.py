@@ -133,39 +133,6 @@ class TestBatchesAndCompilation:
         np.testing.assert_allclose(batch["frame"].error[:, :3], expected, atol=1e-13)
         assert np.linalg.norm(positions[0][0] - positions[2][0]) > 0.1
 
-    def test_changing_any_number_compiles_nothing(self, arm):
-        traces = []
-
-        @jax.jit
-        def total(tasks, q):
-            traces.append(1)
-            return jax.tree.map(jnp.sum, rows_of_each(arm, tasks, q))
-
-        frame = "hand"
-        tasks = {
-            "pose": osik.FrameTask(arm, frame, lower=-0.1, gain=osik.AdaptiveGain(3, 2, 1)),
-            "com": osik.ComTask(arm, polygon=square()),
-            "posture": osik.PostureTask(arm, weight=1.0),
-        }
-        total(tasks, arm.q0)
-        pose = tasks["pose"]
-        changes = [
-            dict(target=np.eye(4, dtype=np.float32)),
-            dict(target_velocity=[1, 2, 3, 4, 5, 6]),
-            dict(lower=0, upper=np.float32(2.0)),
-            dict(position_weight=2),
-            dict(orientation_weight=(1, 2, 3)),
-            dict(weight=np.int32(3)),
-            dict(gain=osik.AdaptiveGain(np.float32(5), 4.0, jnp.asarray(1.0))),
-        ]
-        assert {name for change in changes for name in change} == set(pose.replaceable)
-        for change in changes:
-            total({**tasks, "pose": pose.replace(**change)}, arm.q0)
-        total({**tasks, "com": tasks["com"].replace(polygon=square(0.2), gain=2, weight=1)}, arm.q0)
-        posture = tasks["posture"].replace(target=np.zeros(arm.nq), target_velocity=1, gain=2, weight=3)
-        total({**tasks, "posture": posture}, arm.q0)
-        assert len(traces) == 1
-
     def test_a_replaced_task_is_another_one(self, arm):
         task = osik.PostureTask(arm, gain=2.0, weight=1.0)
         assert task.replace(gain=3.0).gain == 3.0

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from task_checks import assert_every_number_counts, assert_finite_gradients, assert_jacobians, at_each, rows_of_each
 
 import osik_jax as osik
+from osik_jax.tasks._bases import Frames
 
 SEED = 11
 MASK = (True, False, True, True, True, False)
@@ -80,7 +81,7 @@ def _random_pose(rng):
 @jax.jit
 def _alone(task, position, rotation):
     """The rows where the frame's twist is the velocity."""
-    return task.rows_at(position[None], rotation[None], jnp.eye(6)[None])
+    return task.rows_at(Frames(position[None], rotation[None], jnp.eye(6)[None]))
 
 
 class TestJacobians:
@@ -244,7 +245,8 @@ class TestGradients:
 
             def rows(tasks, position, rotation):
                 jacobian = jnp.eye(6, dtype=position.dtype)[None]
-                return {name: task.rows_at(position[None], rotation[None], jacobian) for name, task in tasks.items()}
+                frames = Frames(position[None], rotation[None], jacobian)
+                return {name: task.rows_at(frames) for name, task in tasks.items()}
 
             batch = jax.jit(jax.vmap(aimed))(points)
             assert_finite_gradients(rows, batch, jnp.zeros_like(points), jnp.tile(jnp.eye(3), (len(points), 1, 1)))
@@ -255,7 +257,9 @@ def _turned(task, direction):
     """Angles over 100 steps of 0.02 s of a body that turns as the task asks, from no turn at all."""
 
     def one_step(rotation, _):
-        rows = task.replace(target=direction).rows_at(jnp.zeros((1, 3)), rotation[None], jnp.eye(6)[None, :, 3:])
+        rows = task.replace(target=direction).rows_at(
+            Frames(jnp.zeros((1, 3)), rotation[None], jnp.eye(6)[None, :, 3:])
+        )
         spin = 0.02 * jnp.linalg.pinv(rows.jacobian) @ rows.lower
         return jaxlie.SO3.exp(spin).as_matrix() @ rotation, jnp.linalg.norm(rows.error)
 

@@ -1,14 +1,11 @@
 """Tasks on joints against pink, mink, central differences and numbers worked out by hand."""
 
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mink
 import numpy as np
-import pink
-import pinocchio as pin
 import pytest
 from model_files import mjcf
 from refusals import refuses
@@ -113,34 +110,6 @@ class TestRows:
 
 
 class TestAgainstPeers:
-    def test_pink(self, arm, rng):
-        """A weighted problem: pink's ``cost**2`` is our weight, its gain is ours times dt."""
-        model = pin.buildModelFromMJCF(str(Path(osik.__file__).parent / "robot" / "models" / "arm7.xml"))
-        last, wanted = rng.uniform(-1.0, 1.0, (2, 7))
-        q = np.asarray(arm.q0) + 0.1 * last
-        coupling = {"joint2": 1.0, "joint5": -2.0}
-        configuration = pink.Configuration(model, model.createData(), q)
-        theirs = {
-            "posture": pink.tasks.PostureTask(cost=0.3, gain=0.1),
-            "coupling": pink.tasks.JointCouplingTask([*coupling], [*coupling.values()], 0.8, configuration, gain=0.2),
-            "damping": pink.tasks.DampingTask(cost=0.5),
-            "smooth": pink.tasks.LowAccelerationTask(cost=0.7),
-        }
-        theirs["posture"].set_target(wanted)
-        theirs["smooth"].set_last_integration(last, DT)
-        expected = pink.solve_ik(configuration, theirs.values(), DT, solver="daqp", limits=[], damping=1e-12)
-        ours = {
-            "posture": osik.PostureTask(arm, target=wanted, weight=0.3**2, gain=0.1 / DT),
-            "coupling": osik.JointCouplingTask(arm, coupling, weight=0.8**2, gain=0.2 / DT),
-            "damping": osik.DampingTask(arm, weight=0.5**2),
-            "smooth": osik.LowAccelerationTask(arm, velocity=last, weight=0.7**2),
-        }
-        solution = osik.solve(arm, q, ours, scheme=osik.WeightedQP(damping=1e-12), dt=DT, limits=osik.no_limits)
-        np.testing.assert_allclose(solution.velocity, expected, atol=1e-9)
-        assert np.abs(expected).max() > 0.5
-        error = theirs["coupling"].compute_error(configuration)
-        np.testing.assert_allclose(solution.error["coupling"], error, atol=1e-14)
-
     def test_mink(self, arm, rng):
         """Frozen joints as a constraint, damping, a posture and a frame's orientation."""
         wanted = rng.uniform(-1.0, 1.0, 7)

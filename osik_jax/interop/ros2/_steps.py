@@ -25,7 +25,7 @@ from ...robot._joint_selection import scalar_layout
 from ...saving import load_controller
 from ...schemes import Scheme, WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, Task
-from ...tasks._background import background_weight
+from ...tasks._leaves import background_weight
 from ._settings import Settings
 
 _GAIN = 5.0

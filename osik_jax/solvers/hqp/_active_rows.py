@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ...numerics._dense import apply, product
-from ._padding import LevelProblem
+from ._problem import LevelProblem
 
 
 class ActiveRows(NamedTuple):

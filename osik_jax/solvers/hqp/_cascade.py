@@ -17,13 +17,12 @@ from jaxtyping import Array, Bool, Float, Int
 from ...execution._lanes import choose
 from ...numerics._constants import MAX_RESIDUAL
 from .._damping import HardRows, level_damping
-from .._level import Level
+from .._level import PaddedLevel
 from ._active_rows import drop_dependent, factor_active_rows
 from ._freeze import CascadeState, LevelOutcome, freeze, skip
 from ._implicit_diff import ActiveSets
-from ._padding import Layout, LevelProblem, PaddedHierarchy
 from ._primal_active_set import PrimalState, primal_active_set
-from ._problem import Tolerances, WorkingSet
+from ._problem import Layout, LevelProblem, PaddedHierarchy, Tolerances, WorkingSet
 from ._working_set_solve import WorkingSetSolution, solve_on_working_set
 
 
@@ -50,7 +49,7 @@ def solve_cascade(
     ``max_iterations`` limits the active-set iterations of one level.
     """
 
-    def solve_next(state: CascadeState, now: tuple[Array, Level]) -> tuple[CascadeState, LevelOutcome]:
+    def solve_next(state: CascadeState, now: tuple[Array, PaddedLevel]) -> tuple[CascadeState, LevelOutcome]:
         k, level = now
         problem = jax.vmap(partial(_level_problem, layout, k))(hierarchy, level, state)
         # the trace is the dimension that is left
@@ -115,7 +114,7 @@ def _start(hierarchy: PaddedHierarchy) -> CascadeState:
 
 
 def _level_problem(
-    layout: Layout, k: Int[Array, ""], hierarchy: PaddedHierarchy, level: Level, state: CascadeState
+    layout: Layout, k: Int[Array, ""], hierarchy: PaddedHierarchy, level: PaddedLevel, state: CascadeState
 ) -> LevelProblem:
     """Return level k with the hard rows and the frozen rows that it must keep."""
     level_of_hard = jnp.asarray(layout.level_of_hard)
@@ -132,7 +131,6 @@ def _level_problem(
         level=level,
         damping=level_damping(terms, level, state.x, state.projector, state.lower[:n], state.upper[:n], above),
         damping_terms=terms,
-        is_equality=hierarchy.is_equality[k],
         hard=hierarchy.hard,
         lower=state.lower,
         upper=state.upper,
@@ -170,7 +168,7 @@ def _as_primal_state(solution: WorkingSetSolution) -> PrimalState:
 def _working_set(problem: LevelProblem, end: PrimalState) -> WorkingSet:
     """Return the working set at the end of the primal method."""
     side = jnp.where(problem.level.distance(end.x) > 0.0, 1, -1)
-    own = jnp.where(problem.is_equality, 2, jnp.where(end.in_cost, side, 0))
+    own = jnp.where(problem.level.equal, 2, jnp.where(end.in_cost, side, 0))
     return WorkingSet(end.active, own.astype(jnp.int32))
 
 
@@ -193,7 +191,7 @@ def certify_levels(result: CascadeResult, hierarchy: PaddedHierarchy, tolerances
     like a larger one, that one of the two points is no optimum.
     """
 
-    def change(level: Level, slack_norm: Array) -> Array:
+    def change(level: PaddedLevel, slack_norm: Array) -> Array:
         now = jnp.sqrt(jnp.sum(level.distance(result.x) ** 2))
         terms = jnp.maximum(level.size * jnp.max(jnp.abs(result.x)), now)
         # a level that found no freedom left has an infinite norm: nothing below it moves x

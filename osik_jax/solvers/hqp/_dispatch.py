@@ -19,10 +19,9 @@ from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._double import in_double
 from ...execution._lanes import in_lanes, with_the_rest
 from ...numerics._constants import BOX_TOLERANCE
-from . import _core, _cuda
+from . import _core
 from ._cascade import CascadeResult, certify_levels, solve_cascade
-from ._padding import Layout, PaddedHierarchy
-from ._problem import Tolerances, WorkingSet
+from ._problem import Layout, PaddedHierarchy, Tolerances, WorkingSet
 
 _BLOCK = 256
 """Number of problems that the search solves together; on a GPU its many small operations cost the same for one."""
@@ -52,8 +51,8 @@ def _solve_on_platform(
     warm_start: WorkingSet | None,
 ) -> CascadeResult:
     kernels = {}
-    if takes(backend, "core-cuda", fits=_cuda.fits(layout)):
-        kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _cuda.solve)
+    if takes(backend, "core-cuda", fits=_core.fits(layout)):
+        kernels["core-cuda"] = kernel_candidates(layout, max_iterations, _core.solve_on_gpu)
     if takes(backend, "core", fits=True):
         kernels["core"] = kernel_candidates(layout, max_iterations, _core.solve)
 

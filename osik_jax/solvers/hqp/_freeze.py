@@ -16,9 +16,8 @@ from ...numerics._constants import ZERO_PIVOT
 from ...numerics._dense import apply, product
 from .._damping import narrow_box
 from ._implicit_diff import ActiveSets
-from ._padding import LevelProblem
 from ._primal_active_set import PrimalState
-from ._problem import Tolerances, WorkingSet
+from ._problem import LevelProblem, Tolerances, WorkingSet
 from ._working_set_solve import gradient_roundoff, slack_roundoff
 
 
@@ -77,7 +76,7 @@ def freeze(
         in_cost=side,
         rank=jnp.where(tie, end.rank, rank - frozen_count),
     )
-    own = jnp.where(problem.is_equality, 2, side).astype(jnp.int32)
+    own = jnp.where(problem.level.equal, 2, side).astype(jnp.int32)
     slack_norm = jnp.sqrt(jnp.sum(found.slack**2))
     outcome = LevelOutcome(active_sets, WorkingSet(end.active, own), end.multiplier, slack_norm)
     return _state_below(state, problem, end, found, basis), outcome
@@ -92,7 +91,7 @@ def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances)
     # a short row has the roundoff of the longest one
     short = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + root_cost)
     slack_tol = jnp.maximum(short, slack_roundoff(problem, end.x, slack, tolerances))
-    in_cost = problem.is_equality | (jnp.abs(slack) > slack_tol)
+    in_cost = problem.level.equal | (jnp.abs(slack) > slack_tol)
     gradient = problem.gradient(end.x, jnp.where(in_cost, slack, 0.0))
     force = jnp.abs(end.multiplier) * problem.length
     roundoff = gradient_roundoff(problem, end.x, slack, tolerances)

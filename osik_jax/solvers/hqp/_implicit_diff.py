@@ -9,18 +9,20 @@ grow with its iterations.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ...execution._backends import Backend
 from ...execution._rules import custom_jvp
 from ...numerics._dense import apply, product
 from .._damping import Damping, HardRows, level_damping, narrow_box
-from .._inverses import row_space_and_motion, row_space_and_motion_of_rank
-from .._level import Level
-from ._padding import PaddedHierarchy
+from .._inverses import row_space_and_motion
+from .._level import PaddedLevel
+from ._problem import PaddedHierarchy
 
 
 class ActiveSets(NamedTuple):
@@ -33,38 +35,44 @@ class ActiveSets(NamedTuple):
 
 
 def with_derivative(
-    x: Float[Array, " n"], active_sets: ActiveSets, hierarchy: PaddedHierarchy, singular_tol: Float[Array, ""]
+    x: Float[Array, " n"],
+    active_sets: ActiveSets,
+    hierarchy: PaddedHierarchy,
+    singular_tol: Float[Array, ""],
+    backend: Backend,
 ) -> Float[Array, " n"]:
     """Return ``x`` unchanged, with the derivatives of the cascade at fixed active sets.
 
     Singular values up to ``singular_tol`` times the longest row are 0, whatever the rank of the active sets.
     """
-    return _attach(jax.lax.stop_gradient(x), active_sets, singular_tol, hierarchy)
+    return _attach(jax.lax.stop_gradient(x), active_sets, singular_tol, hierarchy, backend=backend)
 
 
 @custom_jvp
-def _attach(x: Array, active_sets: ActiveSets, singular_tol: Array, hierarchy: PaddedHierarchy) -> Array:
+def _attach(
+    x: Array, active_sets: ActiveSets, singular_tol: Array, hierarchy: PaddedHierarchy, *, backend: Backend
+) -> Array:
     return x
 
 
 @_attach.defjvp
-def _attach_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
+def _attach_jvp(primals: tuple, tangents: tuple, *, backend: Backend) -> tuple[Array, Array]:
     x, active_sets, singular_tol, hierarchy = primals
     *_, rates = tangents
-    _, dx = jax.jvp(lambda data: _solve_at_active_sets(active_sets, singular_tol, data), (hierarchy,), (rates,))
+    _, dx = jax.jvp(partial(_solve_at_active_sets, active_sets, singular_tol, backend), (hierarchy,), (rates,))
     # not x alone: the second derivative needs this rule again
-    return _attach(x, active_sets, singular_tol, hierarchy), dx
+    return _attach(x, active_sets, singular_tol, hierarchy, backend=backend), dx
 
 
 def _solve_at_active_sets(
-    active_sets: ActiveSets, singular_tol: Float[Array, ""], hierarchy: PaddedHierarchy
+    active_sets: ActiveSets, singular_tol: Float[Array, ""], backend: Backend, hierarchy: PaddedHierarchy
 ) -> Float[Array, " n"]:
     """Return the answer of the equality-constrained least-squares cascade defined by the active sets."""
     n = hierarchy.hard.shape[1]
     pinned = hierarchy.hard_is_equality[:n]
 
     def solve_level(
-        state: tuple[Array, ...], now: tuple[Array, ActiveSets, Level, Damping]
+        state: tuple[Array, ...], now: tuple[Array, ActiveSets, PaddedLevel, Damping]
     ) -> tuple[tuple[Array, ...], None]:
         k, sets, level, terms = now
         x, projector, low, high, curvature = state
@@ -77,11 +85,12 @@ def _solve_at_active_sets(
         )
         damping = level_damping(terms, level, x, projector, low, high, above)
         # the level moves within what all active rows leave free; below it only the frozen ones are equalities
-        x, free = _fit_rows(*_active_first(*hard, sets.active), n, x, projector, singular_tol)
-        _, free_below = _fit_rows(*_active_first(*hard, sets.frozen), n, x, projector, singular_tol)
+        fit = partial(_fit_rows, singular_tol, backend)
+        x, free = fit(*_active_first(*hard, sets.active), None, x, projector)
+        _, free_below = fit(*_active_first(*hard, sets.frozen), None, x, projector)
         own = level.matrix, level.lower, level.upper, sets.in_cost, sets.rank
-        x, _ = _fit_rows(*own, x, free, singular_tol, damping)
-        _, free_below = _fit_rows(*own, x, free_below, singular_tol)
+        x, _ = fit(*own, x, free, damping)
+        _, free_below = fit(*own, x, free_below)
         return (x, free_below, *narrow_box(terms, level, curvature, x, low, high)), None
 
     box = hierarchy.hard_lower[:n], hierarchy.hard_upper[:n]
@@ -102,21 +111,22 @@ def _active_first(matrix: Array, lower: Array, upper: Array, active: Array) -> t
 
 
 def _fit_rows(
+    singular_tol: Float[Array, ""],
+    backend: Backend,
     matrix: Float[Array, "k n"],
     lower: Float[Array, " k"],
     upper: Float[Array, " k"],
     active: Int[Array, " k"],
-    rank: Array | int,
+    rank: Array | None,
     x: Float[Array, " n"],
     projector: Float[Array, "n n"],
-    singular_tol: Float[Array, ""],
     damping: Float[Array, ""] | None = None,
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Move x within the projector's range to bring the active rows nearest to their bounds.
 
     With C the active rows times the projector P and g what they miss, the motion is ``C^+ g``, with a pseudo-inverse of
-    the given rank at most. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``. Return the new x, and the
-    projector without the row space of C.
+    the given rank at most, if one is given. With damping it minimises ``|C d - g|^2 + damping |x + d|^2``. Return the
+    new x, and the projector without the row space of C.
     """
     is_active = active != 0
     target = jnp.where(active < 0, _masked(lower, active < 0), _masked(upper, active > 0))
@@ -125,10 +135,11 @@ def _fit_rows(
     longest = jnp.max(jnp.abs(jax.lax.stop_gradient(chosen)))
     gap = jnp.where(is_active, target - apply(chosen, x), 0.0)
     rows, cutoff = product(chosen, projector), singular_tol * longest
-    space, motion = row_space_and_motion_of_rank(rows, gap, rank, cutoff)
+    space, motion = row_space_and_motion(rows, gap, cutoff, jnp.zeros_like(cutoff), rank, backend=backend)
     if damping is not None:
         is_damped = damping > 0.0
-        _, whole = row_space_and_motion(rows, gap + apply(rows, x), cutoff, jnp.where(is_damped, damping, 1.0))
+        damping = jnp.where(is_damped, damping, 1.0)
+        _, whole = row_space_and_motion(rows, gap + apply(rows, x), cutoff, damping, None, backend=backend)
         # the damped minimiser does not depend on x: all of x in the projector's range is replaced
         motion = jnp.where(is_damped, whole - x, motion)
     # rounding over small singular values has components outside the projector's range, so both are projected (eq. 7)

@@ -22,8 +22,7 @@ from ...execution._double import first_smallest
 from ...numerics._constants import EXTRA_DAMPING, MAX_STALLED, STATIONARITY_TOL
 from ...numerics._dense import apply
 from ._active_rows import ActiveRows, factor_active_rows, multipliers
-from ._padding import LevelProblem
-from ._problem import Tolerances
+from ._problem import LevelProblem, Tolerances
 from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_signs
 
 
@@ -54,7 +53,7 @@ def primal_active_set(
     def iterate(s: PrimalState) -> PrimalState:
         value = apply(level.matrix, s.x)
         slack = value - jnp.clip(value, level.lower, level.upper)
-        in_cost = (slack != 0.0) | problem.is_equality
+        in_cost = (slack != 0.0) | problem.level.equal
         rows = jax.lax.optimization_barrier(factor_active_rows(problem, s.active, tolerances.rank))
         least_squares_step, rank = factor_least_squares(problem, in_cost, rows, tolerances)
         step = apply(problem.projector, least_squares_step(s.x, slack))

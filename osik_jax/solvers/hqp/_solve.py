@@ -19,8 +19,7 @@ from .._status import Status
 from ._cascade import CascadeResult
 from ._dispatch import hierarchy_solver
 from ._implicit_diff import with_derivative
-from ._padding import pad_hierarchy
-from ._problem import HQPSolution, Tolerances, WorkingSet
+from ._problem import HQPSolution, Tolerances, WorkingSet, pad_hierarchy
 
 
 @partial(jax.jit, static_argnames=("max_iterations", "backend"))
@@ -73,25 +72,25 @@ def solve_hqp(
     damping_is_valid = jnp.stack([(jnp.isfinite(a) & (a >= 0.0)).all() for a in dampings]).all()
     is_finite = jnp.stack([*are_finite(levels), bounds_exist(lower, upper), damping_is_valid]).all()
     # where the data are not finite, a placeholder is solved: equalities of zeros in a box of ones
-    is_equality = [level.equal | ~is_finite for level in levels]
+    equal = [level.equal | ~is_finite for level in levels]
     levels, unordered = zip(*(level.ordered() for level in levels), strict=True) if levels else ((), ())
     low, high, box_unordered = ordered_bounds(lower, upper)
     bounds_are_ordered = ~jnp.stack([box_unordered, *unordered]).any()
     low, high = (jnp.where(is_finite, b, one).astype(dtype) for b, one in ((low, -1.0), (high, 1.0)))
     scaled = [jax.tree.map(lambda leaf: jnp.where(is_finite, leaf, 0.0), level.scaled()) for level in levels]
     # a last level without rows and with a damping of 1 minimises |x|^2
-    scaled, is_equality = [*scaled, _no_rows(len(low), dtype)], [*is_equality, jnp.ones(0, bool)]
+    scaled, equal = [*scaled, _no_rows(len(low), dtype)], [*equal, jnp.ones(0, bool)]
     smallest_norm = (1.0, 0.0, 0.0, 0.0)
     dampings = Damping(
         *(_append(jnp.where(is_finite, a, 0.0), last) for a, last in zip(dampings, smallest_norm, strict=True))
     )
-    layout, hierarchy = pad_hierarchy(scaled, is_equality, low, high, (lower >= upper) & is_finite, dampings)
+    layout, hierarchy = pad_hierarchy(scaled, equal, low, high, (lower >= upper) & is_finite, dampings)
     traced = jax.tree.map(lambda a: jnp.asarray(a, dtype), tolerances)
     solve = hierarchy_solver(layout, max_iterations, check_backend(backend))
     result = _rules.found(solve(*jax.lax.stop_gradient((hierarchy, traced, warm_start))))
     # the derivative is computed in the precision of the data: no singular value below its roundoff is inverted
     singular_tol = jnp.maximum(ZERO_PIVOT * traced.rank, SINGULAR_TOL * jnp.finfo(dtype).eps)
-    x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol)
+    x = with_derivative(result.x, result.active_sets, hierarchy, singular_tol, backend)
     return _solution(levels, result, x, is_finite, bounds_are_ordered, lower, upper)
 
 

@@ -11,10 +11,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...numerics._constants import DAMPED_RANK, WORKING_SET_SOLVES
 from ...numerics._dense import apply, product
-from .._level import Level
+from .._level import PaddedLevel
 from ._active_rows import ActiveRows, drop_dependent, factor_active_rows, multipliers, restoring_step
-from ._padding import LevelProblem
-from ._problem import Tolerances, WorkingSet
+from ._problem import LevelProblem, Tolerances, WorkingSet
 
 
 class WorkingSetSolution(NamedTuple):
@@ -146,7 +145,7 @@ def _is_feasible(
 
 
 def _is_consistent(
-    level: Level, own: Int[Array, " m"], x: Float[Array, " n"], tolerances: Tolerances
+    level: PaddedLevel, own: Int[Array, " m"], x: Float[Array, " n"], tolerances: Tolerances
 ) -> Bool[Array, ""]:
     """Check that the rows in the cost are exactly those outside their interval, on the assumed side."""
     value = apply(level.matrix, x)

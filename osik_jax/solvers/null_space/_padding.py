@@ -1,36 +1,65 @@
-"""Levels of a projection padded to one shape, so that one ``scan`` runs over all of them."""
+"""Pytrees of a projection: its answer, the rows that take part, and levels padded to one shape for one ``scan``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from ...numerics._constants import ENTRY_ROUNDOFF
 from ...numerics._dense import apply
 from .._damping import Damping
-from ..hqp import Level
+from .._level import Level, PaddedLevel
 
 
-class PaddedLevel(NamedTuple):
-    """Level padded with zero rows without bounds, with the interface of ``Level``.
+class NullSpaceSolution(eqx.Module):
+    """Answer of the projection.
 
-    Which rows are equalities is decided once, and not by comparing bounds again: XLA may compute those twice, with
-    different roundoff.
+    Attributes:
+        x: the answer; with bounds, inside them exactly, whatever the status. (n,)
+        slacks: of each level, A x minus the nearest point of its interval (unweighted). ((m,), ...)
+        status: SOLVED; INFEASIBLE where bounds cross (their middle stands for them);
+            NUMERICAL_ERROR where the data are not finite (x is then 0, clipped to its bounds);
+            with bounds, MAX_ITERATIONS where the search for the saturated joints was cut short.
+        projector: onto the null space of all levels; without bounds, the secondary motion went through it. (n, n)
+        scales: of each level, the largest part s of its motion that the bounds allow; 1 without bounds. (k,)
+        active: -1 at the lower bound, 1 at the upper, 2 pinned by equal bounds, 0 free. (n,)
+        iterations: of the search for the saturated joints, all levels together; 0 without bounds.
     """
 
-    matrix: Float[Array, "m n"]
-    lower: Float[Array, " m"]
-    upper: Float[Array, " m"]
-    equal: Bool[Array, " m"]
+    x: Float[Array, " n"]
+    slacks: tuple[Float[Array, " m"], ...]
+    status: Int[Array, ""]
+    projector: Float[Array, "n n"]
+    scales: Float[Array, " k"]
+    active: Int[Array, " n"]
+    iterations: Int[Array, ""]
 
-    def distance(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """Return A x minus the nearest point of its interval; a clip would halve the derivative at equalities."""
-        value = apply(self.matrix, x)
-        return value - jnp.where(self.equal, self.lower, jnp.clip(value, self.lower, self.upper))
+
+class ActiveTask(NamedTuple):
+    """Rows of a level that are active at a point (0 for others), and the error they should remove.
+
+    ``cutoff`` is the smallest pivot of these rows, projected, that is not 0: rows that have less outside the span of
+    the longer ones count as dependent.
+    """
+
+    rows: Float[Array, "m n"]
+    error: Float[Array, " m"]
+    cutoff: Float[Array, ""]
+
+    @classmethod
+    def at(cls, level: Level | PaddedLevel, x: Float[Array, " n"], rank_tol: Array | float) -> ActiveTask:
+        """Return the rows active at x: equalities always, inequalities if x violates them."""
+        value, equal = apply(level.matrix, x), level.equal
+        # a clip halves its derivative between equal bounds
+        error = jnp.where(equal, level.lower, jnp.clip(value, level.lower, level.upper)) - value
+        is_active = equal | (error != 0.0)
+        rows = jnp.where(is_active[:, None], level.matrix, 0.0)
+        return cls(rows, error, rank_tol * jnp.sqrt(jnp.sum(jax.lax.stop_gradient(rows) ** 2)))
 
 
 class Problem(NamedTuple):
@@ -49,13 +78,13 @@ def pad_levels(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Sequence[Damping],
+    damping: Damping,
     rank_tol: Array | float,
 ) -> Problem:
     """Return the padded problem; a secondary motion is one more level without rows.
 
-    Levels are in the order of priority, weights multiplied in. Rows of a relative length under ``rank_tol`` count as
-    dependent.
+    Levels are in the order of priority, weights multiplied in; the damping has an axis of levels. Rows of a relative
+    length under ``rank_tol`` count as dependent.
     """
     n, dtype = len(lower), lower.dtype
     targets = [jnp.zeros(n, dtype)] * len(levels)
@@ -63,23 +92,18 @@ def pad_levels(
         # a level without rows keeps nothing and asks for the motion towards its target
         no_bounds = jnp.zeros(0, dtype)
         levels = [*levels, Level(jnp.zeros((0, n), dtype), no_bounds, no_bounds)]
-        targets, damping = [*targets, secondary], [*damping, jax.tree.map(jnp.zeros_like, damping[0])]
+        targets = [*targets, secondary]
+        damping = jax.tree.map(lambda a: jnp.concatenate([a, jnp.zeros_like(a[:1])]), damping)
     count = max(1, *(len(level.lower) for level in levels))
-    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(_pad(level, count) for level in levels))
+    stacked = jax.tree.map(lambda *a: jnp.stack(a), *(level.padded(count, level.equal) for level in levels))
     return Problem(
         stacked,
-        jax.tree.map(lambda *a: jnp.stack(a), *damping),
+        damping,
         jnp.stack(targets),
         lower,
         upper,
         jnp.asarray(rank_tol, dtype),
     )
-
-
-def _pad(level: Level, count: int) -> PaddedLevel:
-    padded = level.padded(count)
-    equal = jnp.pad(level.equal, (0, count - len(level.lower)))
-    return PaddedLevel(padded.matrix, padded.lower, padded.upper, equal)
 
 
 def without_roundoff(problem: Problem) -> Problem:

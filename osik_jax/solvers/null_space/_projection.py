@@ -9,35 +9,93 @@ higher ones.
 
 When not to use it: where bounds have to hold (``_saturation.py``), or inequalities (``solve_hqp``): an inequality row
 takes part only while the levels above it leave it violated, and nothing keeps lower levels from violating it again.
-Where a level loses rank against those above it, the levels below jump (``_reverse.py`` does not).
+Where a level loses rank against those above it, the levels below jump.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import cast
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ...execution._backends import Backend
+from ...core import _library
+from ...execution._backends import Backend, on_platforms, takes
+from ...execution._lanes import in_lanes
+from ...execution._rules import custom_jvp
 from ...numerics._constants import FULL_STEP, NEGLIGIBLE_STEP
 from ...numerics._dense import apply, product
 from ...numerics._guarded import greatest, quotient
 from .._damping import Damping, level_damping, narrow_box
 from .._inverses import row_space_and_motion
-from ..hqp import Level
-from ._padding import PaddedLevel
-from ._problem import ActiveTask
+from .._level import Level, PaddedLevel
+from . import _cuda
+from ._padding import ActiveTask
+
+Answer = tuple[Float[Array, " n"], Float[Array, "n n"]]
+"""Answer x, and the projector onto the null space of all levels."""
+
+
+def project(
+    levels: Sequence[Level], secondary: Float[Array, " n"], damping: Damping, rank_tol: Array | float, backend: Backend
+) -> Answer:
+    """Return the result of ``solve_forward``, by the core if it is there, which computes in double precision."""
+    rank_tol = jnp.asarray(rank_tol, secondary.dtype)
+    if takes(backend, "core", fits=True):
+        return _by_kernel(list(levels), secondary, damping, rank_tol, backend=backend)
+    return solve_forward(list(levels), secondary, damping, rank_tol, backend=backend)
+
+
+@custom_jvp
+def _by_kernel(levels: list[Level], secondary: Array, damping: Damping, rank_tol: Array, *, backend: Backend) -> Answer:
+    return _on_platform(backend)(levels, secondary, damping, rank_tol)
+
+
+@_by_kernel.defjvp
+def _by_kernel_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...], *, backend: Backend) -> tuple[Answer, Answer]:
+    return jax.jvp(partial(solve_forward, backend=backend), primals, tangents)
+
+
+@cache
+def _on_platform(backend: Backend) -> Callable[[list[Level], Array, Damping, Array], Answer]:
+    """Return the function that solves one problem on the current platform."""
+    plain = jax.vmap(partial(solve_forward, backend=backend))
+
+    def solve(levels: list[Level], secondary: Float[Array, "B n"], *rest: Any) -> Any:
+        kernels: dict[str, Callable[..., Any]] = dict(core=partial(_by_core, _library.call))
+        rows = tuple(level.matrix.shape[1] for level in levels)
+        if takes(backend, "core-cuda", fits=_cuda.fits(secondary.shape[1], rows)):
+            kernels["core-cuda"] = partial(_by_core, _cuda.project)
+        return on_platforms(kernels, plain, levels, secondary, *rest)
+
+    return in_lanes(solve)
+
+
+def _by_core(
+    call: Callable[..., list[Array]],
+    levels: list[Level],
+    secondary: Float[Array, "B n"],
+    damping: Damping,
+    rank_tol: Float[Array, " B"],
+) -> tuple[Float[Array, "B n"], Float[Array, "B n n"]]:
+    batch, n = secondary.shape
+    equal = [jax.vmap(lambda one: one.equal)(level) for level in levels]
+    rows = [a for level, e in zip(levels, equal, strict=True) for a in (level.matrix, level.lower, level.upper, e)]
+    outputs = [((batch, n), float), ((batch, n, n), float)]
+    x, projector = call("projection", outputs, secondary, *damping, rank_tol, *rows)
+    return x, projector
 
 
 def solve_forward(
     levels: Sequence[Level],
     secondary: Float[Array, " n"],
-    damping: Sequence[Damping],
+    damping: Damping,
     rank_tol: Array | float,
     backend: Backend = "jax",
-) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+) -> Answer:
     """Return the answer, and the projector onto the null space of all levels.
 
     The arguments are those of ``pad_levels``; the secondary motion is projected onto what all levels leave free.
@@ -45,7 +103,8 @@ def solve_forward(
     x, projector = jnp.zeros_like(secondary), jnp.eye(len(secondary), dtype=secondary.dtype)
     curvature = jnp.zeros_like(x)
     lower, upper = jnp.full_like(x, -jnp.inf), jnp.full_like(x, jnp.inf)
-    for level, one in zip(levels, damping, strict=True):
+    for level, *parts in zip(levels, *damping, strict=True):
+        one = Damping(*parts)
         # eq. 7: x_k = x_{k-1} + (J_k P_{k-1})^+ (b_k - J_k x_{k-1}), and P_k
         motion, projector, _ = level_motion(level, x, projector, one, rank_tol, backend)
         x = x + _step_length(x, motion, lower, upper) * motion
@@ -84,10 +143,10 @@ def level_motion(
         return jnp.zeros_like(x), projector, jnp.zeros_like(x[0])
     task = ActiveTask.at(level, x, rank_tol)
     unbounded = jnp.full_like(x, jnp.inf)
-    total = level_damping(damping, cast(Level, level), x, projector, -unbounded, unbounded)
+    total = level_damping(damping, level, x, projector, -unbounded, unbounded)
     # with P = P_{k-1}: the rows J_k P, and the motion P J_k' (J_k P J_k' + damping I)^-1 error
     restricted = product(task.rows, projector)
-    space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, backend=backend)
+    space, motion = row_space_and_motion(restricted, task.error, task.cutoff, total, None, backend=backend)
     # roundoff over small singular values has components outside the projector's range, so the motion is projected
     return apply(projector, motion), projector - product(projector, product(space, projector)), total
 

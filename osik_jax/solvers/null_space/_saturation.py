@@ -43,10 +43,10 @@ from ...execution._rules import found as kept
 from ...numerics._constants import BLOCKING_RANK, BOUND_DISTANCE
 from .._damping import Damping, narrow_box
 from .._inverses import row_space_and_motion
-from ..hqp import Level
+from .._level import Level, PaddedLevel
 from . import _cuda
 from ._implicit_diff import ActiveJoints, SaturatedResult, with_derivative
-from ._padding import PaddedLevel, Problem, initial_point, pad_levels, without_roundoff
+from ._padding import Problem, initial_point, pad_levels, without_roundoff
 from ._projection import level_motion
 from ._scale_path import least_cost
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
@@ -68,7 +68,7 @@ def solve_saturated(
     lower: Float[Array, " n"],
     upper: Float[Array, " n"],
     secondary: Float[Array, " n"] | None,
-    damping: Sequence[Damping],
+    damping: Damping,
     rank_tol: Array | float,
     max_iterations: int,
     backend: Backend = "jax",
@@ -196,7 +196,7 @@ def _after_level(
     # the blocking joints can move no more: their columns are removed from the projector
     columns = jnp.where((blocking != 0)[:, None], motion.projector, 0.0)
     zero = jnp.zeros((), columns.dtype)
-    space, _ = row_space_and_motion(columns, columns[:, 0], zero + BLOCKING_RANK, zero, backend=backend)
+    space, _ = row_space_and_motion(columns, columns[:, 0], zero + BLOCKING_RANK, zero, None, backend=backend)
     keep = (blocking == 0)[:, None] & (blocking == 0)[None, :]
     fixed = jnp.where(state.fixed == 0, blocking, state.fixed)
     x = jnp.where(

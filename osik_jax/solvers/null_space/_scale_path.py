@@ -27,8 +27,8 @@ from ...execution._rules import custom_jvp
 from ...numerics._constants import DERIVATIVE_RANK, PART, PATH_END, PATH_SEARCHES, PATH_STEP, STRAIGHT, WHOLE
 from ...numerics._dense import apply, product
 from ...numerics._guarded import quotient
-from ._padding import PaddedLevel
-from ._problem import ActiveTask
+from .._level import PaddedLevel
+from ._padding import ActiveTask
 from ._projection import damped_step_length
 from ._scaled_motion import SaturationResult, ScaledMotion, solve_scaled_motion
 

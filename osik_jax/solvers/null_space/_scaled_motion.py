@@ -33,11 +33,10 @@ from ...numerics._dense import apply
 from ...numerics._guarded import quotient
 from .._box import clip_to_box
 from .._damping import Damping
-from ..hqp import Level
+from .._level import PaddedLevel
 from ..hqp._active_rows import drop_dependent, factor_active_rows
-from ..hqp._padding import LevelProblem
 from ..hqp._primal_active_set import PrimalState, primal_active_set
-from ..hqp._problem import Tolerances
+from ..hqp._problem import LevelProblem, Tolerances
 
 
 class ScaledMotion(NamedTuple):
@@ -108,7 +107,7 @@ def _saturate(problem: ScaledMotion, skip: Bool[Array, ""], max_iterations: int)
     unit = problem.motion / jnp.where(length > 0.0, length, 1.0)
     rows, goal = unit[None], jnp.sum(unit * problem.start)[None] + length
     space = problem.projector + unit[:, None] * unit[None, :]
-    first = _level(problem, Level(rows, goal), problem.start, space)
+    first = _level(problem, rows, goal, problem.start, space)
     far = primal_active_set(first, _primal_state(first, inactive, skip), tolerances, max_iterations)
     is_whole = jnp.sum(unit * (far.x - problem.start)) >= (1.0 - SATURATION_ROUNDOFF) * length
     largest = jnp.max(jnp.abs(far.multiplier))
@@ -120,7 +119,7 @@ def _saturate(problem: ScaledMotion, skip: Bool[Array, ""], max_iterations: int)
     others = blocking.at[blocker].set(0)
     scale = jnp.where(is_whole, 1.0, blocked_scale(problem, blocking, normal))
     # the second level: the nearest point to the target, with the blocking joints where they are
-    start = _level(problem, Level(jnp.eye(len(unit), dtype=unit.dtype), problem.target), far.x, problem.projector)
+    start = _level(problem, jnp.eye(len(unit), dtype=unit.dtype), problem.target, far.x, problem.projector)
     left = factor_active_rows(start, others, tolerances.rank).projector
     second = start._replace(projector=left, may_block=start.may_block & (blocking == 0))
     kept = jnp.where(blocking != 0, 0, far.active)
@@ -138,20 +137,25 @@ def _saturate(problem: ScaledMotion, skip: Bool[Array, ""], max_iterations: int)
     return SaturationResult(x, scale, active, blocking, blocker, iterations, far.done & end.done & is_exact)
 
 
-def _level(problem: ScaledMotion, level: Level, x: Float[Array, " n"], projector: Float[Array, "n n"]) -> LevelProblem:
-    """Return a level of equalities over x + the range of the projector, in the box."""
+def _level(
+    problem: ScaledMotion,
+    matrix: Float[Array, "m n"],
+    goal: Float[Array, " m"],
+    x: Float[Array, " n"],
+    projector: Float[Array, "n n"],
+) -> LevelProblem:
+    """Return the level matrix x = goal over x + the range of the projector, in the box."""
     n, no = len(x), jnp.zeros(len(x), bool)
     return LevelProblem(
-        level=level,
+        level=PaddedLevel(matrix, goal, goal, jnp.ones(goal.shape, bool)),
         damping=jnp.zeros((), x.dtype),
         damping_terms=Damping(),
-        is_equality=jnp.ones(level.lower.shape, bool),
         hard=jnp.eye(n, dtype=x.dtype),
         lower=problem.lower,
         upper=problem.upper,
         may_block=problem.lower < problem.upper,
         is_own=no,
-        hard_of_row=jnp.full(level.lower.shape, n, jnp.int32),
+        hard_of_row=jnp.full(goal.shape, n, jnp.int32),
         projector=projector,
         x=x,
     )
@@ -160,7 +164,7 @@ def _level(problem: ScaledMotion, level: Level, x: Float[Array, " n"], projector
 def _primal_state(problem: LevelProblem, active: Int[Array, " n"], done: Bool[Array, ""]) -> PrimalState:
     """Return the start of the primal method at the level's x."""
     zero, zeros = jnp.zeros((), jnp.int32), jnp.zeros_like(problem.x)
-    return PrimalState(problem.x, active, zeros, problem.is_equality, zero, zeros[0], zero, zero > 0, zero, done)
+    return PrimalState(problem.x, active, zeros, problem.level.equal, zero, zeros[0], zero, zero > 0, zero, done)
 
 
 def blocked_scale(problem: ScaledMotion, active: Int[Array, " n"], normal: Float[Array, " n"]) -> Float[Array, ""]:

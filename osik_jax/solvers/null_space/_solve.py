@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,21 +18,17 @@ from .._damping import Damping, per_level
 from .._level import are_finite, bounds_exist
 from .._status import Status
 from ..hqp import Level
-from ._dispatch import project
-from ._problem import NullSpaceSolution
-from ._reverse import solve_reverse
+from ._padding import NullSpaceSolution
+from ._projection import project
 from ._saturation import BoundedAnswer, solve_saturated
 
-ORDERS = ("forward", "reverse")
 
-
-@partial(jax.jit, static_argnames=("order", "max_iterations", "backend"))
+@partial(jax.jit, static_argnames=("max_iterations", "backend"))
 def solve_nullspace(
     levels: Sequence[Level],
     lower: Float[ArrayLike, " n"] | None = None,
     upper: Float[ArrayLike, " n"] | None = None,
     *,
-    order: Literal["forward", "reverse"] = "forward",
     secondary: Float[Array, " n"] | None = None,
     damping: Float[Array, ""] | float | Damping | Sequence[Float[Array, ""] | Damping] = 0.0,
     rank_tolerance: Float[Array, ""] | float | None = None,
@@ -42,27 +38,21 @@ def solve_nullspace(
     """Solve each level as nearly as the null space of the levels above it allows.
 
     Pure, compiled on first use, batched by ``vmap``, differentiable in both modes: at constant rank, and with bounds at
-    the saturated joints. Three methods:
+    the saturated joints. Two methods:
 
-    - no bounds, ``order="forward"``: the classical projection, from the highest level down (eqs. 6 and 7).
-    - no bounds, ``order="reverse"``: from the lowest level up, the highest last (Flacco, De Luca 2014). Both orders
-      give the same answer where all levels can be met together. Where they cannot, the highest level is as exact as if
-      it were alone in both; the reverse order has no jump where a level comes to depend on those above.
+    - no bounds: the classical projection, from the highest level down (eqs. 6 and 7).
     - bounds: saturation in the null space (Flacco, De Luca, Khatib 2012, 2015). Joints that would leave their bounds
       are saturated and the others take over; a level for which that does not suffice is scaled down, by the largest
       scale that fits.
 
     Args:
-        levels: highest priority first. A row with lower < upper counts only where it is violated by what came before
-            it: the levels above, in reverse order those below and the secondary motion.
+        levels: highest priority first. A row with lower < upper counts only where the levels above violate it.
         lower: hard bounds on x, -inf where unbounded; equal to ``upper`` for joints that cannot be moved. (n,)
         upper: hard bounds on x, inf where unbounded. (n,)
-        order: of the levels (static).
         secondary: motion in what all levels leave free, such as a potential's descent; with bounds, x comes as near to
             it as levels and bounds allow. (n,)
         damping: of the motion of each level, in squared singular values: s / (s^2 + damping) stands for 1 / s. One for
-            all, or a list with one for each level. A ``Damping`` has a part that vanishes where the level can be met;
-            in the reverse order all of it counts.
+            all, or a list with one for each level. A ``Damping`` has a part that vanishes where the level can be met.
         rank_tolerance: rows of A P that stand out of the span of the longer ones by less than this share of the
             Frobenius norm of A count as dependent on them (P projects onto what the levels before leave free);
             default 1e-10 (1e-5 in float32). Against A and not A P, so that a level which repeats one above it has
@@ -72,16 +62,12 @@ def solve_nullspace(
             "core" for those or an error. It changes the time, not the answer.
 
     Raises:
-        ValueError: an order that does not exist, bounds in reverse order, or a damping too many or few.
+        ValueError: a wrong shape, or a damping too many or few.
     """
     backend = check_backend(backend)
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)
-    if order not in ORDERS:
-        raise OsikValueError(f"order is {order!r}; orders: {', '.join(ORDERS)}")
-    if box is not None and order == "reverse":
-        raise OsikValueError("bounds need order='forward': saturation goes from the highest level down")
     # bounds with lower > upper become equalities halfway; the status says so
     # without a secondary motion x is the smallest: the motion towards 0
     motion = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
@@ -94,18 +80,14 @@ def solve_nullspace(
     valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
     scaled = [level.scaled() for level in valid]
     rank_tol = NULL_SPACE_RANK[dtype] if rank_tolerance is None else rank_tolerance
-    one_each = [Damping(*parts) for parts in zip(*dampings, strict=True)]
     if box is None:
-        if order == "forward":
-            answer = _unbounded(*project(scaled, motion, dampings, rank_tol, backend), count=len(levels))
-        else:
-            answer = _unbounded(*solve_reverse(scaled, motion, one_each, rank_tol, backend), count=len(levels))
+        answer = _unbounded(*project(scaled, motion, dampings, rank_tol, backend), count=len(levels))
         return _solution(valid, answer, is_valid, bounds_are_ordered, jnp.zeros(n, dtype))
     limit = 10 * (n + 2) if max_iterations is None else max_iterations
     low, high, empty = ordered_bounds(*box)
     safe = jnp.where(is_valid, low, -1.0), jnp.where(is_valid, high, 1.0)
     target = None if secondary is None else motion
-    answer = solve_saturated(scaled, *safe, target, one_each, rank_tol, limit, backend)
+    answer = solve_saturated(scaled, *safe, target, dampings, rank_tol, limit, backend)
     return _solution(valid, answer, is_valid, bounds_are_ordered & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
 
 

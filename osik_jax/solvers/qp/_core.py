@@ -1,17 +1,18 @@
-"""Candidates for weighted QPs from the compiled core (``core/weighted_qp.hpp``)."""
+"""Candidates for weighted QPs from the core (``core/weighted_qp.hpp``); on a GPU one warp of 32 threads a problem."""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...core import _library
+from ...core import _cuda, _library
 from ...execution._computed import side_by_side
-from ...numerics._constants import INACTIVE, KKT_TOLERANCE, REDUNDANT
-from ._cost import LeastSquares
-from ._problem import QP, arrays
+from ...numerics._constants import INACTIVE, KKT_TOLERANCE, REDUNDANT, SINGLE_TOL
+from ._problem import QP, LeastSquares
 
 CERTIFIED = 2
 """``Candidate.converged`` of a candidate that solves its problem; 1: there is one."""
@@ -41,7 +42,7 @@ def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_i
     cost = qp.cost
     assert isinstance(cost, LeastSquares)
     batch, _, n = cost.matrix.shape
-    p, (matrix, *others) = qp.rows.shape[1], arrays(qp)
+    p, (matrix, *others) = qp.rows.shape[1], jax.tree.leaves(qp)
     tolerances = jnp.stack([tolerance, jnp.full_like(tolerance, KKT_TOLERANCE[tolerance.dtype])], 1)
     x, y, active, report, residual = _library.call(
         "weighted_qp",
@@ -62,3 +63,75 @@ def of_core(
     active = jnp.where(active == REDUNDANT, INACTIVE, active)
     converged, iterations, factorizations = report.T
     return Candidate(x, row_multipliers, active, converged, iterations, factorizations, residual)
+
+
+_KERNEL = """
+using namespace osik;
+using Method = WeightedQP<Warp<Real, N, M, P>>;
+extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
+    const Real* matrix, const Real* target, const Real* weight, const Real* damping, const Real* center,
+    const Real* rows, const Real* compliance, const Real* lower, const Real* upper, const int* guess,
+    const Real* tolerance, Real* x, Real* multipliers, int* active, int* report, Real* residual, Real* outside,
+    int problems) {
+  const QPSizes s{M, N, P, MAX_CHANGES};
+  Method method(s, nullptr, outside + size_t(blockIdx.x) * DualActiveSet<Warp<Real, N, M, P>>::doubles(N, P));
+  QPCertificate<Warp<Real, N, M, P>> certificate(s, nullptr);
+  for (int b = 0; b < PER_BLOCK; ++b) {
+    const size_t k = size_t(blockIdx.x) * PER_BLOCK + b;
+    if (k >= problems) return;
+    const QPData<Real> d{matrix + k * M * N, target + k * M, weight + k * M, damping + k * N, center + k * N,
+                         rows + k * P * N, compliance + k * P, lower + k * (N + P), upper + k * (N + P),
+                         guess + k * (N + P), tolerance[k]};
+    method.solve(d, {x + k * N, multipliers + k * P, active + k * (N + P), report + k * 3});
+    const Certificate found = certificate.judge(method.copied(), method.X, method.Z + M, method.LABEL, KKT_TOLERANCE);
+    if (threadIdx.x == 0) report[k * 3] += report[k * 3] && found.holds && (sizeof(Real) == 4 || found.is_exact);
+    if (threadIdx.x == 0) residual[k] = found.residual;
+  }
+}
+"""
+
+
+def fits(qp: QP) -> bool:
+    """Return whether the GPU kernel supports a problem: least squares that fit its shared memory."""
+    if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
+        return False
+    m, n = qp.cost.matrix.shape[-2:]
+    return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.shared_bytes()
+
+
+def _bytes(m: int, n: int, p: int, single: bool) -> int:
+    return _cuda.space_of("weighted_qp", m, n, p, int(single))
+
+
+@cache
+def _source(m: int, n: int, p: int, single: bool, max_changes: int, per_block: int) -> str:
+    blocks = _cuda.blocks_beside(_bytes(m, n, p, single))
+    sizes = _cuda.constants(M=m, N=n, P=p, MAX_CHANGES=max_changes, PER_BLOCK=per_block, BLOCKS=blocks)
+    tolerance = KKT_TOLERANCE[jnp.dtype("float32" if single else "float64")]
+    kind = f"using Real = {'float' if single else 'double'};\nconstexpr Real KKT_TOLERANCE = {tolerance};\n"
+    return _cuda.text_of("qp_certificate.hpp") + sizes + kind + _KERNEL
+
+
+def solve_on_gpu(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
+    """Return candidates for a batch from the GPU, in the precision of the data; arguments as for ``solve``."""
+    cost = qp.cost
+    assert isinstance(cost, LeastSquares)
+    batch, m, n = cost.matrix.shape
+    p, kind = qp.rows.shape[1], cost.matrix.dtype
+    sizes = m, n, p, kind == jnp.float32
+    tolerance = jnp.maximum(tolerance, SINGLE_TOL) if kind == jnp.float32 else tolerance
+    numbers = (cost.matrix, cost.target, cost.weight, cost.damping, cost.center, qp.rows, qp.compliance)
+    per_block, most = _cuda.problems_of_a_block(batch), n + p
+    # of the dual method, which few problems need
+    outside = -(-batch // per_block), _cuda.space_outside("weighted_qp", n, p, int(kind == jnp.float32))
+    x, y, active, report, residual, _ = _cuda.call(
+        _source(*sizes, max_iterations, per_block),
+        [*_library.shapes_of(batch, ((n,), (p,)), ((most,), (3,)), kind), ((batch,), kind), (outside, kind)],
+        *(a.astype(kind) for a in (*numbers, qp.lower, qp.upper)),
+        guess.astype(jnp.int32),
+        tolerance.astype(kind),
+        problems=batch,
+        shared=_bytes(*sizes),
+        per_block=per_block,
+    )
+    return of_core(x, y, active, report, residual)

@@ -18,11 +18,10 @@ from ...execution._backends import Backend, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import EQUALITY, INACTIVE, SINGLE_TOL
-from . import _core, _cuda
+from . import _core
 from ._core import CERTIFIED, Candidate
-from ._cost import LeastSquares
 from ._kkt_solve import kkt_inverse
-from ._problem import QP
+from ._problem import QP, LeastSquares
 from ._search import SearchResult, search
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
@@ -46,8 +45,8 @@ def _solve_on_platform(
     max_iterations: int, backend: Backend, qp: QP, as_given: AsGiven, guess: Array, tolerance: Array
 ) -> SearchResult:
     kernels = {}
-    if takes(backend, "core-cuda", fits=_cuda.fits(qp)):
-        kernels["core-cuda"] = kernel_candidates(max_iterations, _cuda.solve)
+    if takes(backend, "core-cuda", fits=_core.fits(qp)):
+        kernels["core-cuda"] = kernel_candidates(max_iterations, _core.solve_on_gpu)
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
         kernels["core"] = kernel_candidates(max_iterations, _core.solve, FEW_ON_CPU)
 
@@ -104,7 +103,7 @@ def _block(batch: int) -> int:
 
 def kkt_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[Array], Array]:
     """Return ``kkt_inverse`` at an active set, computed by the core in single precision on a GPU."""
-    if not takes(backend, "core-cuda", fits=qp.lower.dtype == jnp.float32 and _cuda.fits(qp)):
+    if not takes(backend, "core-cuda", fits=qp.lower.dtype == jnp.float32 and _core.fits(qp)):
         return kkt_inverse(qp, active)
     return lambda right: _solve_kkt_on_platform()(qp, active, right)
 
@@ -134,7 +133,7 @@ def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) ->
         upper=jnp.where(is_equality, bound, jnp.inf),
     )
     tolerance = jnp.full(active.shape[0], SINGLE_TOL, center.dtype)
-    candidate = _cuda.solve(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
+    candidate = _core.solve_on_gpu(system, jnp.where(is_equality, EQUALITY, INACTIVE), tolerance, 0)
     point = jnp.concatenate([candidate.x, jnp.where(active_rows, candidate.row_multipliers, 0.0)], 1)
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)
 

@@ -1,8 +1,8 @@
-"""Pytrees of a quadratic program and its answer, and its optimality (KKT) conditions."""
+"""Pytrees of a quadratic program, its cost and its answer, and its optimality (KKT) conditions."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,11 +10,135 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...numerics._constants import AT_LOWER, AT_UPPER, BOUND_MULTIPLIER, INACTIVE, ROW_MULTIPLIER, ZERO_TOL
-from ...numerics._dense import apply
+from ...execution._platform import cuda_is_default
+from ...numerics._constants import (
+    AT_LOWER,
+    AT_UPPER,
+    BOUND_MULTIPLIER,
+    INACTIVE,
+    QUADRATIC_RIDGE,
+    ROW_MULTIPLIER,
+    ZERO_TOL,
+)
+from ...numerics._dense import apply, product
 from .._box import violation
-from .._certificate import largest_of_each, relative_kkt_residual
-from ._cost import LeastSquares, Quadratic
+
+
+class Quadratic(eqx.Module):
+    """Cost 1/2 x'Hx + g'x."""
+
+    matrix: Float[Array, "n n"]
+    linear: Float[Array, " n"]
+
+    def hessian(self) -> Float[Array, "n n"]:
+        """Return H, (n, n)."""
+        return self.matrix
+
+    def diagonal(self) -> Float[Array, " n"]:
+        """Return the diagonal of H, (n,)."""
+        return jnp.diagonal(self.matrix)
+
+    def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return H x + g, (n,)."""
+        return apply(self.matrix, x) + self.linear
+
+    def hessian_product(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return H x, (n,)."""
+        return apply(self.matrix, x)
+
+    def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the sums of the gradient's absolute terms, which scale its roundoff, (n,)."""
+        return apply(jnp.abs(self.matrix), jnp.abs(x)) + jnp.abs(self.linear)
+
+    def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "n n"]:
+        """Return R with R'R = H over the free variables, identity rows for others (Cholesky with a small ridge)."""
+        eps = QUADRATIC_RIDGE * float(jnp.finfo(self.matrix.dtype).eps)
+        square = jnp.where(free[:, None] & free[None, :], self.matrix, 0.0)
+        # relative to the largest diagonal element, so that a semidefinite H has a factor too
+        ridge = jnp.where(free, eps * jnp.max(jnp.diagonal(square), initial=eps), 1.0)
+        return jax.lax.linalg.cholesky(square + jnp.diag(ridge), symmetrize_input=False).T
+
+    def curvature_bound(self) -> Float[Array, " n"]:
+        """Return the diagonal of a matrix D >= H: row sums of |H| (Gershgorin), (n,)."""
+        return jnp.sum(jnp.abs(self.matrix), 1)
+
+    def in_units(self, unit: Float[Array, " n"]) -> Quadratic:
+        """Return the cost of x / unit."""
+        return Quadratic(self.matrix * unit[:, None] * unit, self.linear * unit)
+
+    def has_valid_signs(self) -> Bool[Array, ""]:
+        """Check that the diagonal of H is not negative."""
+        return jnp.all(self.diagonal() >= 0.0)
+
+    def placeholder(self) -> Quadratic:
+        """Return a cost of the same shape that certainly has a minimiser."""
+        return Quadratic(jnp.eye(len(self.linear), dtype=self.matrix.dtype), jnp.zeros_like(self.linear))
+
+
+class LeastSquares(eqx.Module):
+    """Cost 1/2 sum_i weight_i (A x - b)_i^2 + 1/2 sum_j damping_j (x_j - center_j)^2.
+
+    Products go through A: what is lost to roundoff in H = A'WA (small weights beside large ones) is kept.
+    """
+
+    matrix: Float[Array, "m n"]
+    target: Float[Array, " m"]
+    weight: Float[Array, " m"]
+    damping: Float[Array, " n"]
+    center: Float[Array, " n"]
+
+    def hessian(self) -> Float[Array, "n n"]:
+        """Return A'WA + D, (n, n)."""
+        return product(self.matrix.T * self.weight, self.matrix) + jnp.diag(self.damping)
+
+    def diagonal(self) -> Float[Array, " n"]:
+        """Return the diagonal of the Hessian, (n,)."""
+        return apply(self.matrix.T**2, self.weight) + self.damping
+
+    def gradient(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return A'W(A x - b) + D (x - c), (n,)."""
+        residual = self.weight * (apply(self.matrix, x) - self.target)
+        return apply(self.matrix.T, residual) + self.damping * (x - self.center)
+
+    def hessian_product(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return (A'WA + D) x, (n,)."""
+        return apply(self.matrix.T, self.weight * apply(self.matrix, x)) + self.damping * x
+
+    def gradient_scale(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """Return the sums of the gradient's absolute terms, which scale its roundoff, (n,)."""
+        size = jnp.abs(self.matrix)
+        # the terms that cancel in A x - b count one by one, and so do those of the damping
+        residual_scale = self.weight * (apply(size, jnp.abs(x)) + jnp.abs(self.target))
+        return apply(size.T, residual_scale) + self.damping * (jnp.abs(x) + jnp.abs(self.center))
+
+    def square_root(self, free: Bool[Array, " n"]) -> Float[Array, "m_and_n n"]:
+        """Return R with R'R = H over the free variables, identity rows for others: [sqrt(W) A; sqrt(D)]."""
+        diagonal = jnp.where(free, jnp.sqrt(self.damping), 1.0)
+        return jnp.concatenate([jnp.sqrt(self.weight)[:, None] * self.matrix * free, jnp.diag(diagonal)])
+
+    def curvature_bound(self) -> Float[Array, " n"]:
+        """Return the diagonal of a matrix that is no less than the Hessian: row sums of |A|'W|A| + D, (n,)."""
+        # |x'A'WA x| <= sum_ij |x_i| (|A|'W|A|)_ij |x_j| <= sum_i (row sum)_i x_i^2
+        size = jnp.abs(self.matrix)
+        return apply(size.T, self.weight * jnp.sum(size, 1)) + self.damping
+
+    def in_units(self, unit: Float[Array, " n"]) -> LeastSquares:
+        """Return the cost of x / unit."""
+        return LeastSquares(self.matrix * unit, self.target, self.weight, self.damping * unit**2, self.center / unit)
+
+    def has_valid_signs(self) -> Bool[Array, ""]:
+        """Check that weights and damping are not negative."""
+        return jnp.all(self.weight >= 0.0) & jnp.all(self.damping >= 0.0)
+
+    def placeholder(self) -> LeastSquares:
+        """Return a cost of the same shape that certainly has a minimiser."""
+        return LeastSquares(
+            matrix=jnp.zeros_like(self.matrix),
+            target=jnp.zeros_like(self.target),
+            weight=jnp.zeros_like(self.weight),
+            damping=jnp.ones_like(self.damping),
+            center=jnp.zeros_like(self.center),
+        )
 
 
 class QP(eqx.Module):
@@ -33,17 +157,6 @@ class QP(eqx.Module):
         """Return which constraints are equalities: those declared so, and those with equal bounds, (n + p,)."""
         equal = self.lower == self.upper
         return equal if self.known_equalities is None else equal | np.array(self.known_equalities)
-
-
-def arrays(qp: QP) -> list[Any]:
-    """Return the cost's matrix, then all other arrays in the order of ``pack``."""
-    return jax.tree.leaves(qp)
-
-
-def pack(qp: QP) -> tuple[Array | np.ndarray, Array]:
-    """Return the cost's matrix, and all other arrays concatenated; NumPy arrays are accepted."""
-    matrix, *others = arrays(qp)
-    return matrix, jnp.concatenate([jnp.ravel(a) for a in others])
 
 
 class QPSolution(eqx.Module):
@@ -173,3 +286,33 @@ def kkt_residual(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"], active: I
     scale = constraint_scales(qp, qp.cost.diagonal(), x, y).value[n:]
     stationarity = jnp.maximum(jnp.where(at_bound, 0.0, jnp.abs(gradient)), wrong_sign[:n])
     return relative_kkt_residual(stationarity, gradient_scale(qp, x, y), wrong_sign[n:], gap, scale)
+
+
+def relative_kkt_residual(
+    stationarity: Float[Array, " n"],
+    gradient_scale: Float[Array, " n"],
+    wrong_sign: Float[Array, " p"],
+    violation: Float[Array, " p"],
+    violation_scale: Float[Array, " p"],
+) -> Float[Array, ""]:
+    """Return the KKT residual of a point without units, comparable between problems of any weights.
+
+    It is the larger of two: the largest stationarity residual or wrong multiplier over the largest gradient scale, and
+    the largest violation of a row over the size of its terms and bounds. ``stationarity`` has the gradient of the
+    Lagrangian at variables without an active bound, and at the others multipliers of the wrong sign (not positive where
+    the sign is right). A gradient scale is the sum of the gradient's absolute terms; ``wrong_sign`` is in units of the
+    gradient.
+    """
+    residual, scale = largest_of_each(stationarity, gradient_scale)
+    # stationarity and signs in units of the forces; feasibility in those of the rows' own terms
+    dual = jnp.maximum(residual, jnp.max(wrong_sign, initial=0.0)) / jnp.where(scale > 0.0, scale, 1.0)
+    relative = violation / jnp.where(violation_scale > 0.0, violation_scale, 1.0)
+    primal = jnp.where(violation > 0.0, relative, 0.0)
+    return jnp.maximum(dual, jnp.max(primal, initial=0.0))
+
+
+def largest_of_each(*arrays: Float[Array, " n"]) -> list[Array]:
+    """Return the largest entry of each array, at least 0: one operation for all, but on a GPU, where XLA's is slow."""
+    if cuda_is_default():
+        return [jnp.max(a, initial=0.0) for a in arrays]
+    return list(jnp.max(jnp.stack(arrays), 1, initial=0.0))

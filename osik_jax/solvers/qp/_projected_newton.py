@@ -28,6 +28,9 @@ from ...numerics._constants import (
     AT_UPPER,
     COMPLIANCE_DECREASE,
     EQUALITY,
+    FARKAS_MARGIN,
+    FARKAS_RADIUS,
+    FARKAS_ROUNDOFF,
     FEASIBLE_AT_ONCE,
     FEASIBLE_DECREASE,
     FULL_STEP_ROUNDOFF,
@@ -47,7 +50,6 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply
 from .._box import violation
-from .._certificate import is_farkas_certificate
 from ._problem import QP, constraint_scales, gradient_scale, softened_compliance
 
 
@@ -326,3 +328,31 @@ def _result(qp: QP, s: NewtonState) -> NewtonResult:
         for own in (labels, jnp.where(counts, labels, INACTIVE))
     )
     return NewtonResult(s.x, at.multipliers, active, determined, s.iterations, s.converged, s.infeasible)
+
+
+def is_farkas_certificate(
+    rows: Float[Array, "p n"],
+    certificate: Float[Array, " p"],
+    gap: Float[Array, " p"],
+    x: Float[Array, " n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+) -> Bool[Array, ""]:
+    """Check that a Farkas vector z proves that no point of the box satisfies the rows C.
+
+    Where all rows hold at x + d, ``-z'C d`` is at least ``z'gap``; in the box it is at most the sum of |C'z|_j times
+    the distance of x_j to its bound in the direction of -(C'z)_j. If the latter is smaller, there is no such d. Where a
+    variable has no such bound, values up to a thousand times those at hand are considered. z has the sign of the gap in
+    each row: the gaps themselves at the least violation. The gap is C x minus the nearest point of each row's interval,
+    0 for rows that do not count; x is in the box.
+    """
+    # -z'C d as a linear function of d, whose coefficients below roundoff are 0
+    gradient = apply(rows.T, certificate)
+    roundoff = FARKAS_ROUNDOFF * apply(jnp.abs(rows).T, jnp.abs(certificate))
+    gradient = jnp.where(jnp.abs(gradient) <= roundoff, 0.0, gradient)
+    sizes = [jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (x, lower, upper)]
+    radius = FARKAS_RADIUS * jnp.max(jnp.stack(sizes), initial=0.0)
+    # the most that this function reaches in the box: each variable at the bound that raises it
+    distance = jnp.where(gradient > 0.0, x - lower, upper - x)
+    largest_change = jnp.sum(jnp.abs(gradient) * jnp.where(jnp.isfinite(distance), distance, radius))
+    return jnp.dot(certificate, gap) > (1.0 + FARKAS_MARGIN) * largest_change

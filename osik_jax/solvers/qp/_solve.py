@@ -13,16 +13,15 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from ..._errors import OsikValueError
 from ...execution import _rules
 from ...execution._backends import Backend, check_backend
-from ...execution._platform import cpu_is_default
 from ...numerics._arguments import as_floats
 from ...numerics._constants import FEASIBILITY, INACTIVE
 from ...numerics._dense import apply
 from .._box import clip_roundoff, ordered_bounds
+from .._level import bounds_exist
 from .._status import Status
-from ._cost import LeastSquares, Quadratic
 from ._dispatch import qp_solver
 from ._implicit_diff import with_derivative
-from ._problem import QP, QPSolution, pack
+from ._problem import QP, LeastSquares, QPSolution, Quadratic
 from ._search import SearchResult
 
 
@@ -69,7 +68,7 @@ def solve_qp(
     n = gradient.shape[0]
     if hessian.shape != (n, n):
         raise OsikValueError(f"hessian has shape {hessian.shape}, gradient has length {n}")
-    qp = _problem(Quadratic(hessian, gradient), n, lower, upper, rows, rows_lower, rows_upper, rows_compliance)
+    qp = _problem(Quadratic(hessian, gradient), lower, upper, rows, rows_lower, rows_upper, rows_compliance)
     return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
@@ -124,13 +123,12 @@ def solve_least_squares_qp(
     n = matrix.shape[1]
     diagonal = (jnp.broadcast_to(jnp.asarray(number, matrix.dtype), (n,)) for number in (damping, center))
     cost = LeastSquares(matrix, target, weight, *diagonal)
-    qp = _problem(cost, n, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
+    qp = _problem(cost, lower, upper, rows, rows_lower, rows_upper, rows_compliance, rows_equalities)
     return _solve(qp, warm_start, max_iterations, tolerance, backend)
 
 
 def _problem(
     cost: Quadratic | LeastSquares,
-    n: int,
     lower: ArrayLike,
     upper: ArrayLike,
     rows: ArrayLike | None,
@@ -140,7 +138,7 @@ def _problem(
     equalities: tuple[bool, ...] | None = None,
 ) -> QP:
     """Return the problem with the bounds of box and rows concatenated, after checking shapes."""
-    dtype = cost.matrix.dtype
+    dtype, n = cost.matrix.dtype, cost.matrix.shape[1]
     if rows is None:
         rows, rows_lower, rows_upper = jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), jnp.zeros(0, dtype)
     if rows_lower is None or rows_upper is None:
@@ -173,7 +171,7 @@ def _solve(
     tolerance: ArrayLike | None,
     backend: Backend,
 ) -> QPSolution:
-    """Solve and certify without derivatives."""
+    """Solve, certify and attach the derivative."""
     m, p = qp.lower.shape[0], qp.rows.shape[0]
     n, dtype = m - p, qp.lower.dtype
     tolerance = jnp.asarray(FEASIBILITY if tolerance is None else tolerance, dtype)
@@ -255,20 +253,6 @@ def _with_placeholder(qp: QP) -> tuple[QP, Bool[Array, ""]]:
         upper=unbounded,
         known_equalities=qp.known_equalities,
     )
-    # on a CPU one operation for all arrays but the matrix, where each costs as much as its numbers do
-    flat = pack if cpu_is_default() else jax.tree.leaves
-    arrays = map(flat, (qp, *_valid_range(qp)))
-    in_range = [((least <= a) & (a <= most)).all() for a, least, most in zip(*arrays, strict=True)]
-    is_valid = jnp.stack(in_range).all()
+    finite = [jnp.isfinite(a).all() for a in jax.tree.leaves((qp.cost, qp.rows, qp.compliance))]
+    is_valid = jnp.stack([*finite, qp.cost.has_valid_signs(), bounds_exist(qp.lower, qp.upper)]).all()
     return jax.tree.map(lambda a, b: jnp.where(is_valid, a, b), qp, placeholder), is_valid
-
-
-def _valid_range(qp: QP) -> tuple[QP, QP]:
-    """Return the lowest and the highest valid entries of each array, as problems of arrays of NumPy."""
-    largest = float(jnp.finfo(qp.lower.dtype).max)
-    leaves, tree = jax.tree.flatten(qp)
-    finite = [np.full(a.shape, largest) for a in leaves]
-    infinite = np.full(qp.lower.shape, np.inf)
-    *_, rows, compliance, _, upper = finite
-    lowest = [*qp.cost.lowest_valid(-largest), -rows, -compliance, -infinite, -upper]
-    return jax.tree.unflatten(tree, lowest), jax.tree.unflatten(tree, [*finite[:-1], infinite])

@@ -20,7 +20,7 @@ from ...robot._hands import find_hands
 from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
-from ...tasks._background import angle_scale
+from ...tasks._leaves import angle_scale
 from .._crouch import crouched
 from .._outline import lowest_points
 from .._parts import RobotParts, robot_parts

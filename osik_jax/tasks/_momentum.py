@@ -1,4 +1,4 @@
-"""A task on the angular momentum about the centre of mass."""
+"""Tasks on what the masses do: angular momentum and kinetic energy."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError
-from ..kinematics import Kinematics, centroidal_momentum_matrix
+from ..kinematics import Kinematics, centroidal_momentum_matrix, mass_matrix
 from ..kinematics._forward import body_masses
+from ..numerics._constants import INERTIA_ROUNDOFF
 from ..robot import Robot
+from ._bases import MotionTask
 from ._com import along_axes, axis_numbers, check_axes
-from ._leaves import as_bounds, as_scalar, as_weight
-from ._stay import MotionTask
-from ._task import TaskRows, check_priority
+from ._task import TaskRows
 
 
 class AngularMomentumTask(MotionTask):
@@ -38,8 +38,6 @@ class AngularMomentumTask(MotionTask):
         upper: upper bounds; one of the two may be left out, infinite entries bound nothing.
         axes: which of the world's axes, e.g. ``"xyz"``, ``"z"``.
         weight: of each squared row: a scalar, or one for each.
-        priority: 1 is the most important.
-        hard: makes it a constraint, see ``Task``.
 
     Raises:
         TypeError: a target and bounds.
@@ -64,17 +62,10 @@ class AngularMomentumTask(MotionTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        if target is not None and (lower is not None or upper is not None):
-            raise OsikTypeError("an AngularMomentumTask has a target or bounds (lower, upper), not both")
-        self.axes = check_axes(axes)
-        self.priority, self.hard = check_priority(priority), hard
+        self.axes, self.target = check_axes(axes), None
         body_masses(robot)  # raises if there is no mass
-        dtype = robot.q0.dtype
-        self.weight = as_weight(weight, self._weight_rows, dtype)
-        self.gain = as_scalar(0.0, "gain", dtype)
-        self.lower, self.upper = as_bounds(lower, upper, len(axes), dtype)
-        self.target = None
-        if self.lower is None:
+        dtype = self._set_up(robot, weight, priority, hard)
+        if self._set_bounds(target, lower, upper, len(axes), dtype):
             self.target = along_axes(0.0 if target is None else target, axes, "target", dtype)
 
     def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
@@ -103,3 +94,50 @@ class AngularMomentumTask(MotionTask):
         if name == "target":
             return along_axes(value, self.axes, name, self.weight.dtype)
         return super()._convert(name, value)
+
+
+class KineticEnergyTask(MotionTask):
+    """Task for low kinetic energy: among motions that serve other tasks, it prefers those that move little mass.
+
+    With M = L L' the ``mass_matrix``, asks for ``L' v = 0``. In a weighted problem that adds ``weight v' M v / 2``,
+    the weight times the kinetic energy [J]: damping in which a heavy dof counts more than a light one. It has as many
+    rows as v has entries and leaves nothing free, so it comes last, or with a small weight. The error is 0, and
+    there is no gain.
+
+    L is a Cholesky factor. Where a motion moves no mass at all, M counts as larger by some roundings, so that L exists
+    and has finite derivatives.
+
+    Args:
+        robot: the robot.
+        weight: of the energy against the other tasks' squared rows, halved [1/J].
+        hard: makes it a constraint, see ``Task``: nothing moves.
+
+    Raises:
+        ValueError: a negative weight, or a robot without masses.
+    """
+
+    def __init__(self, robot: Robot, *, weight: ArrayLike | Array = 1.0, priority: int = 1, hard: bool = False):
+        body_masses(robot)  # raises if there is no mass
+        self._set_up(robot, weight, priority, hard)
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Return nv rows: the square root of the mass matrix."""
+        del q
+        root = _root(mass_matrix(robot, kinematics))
+        # |U v|^2 = v' M v is twice the energy, and schemes halve squared rows: weight 1 counts the energy once
+        zero = jnp.zeros(robot.nv, root.dtype)
+        return TaskRows(zero, root, zero, zero, jnp.broadcast_to(self.weight, zero.shape), is_equality=True)
+
+
+def _root(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the upper triangular U with U' U = M, the joint-space inertia (positive semidefinite).
+
+    The Cholesky factor is that of M with each dof in units of the square root of its own inertia; immovable dofs get 0.
+    """
+    inertia = jnp.diagonal(matrix)
+    moves = inertia > 0.0
+    scale = jnp.where(moves, jnp.sqrt(jnp.where(moves, inertia, 1.0)), 0.0)
+    unit = jnp.where(moves, scale, 1.0)
+    roundoff = INERTIA_ROUNDOFF * len(inertia) * jnp.finfo(matrix.dtype).eps
+    lift = jnp.diag(jnp.where(moves, roundoff, 1.0))
+    return jax.lax.linalg.cholesky(matrix / (unit[:, None] * unit) + lift, symmetrize_input=False).T * scale

@@ -1,17 +1,54 @@
-"""Tasks on motions, and how inverse kinematics reads them."""
+"""Bases of tasks: on poses and Jacobians of a few frames, and on motions, as inverse kinematics reads them."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+import abc
+from typing import ClassVar, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..execution._backends import Backend
 from ..kinematics import Kinematics, difference
+from ..kinematics._forward import moving_frames
 from ..robot import Robot
 from ._curvature import no_curvature
 from ._gain import as_gain
 from ._task import Task, TaskRows
+
+
+class Frames(NamedTuple):
+    """World poses and Jacobians of the frames of a task."""
+
+    positions: Float[Array, "k 3"]
+    rotations: Float[Array, "k 3 3"]
+    jacobians: Float[Array, "k 6 nv"]
+
+
+class FramedTask(Task):
+    """Base of tasks on frames; tasks of the same structure are evaluated in one batch (``rows_of``)."""
+
+    is_goal: ClassVar[bool] = True
+    sees_places: ClassVar[bool] = True
+
+    @property
+    @abc.abstractmethod
+    def frames(self) -> tuple[str, ...]:
+        """Return the names of the frames."""
+
+    @property
+    @abc.abstractmethod
+    def bounded(self) -> bool:
+        """Return whether the rows are inequalities."""
+
+    @abc.abstractmethod
+    def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
+        """Return the rows from the poses and Jacobians of the frames, by a kernel if the task has one."""
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"]) -> TaskRows:
+        """Return error, Jacobian and wanted velocities at configuration q with given kinematics."""
+        del q
+        return self.rows_at(Frames(*moving_frames(robot, kinematics, self.frames)), kinematics.backend)
 
 
 class MotionTask(Task):

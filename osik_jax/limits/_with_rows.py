@@ -1,6 +1,8 @@
-"""Limit that keeps a frame's origin between planes."""
+"""Limits with rows: planes that a frame keeps to, and linear functions of the velocity."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,11 +13,10 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..kinematics import Kinematics, frame_jacobian
 from ..numerics._arguments import as_bounds, as_scalar, check_bounds, concrete
-from ..numerics._guarded import at_most_inverse
+from ..numerics._guarded import approach, at_most_inverse
 from ..numerics._host import on_host, to_jax
 from ..robot import Robot
-from ._box import Limit
-from ._rows import LimitRows
+from ._box import Limit, LimitRows, Time
 
 
 class PositionBarrier(Limit):
@@ -42,6 +43,7 @@ class PositionBarrier(Limit):
         ValueError: a wrong shape, no bound at all, lower > upper, a normal of length 0 or a gain that is not positive.
     """
 
+    sees_places: ClassVar[bool] = True
     frame: str = eqx.field(static=True)
     normals: Float[Array, "m 3"]
     lower: Float[Array, " m"]
@@ -76,9 +78,7 @@ class PositionBarrier(Limit):
         del robot
         return self.replace(gain=1.0)
 
-    def rows(
-        self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Float[Array, ""] | float
-    ) -> LimitRows:
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Time) -> LimitRows:
         """Return one row for each normal."""
         del q
         # with a gain of 1 / dt one step reaches the plane; more would cross it
@@ -86,7 +86,7 @@ class PositionBarrier(Limit):
         position, _ = kinematics.frame_pose(robot, self.frame)
         value = jnp.matmul(self.normals, position, precision="highest")
         jacobian = jnp.matmul(self.normals, frame_jacobian(robot, kinematics, self.frame)[:3], precision="highest")
-        return LimitRows(jacobian, _approach(rate, self.lower, value), _approach(rate, self.upper, value))
+        return LimitRows(jacobian, approach(rate, self.lower, value), approach(rate, self.upper, value))
 
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
@@ -97,8 +97,47 @@ class PositionBarrier(Limit):
             raise OsikValueError(f"normals have to be finite and not 0: {normals}")
 
 
-def _approach(rate: Float[Array, ""], bound: Float[Array, " m"], value: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Return ``rate (bound - value)``; an infinite bound stays infinite, with gradients 0."""
-    # rate times infinity has a NaN gradient by the rate
-    free = jnp.isinf(bound)
-    return jnp.where(free, bound, rate * (jnp.where(free, 0.0, bound) - value))
+class LinearLimit(Limit):
+    """``lower <= matrix @ v <= upper``, rows that do not depend on the configuration.
+
+    Args:
+        robot: the robot.
+        matrix: one row for each bounded function of v. (m, nv)
+        lower: bounds on the rows, (m,) or a scalar; left out or -inf: none.
+        upper: bounds on the rows, in the same way; equal to ``lower`` for an equality.
+
+    Raises:
+        ValueError: a wrong shape, no bound at all, lower > upper, or a matrix that is not finite.
+    """
+
+    matrix: Float[Array, "m nv"]
+    lower: Float[Array, " m"]
+    upper: Float[Array, " m"]
+
+    def __init__(
+        self,
+        robot: Robot,
+        matrix: ArrayLike | Array,
+        lower: ArrayLike | Array | None = None,
+        upper: ArrayLike | Array | None = None,
+    ):
+        dtype = robot.q0.dtype
+        self.matrix = to_jax(matrix, dtype)
+        if self.matrix.ndim != 2 or self.matrix.shape[1] != robot.nv:
+            raise OsikValueError(f"matrix has shape {self.matrix.shape}, expected (m, {robot.nv}): a row acts on v")
+        low, high = as_bounds(lower, upper, len(self.matrix), dtype)
+        if low is None or high is None:
+            raise OsikValueError("a LinearLimit needs lower, upper or both")
+        self.lower, self.upper = low, high
+        self._check()
+
+    def rows(self, robot: Robot, kinematics: Kinematics, q: Float[Array, " nq"], dt: Time) -> LimitRows:
+        """Return the given rows."""
+        del robot, kinematics, q, dt
+        return LimitRows(self.matrix, self.lower, self.upper)
+
+    def _check(self) -> None:
+        check_bounds(self.lower, self.upper)
+        seen = concrete(self.matrix)
+        if seen is not None and not np.isfinite(seen).all():
+            raise OsikValueError(f"matrix is not finite in rows {np.flatnonzero(~np.isfinite(seen).all(1)).tolist()}")
