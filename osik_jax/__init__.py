@@ -17,6 +17,7 @@ from .control import Controller as Controller
 from .control import Solution as Solution
 from .control import Trajectory as Trajectory
 from .control import build_problem as build_problem
+from .control import load_trajectory as load_trajectory
 from .control import rollout as rollout
 from .control import solve as solve
 from .inverse import InverseKinematicsSolution as InverseKinematicsSolution

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
+
+from .._errors import OsikValueError
+from .._npz import open_npz
+from .._whole_file import whole_file
+
+_BY_TASK = "slack", "error"
+_NUMBERS = "velocity", "status", "iterations", "factorizations", "kkt_residual", "box_violation"
 
 
 class Solution(eqx.Module):
@@ -58,3 +69,42 @@ class Trajectory(eqx.Module):
     time: Float[Array, " steps"]
     q: Float[Array, "steps_1 nq"]
     solution: Solution
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a ``.npz`` with all numbers but the warm start, for ``load_trajectory``.
+
+        The arrays are ``time``, ``q``, those of the solution by their names, and ``slack.TASK`` and ``error.TASK``.
+        ``motion.Motion.of(robot, trajectory).save`` writes tables for other programs.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        arrays = {"time": self.time, "q": self.q} | {name: getattr(self.solution, name) for name in _NUMBERS}
+        for kind in _BY_TASK:
+            arrays |= {f"{kind}.{task}": value for task, value in getattr(self.solution, kind).items()}
+        with whole_file(path) as file:
+            np.savez_compressed(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
+
+
+def load_trajectory(path: str | os.PathLike[str]) -> Trajectory:
+    """Return the trajectory that ``Trajectory.save`` has written; its warm start is None.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no trajectory.
+    """
+    with open_npz(path) as file:
+        for name in ("time", "q", *_NUMBERS):
+            if name not in file.files:
+                raise OsikValueError(f"{os.fspath(path)} is no trajectory: it has no {name}")
+        arrays = {name: jnp.asarray(file[name]) for name in file.files}
+    fields: dict[str, Any] = {name: arrays[name] for name in _NUMBERS}
+    for kind in _BY_TASK:
+        fields[kind] = {n.partition(".")[2]: a for n, a in arrays.items() if n.startswith(f"{kind}.")}
+
+    def made(time: Array, q: Array, fields: dict[str, Any]) -> Trajectory:
+        return Trajectory(time, q, jax.vmap(lambda own: Solution(**own, warm_start=None))(fields))
+
+    for _ in range(arrays["time"].ndim - 1):  # many rollouts
+        made = jax.vmap(made)
+    return made(arrays["time"], arrays["q"], fields)
