@@ -162,30 +162,6 @@ def test_a_lane_that_is_not_valid_adds_nothing_to_a_derivative_by_what_lanes_sha
     assert_close(found, wanted, 1e-12 * float(jnp.abs(wanted).max()))
 
 
-@pytest.mark.variants(slow=["weighted"], release=["null-space", "saturated"])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_batch_is_a_loop_where_lanes_fail_too(scheme):
-    robot = osik.load_robot("arm7")
-    tasks = bounded(robot)
-    hand = tasks["hand"]
-    assert isinstance(hand, osik.FrameTask)
-    points = jnp.asarray(hand.target[0]) + jnp.linspace(0.0, 3.0, LANES)[:, None]  # the last ones are out of reach
-    points = points.at[2].set(jnp.nan)
-    q = lanes_of(robot).at[4, 6].set(jnp.nan)
-
-    def velocity(q: Any, point: Any) -> osik.Solution:
-        return _step.step(robot, q, tasks | {"hand": hand.replace(target=point)}, SCHEMES[scheme](), None, DT)
-
-    found = jax.jit(jax.vmap(velocity))(q, points)
-    program = jax.jit(velocity)
-    for lane in range(LANES):
-        alone = program(q[lane], points[lane])
-        assert int(alone.status) == int(found.status[lane]) == (3 if lane in (2, 4) else 0)
-        size = 1.0 + float(jnp.abs(alone.velocity).max())
-        np.testing.assert_allclose(found.velocity[lane] / size, alone.velocity / size, atol=1e-11)
-    assert all(np.isfinite(np.asarray(a)).all() for a in jax.tree.leaves(found))
-
-
 def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
     """Rows of a batch are computed for several robots at once, with sines and cosines of its own."""
     robot = osik.load_robot("arm7")

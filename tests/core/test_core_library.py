@@ -20,7 +20,7 @@ SOLVES = (
     "core/test_core_qps.py::test_recorded_problems",
     "core/test_core_hierarchies.py::test_recorded_hierarchies",
     "core/test_core_null_space.py::test_as_numpy",
-    "kinematics/test_core_kinematics.py::test_beside_mujoco",
+    "kinematics/test_core_kinematics.py::test_beside_the_plain_method",
     "control/test_compiled_step.py::test_the_core_answers_as_plain_jax_does",
 )
 

@@ -10,7 +10,6 @@ import pytest
 from core_checks import needs_core
 from null_space_families import FAMILIES, LANES, Problems, check_active, random_problems
 from recorded import SCALED, check_recorded_saturated, check_scales, recorded_saturated, recorded_scales
-from used_memory import used_memory
 
 from osik_jax.core import _library
 from osik_jax.execution import _candidates
@@ -216,30 +215,6 @@ def test_numbers_that_overflow_are_an_error_of_their_lane():
         found = solved(p, backend=backend)
         assert np.isfinite(found.x).all()
         assert (np.delete(np.asarray(found.status), 2) == Status.SOLVED).all()
-
-
-IN_USED_MEMORY = ("dependent and damped", "damped, more rows", "a humanoid's")
-
-
-@pytest.fixture(scope="module")
-def in_used_memory(request):
-    """Answers of the core where its results hold zeros before a call, and where they hold NaN."""
-    found = []
-    for left in (0.0, np.nan):
-        with pytest.MonkeyPatch.context() as patch, used_memory(patch, left):
-            made = {method: jax.jit(partial(cast(Any, solved).__wrapped__, method=method)) for method in METHODS}
-            found.append({method: made[method](FAMILIES[request.param]) for method in METHODS})
-    return found
-
-
-@pytest.mark.release
-@pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
-@pytest.mark.parametrize("method", METHODS)
-def test_memory_that_was_used_before_says_nothing(method, in_used_memory):
-    """Whatever the core finds in the memory of its results: it writes all of them."""
-    found = [answers[method] for answers in in_used_memory]
-    assert np.isfinite(found[0].x).all()
-    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 @pytest.mark.variants(slow=["float32"], release=["float64"])

@@ -161,25 +161,3 @@ def test_problems_before_say_nothing():
         first, after = candidates(p), jax.tree.map(lambda a: a[1::2], candidates(mixed))
         assert (first.converged != 0).mean() > 0.99 and np.isfinite(first.x).all()
         jax.tree.map(np.testing.assert_array_equal, first, after)
-
-
-@pytest.mark.slow
-def test_derivatives_against_central_differences():
-    """Along one direction of all data, forward and reverse."""
-    p = problems(seed=6, weakest=1e-1)
-    rng = np.random.default_rng(7)
-    way = [rng.normal(size=a.shape) for a in (p.matrix, p.target, p.rows)]
-
-    def moved(t):
-        data = [a + t * d for a, d in zip((p.matrix, p.target, p.rows), way, strict=True)]
-        found = solved(p._replace(matrix=data[0], target=data[1], rows=data[2]))
-        return found.x, found.active
-
-    step = 1e-6
-    (ahead, same), (behind, other) = moved(step), moved(-step)
-    _, rate = jax.jvp(lambda t: moved(t)[0], (0.0,), (1.0,))
-    reverse = jax.grad(lambda t: jnp.sum(moved(t)[0] ** 2))(0.0)
-    kept = np.asarray(same == other).all(1)
-    assert kept.mean() > 0.9
-    np.testing.assert_allclose(rate[kept], ((ahead - behind) / (2 * step))[kept], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(reverse, jnp.sum(2.0 * moved(0.0)[0] * rate), rtol=1e-9)

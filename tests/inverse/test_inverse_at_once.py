@@ -74,23 +74,6 @@ def test_one_target_is_answered_as_in_a_batch(rng):
                 np.testing.assert_allclose(a, b[at], atol=1e-12)
 
 
-@needs_core
-@pytest.mark.slow
-def test_nearest_is_never_farther_than_the_plain_call(rng):
-    """From a corner of the joint ranges, where the pull towards it keeps searches from solutions."""
-    arm = osik.load_robot("ur5")
-    low, high, share = np.full(6, -3.1), np.full(6, 3.1), 0.03 * 6.2 * rng.random((300, 6))
-    q = np.where(rng.random((300, 6)) < 0.5, low + share, high - share)
-    goals = {"tool0": tuple(part[:, 0] for part in poses_of(arm, ("tool0",), q))}
-    plain, near = (
-        osik.inverse_kinematics(arm, goals, q0=jnp.asarray(high), nearest=nearest) for nearest in (False, True)
-    )
-    assert plain.converged.all() and near.converged.all()
-    ways = [np.linalg.norm(np.asarray(found.q) - high, axis=1) for found in (near, plain)]
-    assert (ways[0] <= ways[1] + 1e-3).all()
-    assert (ways[0] < ways[1] - 0.1).mean() > 0.2
-
-
 def test_a_solution_of_a_further_search_is_judged_at_its_configuration():
     """The searches of `all` have not met the target, so what they say of their own ends does not count."""
     planar = osik.Robot.from_mjcf(mjcf("two_links_with_a_tip"))

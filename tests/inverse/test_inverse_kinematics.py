@@ -131,13 +131,6 @@ def test_all_solutions_are_those_of_the_closed_form(planar):
     assert np.isnan(solutions[2:]).all()
 
 
-def test_nearest_is_the_nearest_of_the_closed_form(planar):
-    for expected in two_solutions(0.5, 0.3):
-        start = jnp.asarray(expected + 0.1)
-        found = osik.inverse_kinematics(planar, {"tip": (0.5, 0.3, 0.0)}, q0=start, nearest=True, seeds=16)
-        np.testing.assert_allclose(found.q, expected, atol=1e-4)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 def test_nearest_finds_what_the_plain_call_finds(rng):

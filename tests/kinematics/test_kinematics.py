@@ -226,24 +226,6 @@ def test_poses_and_jacobians_equal_mjx(robots, evaluators):
     np.testing.assert_allclose(ours["com"], com, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_jacobians_equal_central_differences_along_the_tangent(robots, evaluators, name):
-    robot, step = robots[name], 1e-5
-    q = random_configurations(robot, seed=5, count=1)[0]
-    moves = np.concatenate([np.eye(robot.nv), -np.eye(robot.nv)]) * step
-    moved = jax.jit(jax.vmap(lambda v: osik.integrate(robot, q, v)))(moves)
-    here = jax.tree.map(lambda leaf: leaf[0], evaluators[name](robot, q[None]))
-    ahead, behind = (evaluators[name](robot, np.asarray(part)) for part in (moved[: robot.nv], moved[robot.nv :]))
-    linear = (ahead["poses"][0] - behind["poses"][0]) / (2 * step)
-    turn = ahead["poses"][1] @ behind["poses"][1].swapaxes(-1, -2)
-    angular = Rotation.from_matrix(turn.reshape(-1, 3, 3)).as_rotvec().reshape(linear.shape) / (2 * step)
-    numeric = np.moveaxis(np.concatenate([linear, angular], -1), 0, -1)
-    np.testing.assert_allclose(here["jacobians"], numeric, atol=1e-8, rtol=0)
-    for point in ("com", "subtree_com"):
-        numeric = (ahead[point] - behind[point]).T / (2 * step)
-        np.testing.assert_allclose(here[f"{point}_jacobian"], numeric, atol=1e-8, rtol=0)
-
-
 @pytest.mark.variants(slow=["nao"], release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_derivatives_of_poses_equal_central_differences(robots, evaluators, name):
