@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -205,13 +204,10 @@ def test_other_gains_compile_nothing(arm, arm_world):
             simulation, task, scheme=osik.WeightedQP(), dt=DT, steps=3, command=time, limits=osik.no_limits
         )
 
-    jax.clear_caches()
+    run(2.0, 0.1)
     with Compilations() as seen:
-        run(2.0, 0.1)
-        steps = [name for name in seen.names if "control_step" in name]
-        assert len(steps) == 1
         run(3.0, 0.2)
-    assert [name for name in seen.names if "control_step" in name] == steps
+    assert not any("control_step" in name for name in seen.names)
 
 
 def test_mistakes_are_told(nao, arm, arm_world):
