@@ -243,20 +243,6 @@ class TestBatches:
             expected[0] = -0.4
         np.testing.assert_array_equal(out.velocity[4], expected)
 
-    @pytest.mark.release
-    def test_rollouts_in_a_batch(self, arm, tasks, limits, rng):
-        """vmap of the whole loop over starts and targets."""
-        starts = np.asarray(arm.q0) + 0.2 * rng.normal(size=(3, arm.nq))
-        places = np.asarray(tasks["hand"].target[0]) + 0.1 * rng.normal(size=(3, 3))
-
-        def run(q0, p):
-            path = (jnp.tile(p, (STEPS, 1)), same(tasks)[1])
-            return osik.rollout(arm, q0, tasks, **options_of(limits), targets={"hand": path})
-
-        together = jax.jit(jax.vmap(run))(starts, places)
-        for k in range(3):
-            np.testing.assert_allclose(together.q[k], run(starts[k], places[k]).q, rtol=0, atol=1e-9)
-
 
 def target_of_hand(tasks):
     return tasks["hand"].target[0]

@@ -131,7 +131,9 @@ BOUNDS = [
 class TestParameterSpace:
     def test_begins_at_the_loops_numbers(self, loop):
         space = ParameterSpace(loop, BOUNDS)
-        for a, b in zip(jax.tree.leaves(eqx.filter_jit(space.apply)(loop, space.initial)), jax.tree.leaves(loop), strict=True):
+        for a, b in zip(
+            jax.tree.leaves(eqx.filter_jit(space.apply)(loop, space.initial)), jax.tree.leaves(loop), strict=True
+        ):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
     @settings(max_examples=20, deadline=None)
