@@ -1,5 +1,6 @@
 """A control step in one call of the core: beside plain JAX, its derivatives and certificates, and steps without it."""
 
+import dataclasses
 import re
 from functools import partial
 from typing import Any
@@ -24,6 +25,7 @@ from step_checks import (
     lanes_of,
     plain,
 )
+from task_checks import square
 
 import osik_jax as osik
 from osik_jax.control import _step
@@ -54,11 +56,9 @@ def mixed(robot: osik.Robot) -> dict[str, osik.Task]:
 def bounded(robot: osik.Robot) -> dict[str, osik.Task]:
     """Inequalities of every supported kind beside equalities."""
     hand, root = frames_of(robot)
-    normals = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    offsets = normals @ osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))[:2] + 0.02
-    corners = jnp.zeros((4, 2))  # which no rows depend on
-    weight = np.array([1.0, 2.0, 0.0, 1.0])
-    polygon = osik.SupportPolygon(normals, offsets, corners)
+    center = osik.center_of_mass(robot, osik.forward_kinematics(robot, robot.q0))[:2]
+    polygon, weight = square(0.02), np.array([1.0, 2.0, 0.0, 1.0])
+    polygon = dataclasses.replace(polygon, offsets=polygon.normals @ center + polygon.offsets)
     return {
         "com": osik.ComTask(robot, polygon=polygon, weight=weight, priority=1),
         "height": osik.ComTask(robot, axes="z", lower=-0.1, upper=0.1, priority=2),

@@ -11,7 +11,7 @@ from benchmarks.robots import workload
 from osik_jax.numerics._constants import COST_FRACTION, MIN_RADIUS
 from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.solvers import Damping, Level, Status, solve_hqp
-from osik_jax.solvers._damping import level_damping, narrow_box
+from osik_jax.solvers._damping import level_damping
 
 DT, STEPS = 0.005, 800
 LATE = 400
@@ -245,43 +245,14 @@ def test_the_share_that_is_out_of_reach_in_single_precision():
         np.testing.assert_allclose(share, expected, rtol=0, atol=atol)
 
 
-class TestRoomBelow:
-    """Levels below one that is out of reach may spend a part of its progress."""
-
-    LEVEL = Level(jnp.array([[1.0, 0.5, 0.0], [0.0, 0.0, 2.0]]), jnp.array([3.0, 4.0]))
-    BENDS = jnp.array([0.2, 0.4, 0.0])
-    FREE = jnp.full(3, jnp.inf)
-
-    def room(self, x, *, unmet=0.3, bends=BENDS):
-        damping = Damping(0.0, unmet, 5.0, bends)
-        low, high, bent = narrow_box(damping, self.LEVEL, jnp.zeros(3), jnp.asarray(x), -self.FREE, self.FREE)
-        np.testing.assert_allclose(bent, bends / np.linalg.norm(self.LEVEL.matrix))
-        np.testing.assert_allclose(high - x, x - low, atol=1e-12)
-        return np.asarray(high - x)
-
-    def test_the_cost_at_the_end_of_the_room_is_that_part_of_the_progress(self):
-        """|residual| (grad^2 e)[d, d] at the corner of the box, against half the squares that the level has gained."""
-        x = jnp.array([1.0, 0.4, 0.5])
-        left = np.linalg.norm(self.LEVEL.distance(x))
-        room = self.room(x)
-        cost = 0.5 * left * np.sum(np.asarray(self.BENDS)[:2] * (room[:2] - MIN_RADIUS) ** 2)
-        assert cost == pytest.approx(COST_FRACTION * 0.5 * (5.0**2 - left**2), rel=1e-12)
-        assert room[2] == np.inf
-
-    def test_without_progress_next_to_nothing_is_left(self):
-        np.testing.assert_allclose(self.room(jnp.zeros(3)), [MIN_RADIUS, MIN_RADIUS, np.inf])
-
-    def test_a_level_that_is_met_narrows_nothing(self):
-        assert np.isinf(self.room(jnp.array([3.0, 0.0, 2.0]))).all()
-        assert np.isinf(self.room(jnp.zeros(3), unmet=0.0)).all()
-
-    def test_a_level_below_ends_at_its_room_and_names_no_bound(self):
-        """The level asks for a motion of x, which it gets, and for 2 of what nothing moves; y is free of its rows."""
-        first = Level(jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([1.5, 2.0]))
-        wanted = Level(jnp.eye(2), jnp.array([1.0, 1.0]))
-        damping = Damping(0.0, 1e-6, 2.5, jnp.array([0.0, 0.5])), 0.0
-        found = solve_hqp([first, wanted], -self.FREE[:2], self.FREE[:2], damping=damping)
-        np.testing.assert_allclose(
-            found.x, [1.5, np.sqrt(COST_FRACTION * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + MIN_RADIUS], rtol=1e-5
-        )
-        assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()
+def test_a_level_below_ends_at_its_room_and_names_no_bound():
+    """The level asks for a motion of x, which it gets, and for 2 of what nothing moves; y is free of its rows."""
+    first = Level(jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([1.5, 2.0]))
+    wanted = Level(jnp.eye(2), jnp.array([1.0, 1.0]))
+    damping = Damping(0.0, 1e-6, 2.5, jnp.array([0.0, 0.5])), 0.0
+    free = jnp.full(2, jnp.inf)
+    found = solve_hqp([first, wanted], -free, free, damping=damping)
+    np.testing.assert_allclose(
+        found.x, [1.5, np.sqrt(COST_FRACTION * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + MIN_RADIUS], rtol=1e-5
+    )
+    assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()
