@@ -80,12 +80,11 @@ def standing(robot: osik.Robot) -> dict[str, osik.Task]:
 
 SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
 CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
-ORDINARY = ["arm7-bounded-weighted", "nao-mixed-hierarchy"]
-IN_THE_GATE = ["arm7-bounded-null-space", "nao-mixed-saturated"]
-AT_NIGHT = [f"{name}-{tasks}-{scheme}" for name, tasks in CASES for scheme in SCHEMES]
 
 
-@pytest.mark.variants(slow=IN_THE_GATE, release=[c for c in AT_NIGHT if c not in (*ORDINARY, *IN_THE_GATE)])
+@pytest.mark.variants(
+    ordinary=["arm7-bounded-weighted", "nao-mixed-hierarchy"], slow=["arm7-bounded-null-space", "nao-mixed-saturated"]
+)
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize(("name", "tasks"), CASES)
 def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
@@ -177,13 +176,7 @@ def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
         np.testing.assert_allclose(found.error["tip"][lane, :3], place.xpos, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.variants(
-    slow=["mixed-weighted", "bounded-null-space"],
-    release=[
-        *("bounded-weighted", "bounded-hierarchy", "mixed-hierarchy"),
-        *("mixed-null-space", "mixed-saturated", "bounded-saturated"),
-    ],
-)
+@pytest.mark.variants(ordinary=[], slow=["mixed-weighted", "bounded-null-space"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("tasks", [mixed, bounded])
 def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
@@ -230,13 +223,7 @@ def variants(robot: osik.Robot) -> dict[str, tuple[dict[str, osik.Task], Any]]:
     }
 
 
-@pytest.mark.variants(
-    slow=["mimic-hierarchy", "ball-null-space"],
-    release=[
-        *("ball-weighted", "mimic-weighted", "locked-weighted", "ball-hierarchy", "locked-hierarchy"),
-        *("mimic-null-space", "locked-null-space", "mimic-saturated", "ball-saturated", "locked-saturated"),
-    ],
-)
+@pytest.mark.variants(ordinary=[], slow=["mimic-hierarchy", "ball-null-space"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("kind", ["mimic", "ball", "locked"])
 def test_edges_of_what_is_allowed_are_those_of_plain_jax(kind, scheme):

@@ -101,31 +101,6 @@ def test_a_warm_start_costs_one_factorization():
     np.testing.assert_allclose(warm.x, cold.x, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_lanes_that_are_left_to_the_search():
-    """Rows that cannot hold, numbers that are none, unordered bounds, beside lanes that are as they were alone."""
-    p = problems(seed=4)
-    alone = solved(p)
-    rows, low, high = p.rows.copy(), p.rows_lower.copy(), p.rows_upper.copy()
-    compliance, target, lower = p.rows_compliance.copy(), p.target.copy(), p.lower.copy()
-    rows[3, 1], compliance[3, :2] = rows[3, 0], 0.0
-    low[3, :2], high[3, :2] = (1.0, -2.0), (2.0, -1.0)
-    target[7, 0] = np.nan
-    lower[11, 2] = np.where(np.isfinite(p.upper[11, 2]), p.upper[11, 2], 0.0) + 1.0
-    upper = p.upper.copy()
-    upper[11, 2] = lower[11, 2] - 1.0
-    bad = p._replace(
-        rows=rows, rows_lower=low, rows_upper=high, rows_compliance=compliance, target=target, lower=lower, upper=upper
-    )
-    found, plain = solved(bad), solved(bad, "jax")
-    np.testing.assert_array_equal(found.status, plain.status)
-    assert found.status[3] == Status.INFEASIBLE and found.status[7] == Status.NUMERICAL_ERROR
-    assert found.status[11] == Status.INFEASIBLE and np.isfinite(found.x).all()
-    np.testing.assert_allclose(found.x[3], plain.x[3], atol=1e-8)
-    others = np.setdiff1d(np.arange(COUNT), [3, 7, 11])
-    np.testing.assert_array_equal(found.x[others], alone.x[others])
-
-
 @pytest.mark.parametrize(
     ("family", "seed", "lanes"),
     [

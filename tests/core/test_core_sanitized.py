@@ -11,7 +11,6 @@ from core_checks import compile_core, run_tests_with
 
 SOME = (
     "core/test_core_qps.py::test_recorded_problems",
-    "core/test_core_qps.py::test_lanes_that_are_left_to_the_search",
     "core/test_core_hierarchies.py::test_recorded_hierarchies",
     "core/test_core_null_space.py::test_as_numpy",
     "core/test_core_null_space.py::test_saturation_of_recorded_problems_whatever_rounding_does",

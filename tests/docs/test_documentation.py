@@ -67,7 +67,7 @@ IN_THE_GATE = [f"docs/{page}.md" for page in IN_THE_GATE]
 QUICK = ["README.md", "docs/index.md", "docs/installation.md", "docs/physics.md", "docs/traced_vs_static.md"]
 
 
-@pytest.mark.variants(slow=IN_THE_GATE, release=WITH_CODE.keys() - {*IN_THE_GATE, *QUICK})
+@pytest.mark.variants(ordinary=QUICK, slow=IN_THE_GATE)
 @pytest.mark.parametrize("page", WITH_CODE.values(), ids=WITH_CODE)
 def test_code_runs(
     page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -186,11 +186,7 @@ CHECKS: list[Callable[[Names], None]] = [
 ]  # fmt: skip
 
 
-IN_THE_GATE = [so101_teleoperation, retarget_a_person]
-AT_NIGHT = [check for check in CHECKS if check not in IN_THE_GATE]
-
-
-@pytest.mark.variants(slow=[check.__name__ for check in IN_THE_GATE], release=[check.__name__ for check in AT_NIGHT])
+@pytest.mark.variants(ordinary=[], slow=["so101_teleoperation", "retarget_a_person"])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")
 def test_runs(

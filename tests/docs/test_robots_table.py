@@ -31,11 +31,7 @@ def test_sizes_are_those_of_what_loads(row: list[str]):
     assert (robot.floating_base, *sizes) == (base == "floating", int(dofs), int(followers), int(frames))
 
 
-GATE = ("ur5", "g1", "nao", "allegro", "tiago_pro")
-
-
-@pytest.mark.variants(release=[name for name in robots_table.ROBOTS if name not in GATE])
-@pytest.mark.slow
+@pytest.mark.variants(ordinary=[], slow=["ur5", "g1", "nao", "allegro", "tiago_pro"])
 @pytest.mark.parametrize("name", robots_table.ROBOTS)
 def test_poses_are_as_right_as_the_page_says(name: str):
     assert robots_table.pose_error(name, robots_table.load(name)) < robots_table.TOLERANCE

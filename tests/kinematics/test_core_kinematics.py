@@ -150,10 +150,7 @@ def with_squares(rows: Any) -> Any:
     return {name: replace(one, squares=one.squared_lengths()) for name, one in rows.items()}
 
 
-@pytest.mark.slow
-@pytest.mark.variants(
-    release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's", "position", "pose"]
-)
+@pytest.mark.variants(ordinary=[], slow=["bounds"])
 @pytest.mark.parametrize("case", OPTIONS)
 def test_rows_of_poses(robots, case):
     """All that the rows hold, beside the plain method; some errors are 0, one is nearly half a turn."""

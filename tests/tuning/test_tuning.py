@@ -315,6 +315,17 @@ class TestTune:
         assert tuned.parameters["hand.gain.decay"] == pytest.approx(float(best.tasks["hand"].gain.decay))
         assert float(best.tasks["hand"].weight) == 1.0
 
+    @pytest.mark.slow
+    def test_the_step_is_the_gradient(self, loop, scenarios):
+        """Plain descent with rate 1, against central differences of the loss."""
+        tuned = run(loop, scenarios, optimizer=optax.sgd(1.0), iterations=1)
+        start, space = tuned.space.initial, tuned.space
+        gradient = np.asarray(start - tuned.state.vector)
+        assert np.linalg.norm(gradient) == pytest.approx(tuned.history.gradient_norm[0])
+        for direction in np.random.default_rng(1).normal(size=(4, len(gradient))):
+            ends = [tuning.evaluate(LOSS, space.apply(loop, start + h * direction), scenarios) for h in (1e-5, -1e-5)]
+            assert gradient @ direction == pytest.approx(float(ends[0].loss - ends[1].loss) / 2e-5, rel=1e-5)
+
     @pytest.mark.release
     def test_chunks_change_nothing(self, loop, scenarios):
         whole, parts = run(loop, scenarios), run(loop, scenarios, chunk=3)
