@@ -10,7 +10,7 @@ from benchmarks.hard._reach import farthest
 from benchmarks.robots import workload
 from osik_jax.numerics._constants import COST_FRACTION, MIN_RADIUS
 from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
-from osik_jax.solvers import Damping, Level, Status, solve_hqp
+from osik_jax.solvers import Damping, Level, Status, solve_hqp, solve_least_squares_qp
 from osik_jax.solvers._damping import level_damping
 
 DT, STEPS = 0.005, 800
@@ -256,3 +256,30 @@ def test_a_level_below_ends_at_its_room_and_names_no_bound():
         found.x, [1.5, np.sqrt(COST_FRACTION * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + MIN_RADIUS], rtol=1e-5
     )
     assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()
+
+
+@pytest.mark.variants(slow=["scheme0", "scheme1"])
+@pytest.mark.parametrize("scheme", [osik.WeightedQP(), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])
+def test_steps_are_solved_at_rest(nao, scheme):
+    """A hand near its target, and a posture that pulls back."""
+    first, then = (1, 1) if isinstance(scheme, osik.WeightedQP) else (1, 2)
+    tasks: dict[str, osik.Task] = {foot: osik.FrameTask(nao, foot, weight=100.0, priority=first) for foot in FEET}
+    tasks["com"] = osik.ComTask(nao, weight=10.0, priority=first)
+    place, turn = osik.forward_kinematics(nao, nao.q0).frame_pose(nao, "l_gripper")
+    target = place + jnp.array([0.03, -0.02, 0.04]), turn
+    tasks["hand"] = osik.FrameTask(nao, "l_gripper", rows="position", target=target, priority=then)
+    tasks["posture"] = osik.PostureTask(nao, weight=1e-3, gain=10.0, priority=then)
+    found = osik.rollout(nao, nao.q0, tasks, scheme=scheme, dt=0.02, steps=400).solution
+    assert (found.status == Status.SOLVED).all()
+    assert jnp.abs(found.velocity[-20:]).max() < 1e-12
+
+
+def test_no_search_follows_the_core_at_rest(rng):
+    """Residuals that balance each other: the answer is 0 but for roundoff, and so is all that it is measured by."""
+    A, weight = rng.normal(size=(20, 9, 6)), 10.0 ** rng.uniform(-3, 2, (20, 9))
+    pulls = np.linalg.svd((weight[..., None] * A).transpose(0, 2, 1))[2][:, -1]  # A' W pulls = 0
+    limit = np.tile([np.inf, np.inf, np.inf, 0.5, 0.5, 0.5], (20, 1))
+    solve = jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a, backend="core")))
+    found = solve(A, pulls, weight, -limit, limit)
+    assert (found.status == Status.SOLVED).all() and jnp.abs(found.x).max() < 1e-10
+    np.testing.assert_array_equal(found.factorizations, 1)

@@ -1,6 +1,8 @@
-"""Controllers as files: every class of tasks, limits and schemes comes back to the last bit; errors name the file."""
+"""Files of controllers and rollouts: every class comes back to the last bit; errors name the file."""
 
 import json
+import os
+import stat
 from typing import Any, cast
 
 import jax
@@ -12,6 +14,7 @@ from refusals import refuses
 from small_files import files_of_at_most
 
 import osik_jax as osik
+from osik_jax._whole_file import whole_file, write_text
 
 
 def same(a: Any, b: Any) -> bool:
@@ -269,3 +272,57 @@ def test_on_a_full_disk_the_older_file_stays(saved, arm, tmp_path):
         osik.save_controller(path, arm, {"p": osik.PostureTask(arm)}, source="arm7")
     assert caught.value.filename == str(path)
     assert [one.name for one in tmp_path.iterdir()] == ["c.json"] and path.read_text() == saved
+
+
+def check_trajectory(path, trajectory) -> None:
+    trajectory.save(path)
+    found = osik.load_trajectory(path)
+    wanted = (trajectory.time, trajectory.q, vars(trajectory.solution) | {"warm_start": None})
+    found = (found.time, found.q, vars(found.solution))
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(own, other)
+        assert own.dtype == other.dtype
+
+
+def test_a_file_gives_the_same_rollout(tmp_path, nao) -> None:
+    tasks = {"hand/left": osik.FrameTask(nao, "l_gripper", priority=2), "com": osik.ComTask(nao)}
+    check_trajectory(tmp_path / "a.npz", osik.rollout(nao, nao.q0, tasks, steps=3))
+
+
+def test_of_many_rollouts(tmp_path, arm) -> None:
+    tasks = {"posture.all": osik.PostureTask(arm)}
+    many = jax.vmap(lambda q: osik.rollout(arm, q, tasks, steps=3))(arm.q0 + jnp.linspace(0.0, 0.1, 4)[:, None])
+    check_trajectory(tmp_path / "many.npz", many)
+
+
+def test_what_is_no_trajectory_is_refused(tmp_path) -> None:
+    np.savez(tmp_path / "other.npz", time=np.zeros(3))
+    with pytest.raises(osik.OsikError, match="other.npz is no trajectory: it has no q"):
+        osik.load_trajectory(tmp_path / "other.npz")
+    with pytest.raises(FileNotFoundError):
+        osik.load_trajectory(tmp_path / "none.npz")
+
+
+def test_links_devices_and_permissions_stay(tmp_path):
+    file, link, nothing = tmp_path / "file", tmp_path / "link", tmp_path / "nothing"
+    write_text(file, "older")
+    file.chmod(0o640)
+    link.symlink_to(file)
+    write_text(link, "ä\n")
+    assert link.is_symlink() and file.read_bytes() == "ä\n".encode() and stat.S_IMODE(file.stat().st_mode) == 0o640
+    nothing.symlink_to(os.devnull)
+    write_text(nothing, "text")
+    assert nothing.is_char_device() and sorted(path.name for path in tmp_path.iterdir()) == ["file", "link", "nothing"]
+
+
+def test_after_an_error_the_older_file_stays(tmp_path):
+    write_text(path := tmp_path / "file", "older")
+    with pytest.raises(RuntimeError), whole_file(path) as file:
+        file.write(b"new")
+        raise RuntimeError
+    assert path.read_text() == "older" and [one.name for one in tmp_path.iterdir()] == ["file"]
+    missing = tmp_path / "none" / "file"
+    with pytest.raises(FileNotFoundError) as caught:
+        write_text(missing, "text")
+    assert caught.value.filename == str(missing)
