@@ -1,7 +1,6 @@
 """Kinematics against MuJoCo C, MJX, Pinocchio and central differences."""
 
 import copy
-import time
 
 import equinox as eqx
 import jax
@@ -271,35 +270,6 @@ def test_wrong_input_is_named(robots):
     feather = eqx.tree_at(lambda r: r.body_mass, robot, robot.body_mass.at[-1].set(0.0))
     for function in (osik.center_of_mass, osik.com_jacobian):
         refuses(ValueError, "the subtree of 'r_gripper' has no mass", function, feather, kin, "r_gripper")
-
-
-def microseconds(function, q) -> float:
-    """Shortest time of a call, per configuration."""
-    compiled = jax.jit(jax.vmap(function)).lower(q).compile()
-    times = []
-    for _ in range(30):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(q))
-        times.append(time.perf_counter() - start)
-    return 1e6 * min(times) / len(q)
-
-
-@pytest.mark.slow
-def test_a_serial_chain_costs_microseconds(robots):
-    """XLA's CPU backend can recompute every parent of every link of a chain: thousands of microseconds for an arm."""
-    robot = robots["arm7"]
-
-    def pose(q):
-        return osik.forward_kinematics(robot, q).frame_pose(robot, "flange")
-
-    def height(q):
-        position, rotation = pose(q)
-        return position[2] + jnp.sum(jnp.sin(rotation))
-
-    one, batch = (jnp.asarray(random_configurations(robot, seed=12, count=n)) for n in (1, 1024))
-    assert microseconds(pose, batch) < 20.0
-    assert microseconds(jax.grad(height), batch) < 60.0
-    assert microseconds(pose, one) < 1500.0
 
 
 @pytest.mark.parametrize("name", NAMES)

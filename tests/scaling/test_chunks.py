@@ -243,22 +243,6 @@ def test_a_folder_that_cannot_be_written_to(tmp_path):
     assert function.ran == []
 
 
-def test_a_read_only_folder(tmp_path, monkeypatch):
-    """The first file that is opened for writing tells, before anything runs."""
-    real = os.open
-
-    def read_only(path: Any, flags: int, *args: Any, **kwargs: Any) -> int:
-        if flags & os.O_CREAT and Path(path).parent == tmp_path:
-            raise PermissionError(13, "Permission denied", str(path))
-        return real(path, flags, *args, **kwargs)
-
-    monkeypatch.setattr(os, "open", read_only)  # rights do not stop root, who may run the tests
-    function = Counted()
-    with pytest.raises(PermissionError, match="folder for the results cannot be made or written to") as caught:
-        run(tmp_path, function)
-    assert caught.value.filename == str(tmp_path) and function.ran == []
-
-
 def test_a_disk_that_is_too_small_is_found_before_the_work(tmp_path):
     """A petabyte does not fit anywhere: 20 lanes of 50 TB."""
     ran = []
