@@ -6,6 +6,7 @@ Shared memory holds NaN before each problem.
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import one_warp
 import pytest
@@ -32,10 +33,10 @@ def solved(tmp_path, monkeypatch):
     monkeypatch.setattr(core_cuda, "call", partial(one_warp.call_of_warps, tmp_path))
 
     def solve(given, kind, guess=None):
-        *cost, rows, compliance, lower, upper = (np.asarray(a, kind) for a in given)
-        guess = np.zeros(lower.shape, np.int32) if guess is None else guess
-        tolerance = np.full(len(lower), TOLERANCE[kind], kind)
-        found = _cuda.solve(QP(LeastSquares(*cost), rows, compliance, lower, upper), guess, tolerance, 1000)
+        *cost, rows, compliance, lower, upper = (jnp.asarray(a, kind) for a in given)
+        qp = QP(LeastSquares(*cost), rows, compliance, lower, upper)
+        guess = jnp.zeros(lower.shape, jnp.int32) if guess is None else jnp.asarray(guess)
+        found = _cuda.solve(qp, guess, jnp.full(len(lower), TOLERANCE[kind], kind), 1000)
         return jax.tree.map(np.asarray, found)
 
     return solve
