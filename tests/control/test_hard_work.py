@@ -198,27 +198,6 @@ def test_derivatives_at_the_start_are_central_differences(arm, rng, method):
     assert float(jax.jvp(cost, (0.0,), (1.0,))[1]) == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.variants(slow=["hierarchy"])
-@pytest.mark.parametrize("scheme", ["weighted", "hierarchy"])
-def test_a_traced_dt_that_is_none_moves_nothing(arm, scheme):
-    """A dt of 0 would divide, a negative one turn limits round: the status says so, and the robot stays."""
-    place, rotation = jnp.array([0.6, 0.2, 0.5]), jnp.eye(3)
-    tasks = {"hand": osik.FrameTask(arm, "hand", rows="position", target=(place, rotation))}
-    start = arm.q0.at[0].set(0.99 * float(arm.position_upper[0]))
-
-    @jax.jit
-    @jax.vmap
-    def run(dt):
-        motion = osik.rollout(arm, start, tasks, scheme=SCHEMES[scheme](), dt=dt, steps=3)
-        return motion.solution.status, motion.solution.velocity, motion.q
-
-    status, velocity, path = run(jnp.array([DT, 0.0, -DT, jnp.nan, jnp.inf]))
-    assert (status[0] == Status.SOLVED).all() and np.abs(velocity[0]).max() > 0.1
-    assert (status[1:] == Status.NUMERICAL_ERROR).all()
-    np.testing.assert_array_equal(velocity[1:], np.zeros_like(velocity[1:]))
-    np.testing.assert_array_equal(path[1:], np.broadcast_to(start, path[1:].shape))
-
-
 def test_the_share_that_is_out_of_reach_in_single_precision():
     """Dependent rows that ask for what cannot be had, with a damping under the rounding of their squares.
 
