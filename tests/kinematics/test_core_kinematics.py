@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from core_checks import needs_core
+from frames_beside_mujoco import random_configurations
 from model_files import mjcf
-from test_kinematics import quick_jit, random_configurations, toy_robot
+from test_kinematics import quick_jit, toy_robot
 
 import osik_jax as osik
 from osik_jax.kinematics import forward_kinematics

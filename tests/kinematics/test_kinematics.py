@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from frames_beside_mujoco import random_configurations
 from model_files import mjcf
 from mujoco import mjx
 from mujoco_states import full_velocities, mujoco_at
@@ -87,19 +88,6 @@ def evaluators(robots):
         return evaluate
 
     return {name: make_evaluator(robot, SUBTREES[name]) for name, robot in robots.items()}
-
-
-def random_configurations(robot: osik.Robot, seed: int, count: int = 4) -> np.ndarray:
-    """Made with MuJoCo's own integrator, quaternions left off unit length to see that they are normalised."""
-    rng = np.random.default_rng(seed)
-    model, tree = robot.mj_model, robot.tree
-    out = []
-    for _ in range(count):
-        full = np.array(robot.mujoco_qpos(robot.q0))
-        mujoco.mj_integratePos(model, full, rng.uniform(-1.0, 1.0, model.nv), 1.0)
-        q = np.concatenate([full[tree.full_qpos_address[j] : tree.full_qpos_address[j + 1]] for j in tree.independent])
-        out.append(q)
-    return np.array(out)
 
 
 def moving_model(robot: osik.Robot) -> mujoco.MjModel:
