@@ -153,6 +153,7 @@ def test_nearest_finds_what_the_plain_call_finds(rng):
     assert np.asarray(fixed).any() and (np.asarray(traced) >= np.asarray(fixed)).all()
 
 
+@pytest.mark.variants(slow=["options1"])
 @pytest.mark.parametrize("options", [{}, {"nearest": True}])
 def test_numbers_inside_jit_are_searched_as_outside(planar, options):
     """Of a target out of reach, where the search goes on to the least error."""
@@ -198,6 +199,7 @@ def test_a_start_that_is_right_is_kept(arm, rng):
     assert found.seed == 0
 
 
+@pytest.mark.slow
 def test_pure_form_is_differentiable_and_batched(arm, rng):
     """Against central differences of the same search from its own solution, and MuJoCo's Jacobian."""
     _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
@@ -387,6 +389,7 @@ class TestMistakes:
         refuses(TypeError, "all=True counts", jax.jit(lambda p: find({"hand": p}, all=True).q), jnp.zeros(3))
 
 
+@pytest.mark.slow
 def test_a_program_with_searches_can_be_exported(planar):
     def solve(position):
         return osik.inverse_kinematics(planar, {"tip": position}, seeds=8, steps=12).q

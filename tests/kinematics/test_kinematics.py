@@ -169,7 +169,7 @@ def test_the_host_finds_the_same_without_a_program(robots, name):
         assert_trees_close(jax.tree.leaves(kin), jax.tree.leaves(whole), 1e-12)
 
 
-@pytest.mark.variants(release=["toy"])
+@pytest.mark.variants(slow=["nao"], release=["toy"])
 @pytest.mark.parametrize("name", NAMES)
 def test_everything_equals_mujoco_c_in_single_precision(robots, name):
     q = random_configurations(robots[name], seed=2)
@@ -190,6 +190,7 @@ def test_a_quaternion_of_any_length_means_its_direction(robots, evaluators):
     assert_trees_close(evaluators["toy"](robot, longer), evaluators["toy"](robot, q), 1e-12)
 
 
+@pytest.mark.slow
 def test_poses_and_jacobians_equal_mjx(robots, evaluators):
     robot = robots["toy"]
     q = random_configurations(robot, seed=4, count=2)

@@ -99,6 +99,7 @@ def test_what_is_elsewhere_in_the_model_stays(planar, planar_map):
     np.testing.assert_array_equal(planar_map.q[some][:, 3:], np.broadcast_to(planar.q0[3:], (some.sum(), 7)))
 
 
+@pytest.mark.slow
 def test_configurations_are_where_the_map_says():
     """An arm's map on a grid of its own: by MuJoCo each configuration is at its position, in an orientation asked for,
     and as manipulable as it says."""
