@@ -280,6 +280,11 @@ def test_mistakes_beside_those_of_the_table_of_wrong_inputs(arm, tasks):
     targets = {"posture": np.zeros((3, 5))}
     message = r"target has shape \(5,\), expected \(7,\)"
     refuses(ValueError, message, osik.rollout, arm, arm.q0, tasks, **options, targets=targets)
+    each: list[tuple[str, Any, str]] = [("q0", np.zeros(3), r"shape \(3,\)"), ("tasks", {}, "no task")]
+    each += [("dt", 0.0, "dt is"), ("scheme", osik.WeightedQP, "scheme is"), ("limits", 3, "limits")]
+    for name, value, message in each:
+        given = {"q0": arm.q0, "tasks": tasks, **options, name: value}
+        refuses((ValueError, TypeError), message, osik.rollout, arm, **given)
     refuses(ValueError, "potential_gain is nan", osik.NullSpace, potential_gain=np.nan)
     refuses(ValueError, r"margin has shape \(2,\), expected a scalar", osik.NullSpace, margin=np.zeros(2))
 
