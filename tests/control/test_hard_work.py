@@ -224,16 +224,19 @@ def test_the_share_that_is_out_of_reach_in_single_precision():
         np.testing.assert_allclose(share, expected, rtol=0, atol=atol)
 
 
-def test_a_level_below_ends_at_its_room_and_names_no_bound():
-    """The level asks for a motion of x, which it gets, and for 2 of what nothing moves; y is free of its rows."""
-    first = Level(jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([1.5, 2.0]))
-    wanted = Level(jnp.eye(2), jnp.array([1.0, 1.0]))
-    damping = Damping(0.0, 1e-6, 2.5, jnp.array([0.0, 0.5])), 0.0
-    free = jnp.full(2, jnp.inf)
-    found = solve_hqp([first, wanted], -free, free, damping=damping)
-    np.testing.assert_allclose(
-        found.x, [1.5, np.sqrt(COST_FRACTION * (2.5**2 - 2.0**2) / (2.0 * 0.5)) + MIN_RADIUS], rtol=1e-5
-    )
+@pytest.mark.parametrize("backend", ["auto", "jax"])
+@pytest.mark.parametrize("pull", [1.5, 0.0])
+def test_a_level_below_ends_at_its_room_and_names_no_bound(pull, backend):
+    """The level asks for a motion of x, which it gets, and for 2 of what nothing moves; y is free of its rows.
+
+    Without progress next to nothing is left of y's room.
+    """
+    first = Level(jnp.array([[1.0, 0.0], [0.0, 0.0]]), jnp.array([pull, 2.0]))
+    wanted, free = Level(jnp.eye(2), jnp.array([1.0, 1.0])), jnp.full(2, jnp.inf)
+    damping = Damping(0.0, 1e-6, np.hypot(pull, 2.0), jnp.array([0.0, 0.5])), 0.0
+    found = solve_hqp([first, wanted], -free, free, damping=damping, backend=backend)
+    room = np.sqrt(COST_FRACTION * pull**2 / (2.0 * 0.5)) + MIN_RADIUS
+    np.testing.assert_allclose(found.x, [pull, room], rtol=1e-5, atol=1e-9)
     assert found.status == Status.SOLVED and (np.asarray(found.active) == 0).all()
 
 
