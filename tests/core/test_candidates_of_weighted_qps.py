@@ -15,7 +15,7 @@ from recorded import QP_DAMPING, recorded_qps
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.core import _library
 from osik_jax.execution import _backends
-from osik_jax.execution._lanes import FEW_ON_CPU, with_the_rest
+from osik_jax.execution._lanes import FEW_ON_CPU, first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _cuda, _dispatch, _search
@@ -264,6 +264,13 @@ def test_when_the_kernel_is_asked(beside_a_gpu, rows, dtype):
     options |= dict(rows_compliance=one) if rows == "soft" else {}
     jax.jit(lambda: solve_least_squares_qp(A, b, b, -bound, bound, **options)).lower()
     assert set(beside_a_gpu) == {(4, 5)}
+
+
+@pytest.mark.parametrize("set_", [[], [0], [6], [1, 4], [0, 1, 2, 3, 4, 5, 6]])
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_the_first_flags_that_are_set(set_, size):
+    flags = np.isin(np.arange(7), set_)
+    np.testing.assert_array_equal(first_set(jnp.asarray(flags), size), (set_ + [7] * 7)[:size])
 
 
 @pytest.mark.parametrize("lanes", [1, 4])
