@@ -67,15 +67,22 @@ collect_ignore = list(NOT_INSTALLED)
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Marks single variants of a test as slow or for releases: ``@pytest.mark.variants(slow=[...], release=[...])``."""
+    """Marks single variants of a test as slow or for releases: ``@pytest.mark.variants(slow=[...], release=[...])``.
+
+    With ``ordinary=[...]`` all variants that are not named are for releases.
+    """
     named, found = set(), set()
     for item in items:
         test, variant = item.nodeid.removesuffix("]").partition("[")[::2]
-        for tier, ids in ((t, i) for m in item.iter_markers("variants") for t, i in m.kwargs.items()):
-            named |= {(test, name) for name in ids}
-            if variant in ids:
-                item.add_marker(tier)
+        for tiers in [mark.kwargs for mark in item.iter_markers("variants")]:
+            named |= {(test, name) for ids in tiers.values() for name in ids}
+            tier = next((tier for tier, ids in tiers.items() if variant in ids), None)
+            if tier is not None:
                 found.add((test, variant))
+            elif "ordinary" in tiers:
+                tier = "release"
+            if tier in ("slow", "release"):
+                item.add_marker(tier)
     if not config.getoption("lf", False) and not any("::" in argument for argument in config.args):
         UNKNOWN_VARIANTS.extend(sorted(named - found))  # otherwise only some are collected
     gc.freeze()  # what was imported stays: looking for garbage among it again and again is some percent of the time

@@ -98,8 +98,8 @@ def text_of(header: str) -> str:
         if name in seen or name in ("serial.hpp", "lanes.hpp"):  # the team of a CPU, and its packs
             return ""
         seen.add(name)
-        text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text())
-        return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1], posixpath.dirname(name)), text.replace("#pragma once\n", ""))
+        text = _SYSTEM_INCLUDE.sub("", (_build.FOLDER / name).read_text()).replace("#pragma once\n", "")
+        return _LOCAL_INCLUDE.sub(lambda match: inlined(match[1], posixpath.dirname(name)), text)
 
     return rolled(inlined(header))
 

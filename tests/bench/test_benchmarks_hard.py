@@ -13,7 +13,7 @@ from benchmarks.hard import _motion, _page, _results
 from benchmarks.hard._balance import balance
 from benchmarks.hard._cases import BEYOND, Case, cases, directions, without_turning
 from benchmarks.hard._judge import Numbers, judged, worst
-from benchmarks.hard._motion import Entrant, Motion
+from benchmarks.hard._motion import Motion
 from benchmarks.hard._reach import Search, farthest
 from benchmarks.robots import pinocchio_model, workload
 from benchmarks.workload import DT
@@ -130,31 +130,6 @@ class TestNumbers:
         assert worst([fine, bad, fine._replace(feet=1.0)]) == bad._replace(feet=1.0)
 
 
-class TestMotions:
-    def test_what_raises_stands_still(self, work):
-        from benchmarks.worker import Loop
-
-        loop = Loop(work, "mink", {})
-        wrong = np.zeros((2, 2))  # no places
-        found = loop.follow(wrong, np.tile(work.com_start, (2, 1)), {})
-        assert found["solved"] == 0.0 and found["motion"] == np.tile(work.start, (3, 1)).tolist()
-
-
-class TestResults:
-    @pytest.mark.slow
-    def test_hard_feet_are_constraints(self, humanoid):
-        tasks = _motion.OurLoop(humanoid, _motion.SCHEMES[_motion.HARD_FEET], posture=True)
-        changed = tasks.change(tasks.robot, tasks.tasks)
-        assert {name for name, task in changed.items() if task.hard} == set(humanoid.feet)
-
-    def test_rows_survive_their_file(self, tmp_path):
-        numbers = Numbers(*np.linspace(0.0, 1.0, len(Numbers._fields)).tolist())
-        rows = [_results.Row(Entrant("nao", "mink", "float64", True), "beyond", 10.0, numbers)]
-        _results.keep(tmp_path / "rows.json", rows)
-        assert _results.read(tmp_path / "rows.json") == rows
-        assert _results.read(tmp_path / "none.json") == []
-
-
 def test_the_page_and_the_file_have_the_tables_of_the_command():
     """All robots in each case, every solver in the table of the page, and nothing that is not finite."""
     head, rows = read_csv(_page.FILE)
@@ -167,19 +142,6 @@ def test_the_page_and_the_file_have_the_tables_of_the_command():
     cells = [line.split("|")[1].strip() for line in table.splitlines() if line.startswith("|")][2:]
     assert {*_motion.OURS, *_motion.PEERS} <= set(cells)
     assert not re.search(r"\bnan\b|\binf\b", text + _page.FILE.read_text(encoding="utf-8"))
-
-
-def test_a_row_is_written_to_the_page_and_the_file(tmp_path):
-    numbers = Numbers(**dict.fromkeys(Numbers._fields, 0.0) | dict(solved=1.0, rms=0.25))
-    rows = [_results.Row(Entrant("g1", "mink", "float64", True), "beyond", gain, numbers) for gain in (10.0, 200.0)]
-    page, file = tmp_path / "page.md", tmp_path / "file.csv"
-    page.write_text("<!-- table: summary -->\nold\n<!-- end: summary -->\n", encoding="utf-8")
-    _page.write(rows, page, file)
-    assert "| mink | 0 of 2 | 2 of 2 | 2 of 2 | 0 of 0 |" in page.read_text(encoding="utf-8")
-    assert "old" not in page.read_text(encoding="utf-8")
-    head, (first, second) = read_csv(file)
-    assert dict(zip(head, first, strict=True))["rms speed [rad/s]"] == "0.25"
-    assert (first[:5], second[4]) == (["beyond", "g1", "mink", "yes", "10"], "200")
 
 
 def test_the_bound_on_the_curvature_is_near_it():

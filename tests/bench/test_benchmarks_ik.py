@@ -1,19 +1,13 @@
-"""The benchmark of inverse kinematics: its sets of poses are what they are called, its judges agree; a peer apart."""
+"""The benchmark of inverse kinematics: its sets of poses are what they are called, its judges agree."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
-import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.ik.__main__ import Tracik
 from benchmarks.ik._arms import Arm
 from benchmarks.ik.humanoids import Judge
 from benchmarks.ik.many import measured
-from benchmarks.ik.with_pytracik import quaternion
 from benchmarks.throughput import loaded
 
 
@@ -71,29 +65,3 @@ def test_many_poses_of_an_arm_are_found() -> None:
     row = measured("arm7", 16, calls=3)
     assert row["found"] == 1.0 and row["wrongly called found"] == 0 and row["limits broken"] == 0
     assert row["median position error [m]"] < 1e-4 and row["poses a second"] > 0.0
-
-
-def test_quaternions_are_those_of_the_matrices() -> None:
-    """By MuJoCo, half turns among them, where the scalar part is 0."""
-    wxyz = np.random.default_rng(5).standard_normal((40, 4))
-    wxyz[:8, 0] = 0.0
-    for own in wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True):
-        matrix, back = np.empty(9), np.empty(9)
-        mujoco.mju_quat2Mat(matrix, own)
-        x, y, z, w = quaternion(matrix.reshape(3, 3))
-        mujoco.mju_quat2Mat(back, np.array([w, x, y, z]))
-        np.testing.assert_allclose(back, matrix, atol=1e-12)
-
-
-def test_a_peer_that_does_not_start_is_told_once_and_left_out(
-    ur5: Arm, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where its library is missing, and where there is no such interpreter."""
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    (tmp_path / "pytracik.py").write_text("raise ModuleNotFoundError('no pytracik here')")
-    poses = ur5.reachable(2, np.random.default_rng(6))
-    for python, told in ((sys.executable, "no pytracik here"), (str(tmp_path / "python"), "No such file")):
-        tracik = Tracik(python)
-        assert tracik(ur5, poses) is None and tracik(ur5, poses) is None
-        said = capsys.readouterr().err
-        assert told in said and said.count("pytracik is left out") == 1

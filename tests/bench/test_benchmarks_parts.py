@@ -1,15 +1,13 @@
-"""Parts, rollouts and long jobs: all is there, compiled and timed; a profile names operations of the program."""
+"""Parts of a step: all is there, compiled and timed; a profile names operations of the program."""
 
 import json
 import sys
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 
-from benchmarks import job, parts, rollouts
-from osik_jax import scaling
+from benchmarks import parts
 
 
 @pytest.mark.release
@@ -36,31 +34,3 @@ def test_an_operation_is_found_where_it_is():
     (slowest, seconds), *rest = parts.profiled(program, (big,), 3)
     assert "dot" in slowest
     assert seconds > 2.0 * sum(others for _, others in rest)
-
-
-@pytest.mark.release
-def test_the_gradient_of_rollouts_is_finite_and_timed(tmp_path, monkeypatch):
-    path = tmp_path / "rollouts.json"
-    monkeypatch.setattr(sys, "argv", ["rollouts", str(path), "--robot", "arm7", "--robots", "2", "--steps", "3"])
-    rollouts.main()
-    forward, gradient = json.loads(path.read_text())["rows"]
-    assert (forward["part"], gradient["part"]) == ("forward", "gradient")
-    assert forward["finite"] and gradient["finite"]
-    assert forward["seconds"] > 0.0 and gradient["seconds"] > 0.0  # which is longer is not sure in so short a run
-
-
-@pytest.mark.release
-def test_a_job_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
-    """Of three chunks the middle one is lost: it alone is run, and comes out as it was."""
-    command = ["job", str(tmp_path), "--robot", "arm7", "--steps", "18", "--length", "2", "--chunk", "3"]
-    monkeypatch.setattr(sys, "argv", command)
-    monkeypatch.setattr(job, "cores", lambda: (0,))
-    job.main()
-    assert "18 steps in" in capsys.readouterr().out
-    before = scaling.load(tmp_path)[:]
-    assert before["solved"].all() and 0.0 < before["error"].max() < 1.0 and len(before["error"]) == 9
-    (tmp_path / "00000001.npz").unlink()
-    job.main()
-    assert "6 steps in" in capsys.readouterr().out
-    for name, array in scaling.load(tmp_path)[:].items():
-        np.testing.assert_array_equal(array, before[name])

@@ -10,8 +10,7 @@ import pytest
 from rich.console import Console
 
 import osik_jax as osik
-from benchmarks import figures, gate, motions, report
-from benchmarks.__main__ import LONGEST, affordable
+from benchmarks import gate, motions, report
 from benchmarks.descriptions import ROBOTS
 from benchmarks.judge import BOUNDS, failures, judged, verdict
 from benchmarks.peers import ours, peer
@@ -87,12 +86,6 @@ def test_feet_and_centre_of_mass_are_judged():
     assert judged(work, motion)["feet_rotation"] == pytest.approx(0.02, abs=1e-9)
 
 
-def test_a_workload_survives_its_file(work):
-    again = Workload.from_json(work.to_json())
-    assert again.joints == work.joints and again.costs == work.costs
-    np.testing.assert_array_equal(again.hand_at(70, np.arange(3)), work.hand_at(70, np.arange(3)))
-
-
 @pytest.mark.parametrize("name", ["nao", "arm7"])
 def test_urdfs_of_embedded_robots_are_those_robots(name):
     """All links, sites and the centre of mass by Pinocchio are where MuJoCo has those of the MJCF."""
@@ -166,34 +159,6 @@ def test_the_worst_lane_of_a_batch_counts(work, motions_of_lanes):
 def motions_of_lanes(work):
     """Of two robots, each with its own target, by mink."""
     return np.array([motion_of(peer("mink")(work), work, lane=lane) for lane in range(2)])
-
-
-def test_a_figure_has_a_line_of_each(tmp_path):
-    def row(peer, batch, rate, **options):
-        named = dict(peer=peer, name=peer, device=None, failures=[])
-        return named | dict(options=options | dict(batch=batch), robots=batch or 2, steps_per_second=rate)
-
-    rows = [row("mink", None, 1e4), row("mjinx", 4, 1e3), row("mjinx", 64, 2e3)]
-    for precision in ("float64", "float32"):
-        for batch in (1, 64):
-            rows += [row("osik_jax", batch, 7e3 * batch, scheme="weighted", precision=precision)]
-    result = dict(robot="panda", cpu="a CPU", many_robots=rows)
-    figures.draw(result, tmp_path / "figure.svg")
-    drawn = (tmp_path / "figure.svg").read_text()
-    for text in ("osik_jax, weighted", "mjinx", "mink", "float64", "float32", "panda on a CPU"):
-        assert f"<!-- {text}" in drawn or text in drawn
-    figures.draw(result | dict(many_robots=rows[:1]), tmp_path / "none.svg")
-    assert not (tmp_path / "none.svg").exists()
-
-
-def test_a_batch_that_would_take_too_long_is_left_out(work):
-    said: list[str] = []
-    with Race(work, pythons={}, report=said.append) as race:
-        small = dict(peer="mjinx", options=dict(batch=4), step_seconds_median=0.6 * LONGEST)
-        large = Entrant("mjinx, batch 8", "mjinx", dict(batch=8))
-        assert list(affordable([large], [small], race)) == [] and "left out" in said[-1]
-        quicker = small | dict(step_seconds_median=0.4 * LONGEST)
-        assert list(affordable([large], [small | dict(peer="mink-warp"), quicker], race)) == [large]
 
 
 def test_the_gate_sees_what_is_slow_or_wrong():

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 from example_files import example_file
 from mujoco_states import mujoco_at
-from task_checks import kinematics_at
 
 import osik_jax as osik
 from benchmarks.demonstrated import file_motion, guess_moving_frame
-from benchmarks.swaying import JointPath, robot_outline, strides, sway_of
+from benchmarks.swaying import JointPath
 from osik_jax.demo._figures import figures
 from osik_jax.demo._run import run_scheme
 from osik_jax.robot._feet import guess_feet
@@ -60,14 +59,6 @@ def test_one_joint_takes_its_tip_along_its_arc():
         np.testing.assert_allclose(at(t)[1][:3], rate, atol=1e-8)
 
 
-@pytest.mark.slow
-def test_a_joint_that_turns_its_tip_in_place_turns_it():
-    motion = motion_of(chain(0.3, (Z,)))
-    (start, R0), (there, R1) = (joint_path(motion).at(t)[0] for t in (0.0, 1.0))
-    np.testing.assert_allclose(start, there, atol=1e-12)
-    assert np.arccos((np.trace(R0.T @ R1) - 1.0) / 2.0) == pytest.approx(0.3)
-
-
 def test_a_slide_goes_towards_its_room():
     """Home is 2 cm above the lower limit and 30 cm below the upper one."""
     motion = motion_of(chain(0.3, (X,), "prismatic", LIMIT))
@@ -97,31 +88,6 @@ def test_huge_and_tiny_robots_move_in_proportion(length, scale):
     assert not any("feet" in label or "mass" in label for label in rows)
 
 
-def test_sizes_in_between_go_5_cm():
-    assert [sway_of(size) for size in (0.3, 1.0, 10.0)] == pytest.approx([0.05] * 3)
-    assert [sway_of(size) for size in (0.03, 100.0)] == pytest.approx([0.005, 0.5])
-
-
-def test_strides_of_slides_are_lengths():
-    robot = chain(0.3, (X, Y, Z), "prismatic", LIMIT)
-    np.testing.assert_allclose(strides(robot, 2.0), 0.5)
-
-
-def test_an_arm_rises_above_its_base_and_a_hanging_one_hangs():
-    """An arm that lies along the floor at home, and the same one that hangs from the ceiling."""
-    arm = """<mujoco><compiler angle="radian"/><worldbody><body name="foot"><geom type="box" size=".1 .1 .05"/>
-    <body name="a" pos="0 0 .05" euler="{0} 0 0"><joint axis="0 0 1"/>
-    <geom type="capsule" size=".03 .05" pos="0 0 .05"/>
-    <body name="b" pos="0 0 .1"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .4 0 0" size=".03"/>
-    <body name="c" pos=".4 0 0"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 {1}" size=".03"/>
-    <site name="tool" pos="0 0 {1}"/></body></body></body></body></worldbody></mujoco>"""
-    for turn, reach, side in ((0.0, -0.3, 1.0), (np.pi, 0.3, -1.0)):
-        robot = osik.Robot.from_mjcf(arm.format(turn, reach))
-        motion = motion_of(robot)
-        height = kinematics_at(robot, motion.q0).frame_pose(robot, "tool")[0][2]
-        assert side * height > 0.0, (turn, height)
-
-
 @pytest.mark.variants(slow=["solo_description/robots/solo12.urdf"])
 @pytest.mark.parametrize("file", ["nao", "solo_description/robots/solo12.urdf"])
 def test_legs_bend_over_feet_that_stay(file, nao):
@@ -142,17 +108,6 @@ def test_legs_bend_over_feet_that_stay(file, nao):
     limited = model.jnt_limited.astype(bool)
     value, (lower, upper) = q[model.jnt_qposadr[limited]], model.jnt_range[limited].T
     assert (value >= lower - 1e-9).all() and (value <= upper + 1e-9).all()
-
-
-@pytest.mark.release
-def test_a_walker_stands_on_the_floor():
-    """Its lowest point is at height 0, and all its feet are within a millimetre of it."""
-    path = example_file("solo_description/robots/solo12.urdf")
-    robot = osik.Robot.from_urdf(path, floating_base=True)
-    motion = file_motion(robot, name="solo12")
-    assert robot_outline(robot, motion.q0).lowest == pytest.approx(0.0, abs=1e-9)
-    heights = [kinematics_at(robot, motion.q0).frame_pose(robot, s.frame)[0][2] for s in motion.stances]
-    assert len(heights) == 4 and np.ptp(heights) < 1e-3 and max(heights) < 0.05
 
 
 def test_feet_and_hands_are_guessed(nao):

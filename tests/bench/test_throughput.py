@@ -1,4 +1,4 @@
-"""The benchmark of batches: its numbers are there, right, and its file may be filled in parts."""
+"""The benchmark of batches: its numbers are there and right, and jumps are counted."""
 
 import json
 import sys
@@ -7,79 +7,25 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from refusals import refuses
 
 import osik_jax as osik
-from benchmarks import jumps, scaling, throughput
-
-
-@pytest.fixture(scope="module")
-def path(tmp_path_factory):
-    """A file with one row, as the command line writes it."""
-    path = tmp_path_factory.mktemp("throughput") / "results.json"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(throughput, "SECONDS", 0.01)
-        run(patch, path, "3")
-    return path
-
-
-def run(patch, path, batches):
-    options = ["--robot", "arm7", "--schemes", "weighted", "--precisions", "float64", "--batches", batches]
-    options += ["--tasks", "equality"]
-    patch.setattr(sys, "argv", ["throughput", str(path), *options])
-    throughput.main()
+from benchmarks import jumps, throughput
 
 
 @pytest.mark.release
-def test_a_row_is_right(path):
+def test_a_row_is_right(tmp_path, monkeypatch):
+    """As the command line writes it."""
+    path = tmp_path / "results.json"
+    options = ["--robot", "arm7", "--schemes", "weighted", "--precisions", "float64", "--batches", "3"]
+    monkeypatch.setattr(sys, "argv", ["throughput", str(path), *options, "--tasks", "equality"])
+    monkeypatch.setattr(throughput, "SECONDS", 0.01)
+    throughput.main()
     result = json.loads(path.read_text())
     assert result["jax"] == jax.__version__ and result["platform"] == "cpu"
     (row,) = result["rows"]
     assert row["solved"] == 1.0 and row["error"] < 1e-12
     assert row["steps_per_second"] == row["batch"] / row["seconds"] > 0.0
     assert row["compile_seconds"] > 0.0 and row["program_bytes"] > row["batch"] * 7 * 8
-
-
-@pytest.mark.release
-def test_a_file_is_filled_in_parts(path, tmp_path, monkeypatch):
-    other = tmp_path / "results.json"
-    other.write_text(path.read_text())
-    (first,) = json.loads(path.read_text())["rows"]
-    monkeypatch.setattr(throughput, "measure", lambda given, scheme, batch, *_: first | dict(batch=batch, calls=9))
-    run(monkeypatch, other, "5")
-    assert json.loads(other.read_text())["rows"] == [first, first | dict(batch=5, calls=9)]
-    run(monkeypatch, other, "3")
-    assert [row["calls"] for row in json.loads(other.read_text())["rows"]] == [9, 9]
-    monkeypatch.setattr(throughput, "machine", lambda: {"device": "another"})
-    refuses(ValueError, "another machine", throughput.kept, other)
-
-
-@pytest.mark.release
-@pytest.mark.parametrize("robot", ["g1", "nao"])
-def test_humanoids_stand_on_both_feet(robot):
-    given = throughput.setting(robot, "polygon")
-    kinematics = osik.forward_kinematics(given.robot, given.robot.q0)
-    feet = np.array([kinematics.frame_pose(given.robot, name)[0][:2] for name in throughput.ROBOTS[robot].feet])
-    com = given.tasks["com"]
-    assert isinstance(com, osik.ComTask) and com.polygon is not None
-    polygon = com.polygon
-    outside = np.asarray(feet @ polygon.normals.T - polygon.offsets)
-    assert (outside < 0.0).all() and outside.min() < -0.1  # each foot is far from an edge of the other one
-
-
-@pytest.mark.release
-def test_steps_of_a_call_are_those_of_several():
-    step, given, state = throughput.batch_of(throughput.setting("arm7"), osik.WeightedQP(), 3)
-    at_once = jax.jit(throughput.repeated(step, 4))(*given, state)
-    for _ in range(4):
-        state, error, fine = jax.jit(step)(*given, state)
-    jax.tree.map(np.testing.assert_array_equal, at_once, (state, error, fine))
-
-
-@pytest.mark.release
-def test_lanes_of_a_device_are_measured():
-    (row,) = scaling.run("arm7", "weighted", "float64", 4, [1])
-    assert row["solved"] == row["efficiency"] == 1.0 and row["error"] < 1e-12
 
 
 @pytest.mark.release
@@ -101,14 +47,6 @@ def test_the_reference_is_the_rollout():
         )
         for name, error in motion.solution.error.items():
             np.testing.assert_allclose(wanted[name][lane], error[-1], rtol=0, atol=1e-12)
-
-
-def test_a_sweep_ends_before_a_call_takes_too_long(monkeypatch):
-    monkeypatch.setattr(throughput, "LONGEST", 1.0)
-    monkeypatch.setattr(throughput, "reference", lambda *_: {})
-    monkeypatch.setattr(throughput, "measure", lambda *args: dict(batch=args[2], seconds=0.1 * args[2]))
-    found = throughput.sweep("arm7", "weighted", "float64", [1, 8, 64, 10])
-    assert [row["batch"] for row in found] == [1, 8, 10]
 
 
 @pytest.mark.release

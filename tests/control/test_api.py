@@ -26,25 +26,6 @@ def pose(arm):
 
 
 class TestTargetsOfSolve:
-    @pytest.mark.release
-    def test_are_as_replaced(self, arm, tasks, pose):
-        wanted = osik.solve(arm, arm.q0, tasks | {"hand": tasks["hand"].replace(target=pose)}).velocity
-        rotation = jaxlie.SO3.from_matrix(pose[1])
-        whole = jnp.eye(4).at[:3, 3].set(pose[0]).at[:3, :3].set(pose[1])
-        rigid = jaxlie.SE3.from_rotation_and_translation(rotation, pose[0])
-        for given in (pose, (pose[0], rotation.wxyz), whole, rigid):
-            found = osik.solve(arm, arm.q0, tasks, targets={"hand": given}).velocity
-            np.testing.assert_allclose(found, wanted, atol=1e-12)
-        assert np.abs(wanted).max() > 0.1
-
-    def test_are_batched_by_vmap(self, arm, tasks, pose):
-        positions = pose[0] + jnp.linspace(-0.02, 0.02, 3)[:, None]
-
-        def velocity(p):
-            return osik.solve(arm, arm.q0, tasks, targets={"hand": (p, pose[1])}).velocity
-
-        np.testing.assert_allclose(jax.vmap(velocity)(positions), [velocity(p) for p in positions], atol=1e-10)
-
     def test_that_are_wrong_are_refused(self, arm, tasks, pose):
         with pytest.raises(KeyError, match="'hnad', which is no task; tasks: hand, posture"):
             osik.solve(arm, arm.q0, tasks, targets={"hnad": pose})

@@ -243,20 +243,6 @@ class TestBatches:
             expected[0] = -0.4
         np.testing.assert_array_equal(out.velocity[4], expected)
 
-    @pytest.mark.release
-    def test_rollouts_in_a_batch(self, arm, tasks, limits, rng):
-        """vmap of the whole loop over starts and targets."""
-        starts = np.asarray(arm.q0) + 0.2 * rng.normal(size=(3, arm.nq))
-        places = np.asarray(tasks["hand"].target[0]) + 0.1 * rng.normal(size=(3, 3))
-
-        def run(q0, p):
-            path = (jnp.tile(p, (STEPS, 1)), same(tasks)[1])
-            return osik.rollout(arm, q0, tasks, **options_of(limits), targets={"hand": path})
-
-        together = jax.jit(jax.vmap(run))(starts, places)
-        for k in range(3):
-            np.testing.assert_allclose(together.q[k], run(starts[k], places[k]).q, rtol=0, atol=1e-9)
-
 
 def target_of_hand(tasks):
     return tasks["hand"].target[0]
@@ -285,77 +271,29 @@ class TestStatus:
             refuses(RuntimeError, r"MAX_ITERATIONS in 1 of 1 lanes.*raise max_iterations", raise_if_failed, solution)
 
 
-class TestMistakes:
-    """What a user gets wrong is named, with what exists."""
-
-    @staticmethod
-    def run(arm, tasks, **changes):
-        arguments = {"robot": arm, "q0": arm.q0, "tasks": tasks, "scheme": SCHEMES["weighted"], "steps": 3, **changes}
-        return osik.rollout(arguments.pop("robot"), arguments.pop("q0"), arguments.pop("tasks"), **arguments)
-
-    @staticmethod
-    def solved(arm, tasks, **changes):
-        arguments = {"q": arm.q0, "tasks": tasks, "scheme": SCHEMES["weighted"], **changes}
-        return osik.solve(arm, arguments.pop("q"), arguments.pop("tasks"), **arguments)
-
-    def test_configurations(self, arm, nao, tasks):
-        for call, key in ((self.solved, "q"), (self.run, "q0")):
-            refuses(ValueError, r"shape \(3,\).*\(7,\): joint1, joint2", call, arm, tasks, **{key: np.zeros(3)})
-            refuses(ValueError, r"vmap", call, arm, tasks, **{key: np.zeros((2, 7))})
-            none = np.where(np.arange(7) == 2, np.nan, 0.0)
-            refuses(ValueError, r"not finite at indices \[2\]", call, arm, tasks, **{key: none})
-        zeros, posture = nao.q0.at[3:7].set(0.0), {"posture": osik.PostureTask(nao)}
-        refuses(ValueError, r"q\[3:7\], the quaternion of joint .*is zero", osik.solve, nao, zeros, posture)
-
-    def test_tasks(self, arm, tasks):
-        for call in (self.solved, self.run):
-            refuses(ValueError, "no task", call, arm, {})
-            refuses(TypeError, "tasks is a list; it is a dict", call, arm, list(tasks.values()))
-            refuses(TypeError, r"tasks\['hand'\] is a str, not a Task", call, arm, {"hand": "hand"})
-        refuses(ValueError, "no task", self.run, arm, lambda t: {})
-
-    def test_schemes_limits_and_times(self, arm, tasks, limits):
-        for call in (self.solved, self.run):
-            refuses(TypeError, r"scheme is <class .*WeightedQP\(\)", call, arm, tasks, scheme=osik.WeightedQP)
-            refuses(TypeError, r"limits is ConfigurationLimit.*sequence", call, arm, tasks, limits=limits[0])
-            refuses(TypeError, r"limits.* is .*VelocityLimit", call, arm, tasks, limits=(osik.VelocityLimit,))
-            for dt in (0.0, -0.01, np.nan, np.inf):
-                refuses(ValueError, r"dt is .*positive", call, arm, tasks, dt=dt)
-        for steps in (-1, 2.5, True):
-            refuses(ValueError, "steps is", self.run, arm, tasks, steps=steps)
-
-    def test_targets_and_feedback(self, arm, tasks):
-        no_task = "targets are for 'foot', which is no task; tasks: hand, elbow, posture"
-        refuses(KeyError, no_task, self.run, arm, tasks, targets={"foot": np.zeros((3, 7))})
-        length = r"targets\['posture'\] has shape \(2, 7\).*steps, 3"
-        refuses(ValueError, length, self.run, arm, tasks, targets={"posture": np.zeros((2, 7))})
-        shape = r"target has shape \(5,\), expected \(7,\)"
-        refuses(ValueError, shape, self.run, arm, tasks, targets={"posture": np.zeros((3, 5))})
-        refuses(ValueError, "targets go with a dict", self.run, arm, lambda t: tasks, targets={"posture": [[0.0] * 7]})
-        refuses(ValueError, r"feedback has shape \(3, 6\).*\(3, 7\)", self.run, arm, tasks, feedback=np.zeros((3, 6)))
-        refuses(ValueError, r"q has shape \(2,\)", self.run, arm, tasks, feedback=lambda t, q: q[:2])
-
-    def test_numbers_of_the_schemes(self):
-        refuses(ValueError, r"damping is -1.0", osik.NullSpace, damping=-1.0)
-        refuses(ValueError, r"damping is 0.0; a WeightedQP needs it positive", osik.WeightedQP, damping=0.0)
-        refuses(ValueError, "potential_gain is nan", osik.NullSpace, potential_gain=np.nan)
-        refuses(ValueError, r"margin has shape \(2,\), expected a scalar", osik.NullSpace, margin=np.zeros(2))
+def test_mistakes_beside_those_of_the_table_of_wrong_inputs(arm, tasks):
+    options = dict(scheme=SCHEMES["weighted"], steps=3)
+    wrong = {"targets": {"posture": [[0.0] * 7]}}, {"feedback": lambda t, q: q[:2]}, {"feedback": np.zeros((3, 6))}
+    refuses(ValueError, "targets go with a dict", osik.rollout, arm, arm.q0, lambda t: tasks, **options, **wrong[0])
+    refuses(ValueError, r"q has shape \(2,\)", osik.rollout, arm, arm.q0, tasks, **options, **wrong[1])
+    refuses(ValueError, r"feedback has shape \(3, 6\)", osik.rollout, arm, arm.q0, tasks, **options, **wrong[2])
+    targets = {"posture": np.zeros((3, 5))}
+    message = r"target has shape \(5,\), expected \(7,\)"
+    refuses(ValueError, message, osik.rollout, arm, arm.q0, tasks, **options, targets=targets)
+    each: list[tuple[str, Any, str]] = [("q0", np.zeros(3), r"shape \(3,\)"), ("tasks", {}, "no task")]
+    each += [("dt", 0.0, "dt is"), ("scheme", osik.WeightedQP, "scheme is"), ("limits", 3, "limits")]
+    for name, value, message in each:
+        given = {"q0": arm.q0, "tasks": tasks, **options, name: value}
+        refuses((ValueError, TypeError), message, osik.rollout, arm, **given)
+    refuses(ValueError, "potential_gain is nan", osik.NullSpace, potential_gain=np.nan)
+    refuses(ValueError, r"margin has shape \(2,\), expected a scalar", osik.NullSpace, margin=np.zeros(2))
 
 
-def test_a_list_of_targets_is_an_error_that_says_so():
-    arm = osik.load_robot("arm7")
+def test_a_list_of_targets_is_an_error_that_says_so(arm):
     tasks = {"hand": osik.FrameTask(arm, "hand", rows="position")}
     places = [[0.4, 0.0, 0.5], [0.4, 0.1, 0.5], [0.4, 0.2, 0.5]]
+    message = r"targets\['hand'\] is or holds a list of numbers"
     for target in (places, (places,)):
-        refuses(
-            TypeError,
-            r"targets\['hand'\] is or holds a list of numbers",
-            osik.rollout,
-            arm,
-            arm.q0,
-            tasks,
-            steps=3,
-            targets={"hand": target},
-        )
+        refuses(TypeError, message, osik.rollout, arm, arm.q0, tasks, steps=3, targets={"hand": target})
     pair = [jnp.array(places), jnp.tile(jnp.eye(3), (3, 1, 1))]
     assert osik.rollout(arm, arm.q0, tasks, steps=3, targets={"hand": pair}).q.shape == (4, arm.nq)

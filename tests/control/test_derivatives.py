@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivative_checks import assert_exact, assert_hessian, check, nearest_side
+from derivative_checks import assert_exact, check, nearest_side
 
 from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp, solve_nullspace, solve_qp
 
@@ -96,7 +96,6 @@ class TestArrays:
         out = check(lambda a: qp_answer(solve_qp(*a)), straight, quadratic_programs(rng, rows=5))
         assert_exact(out, most=0.9)
 
-    @pytest.mark.release
     def test_least_squares_with_soft_rows(self, rng):
         """And with respect to A, b, weights, damping and the compliance of rows, hard and soft."""
         out = check(lambda a: qp_answer(solve_factored(a)), straight, least_squares(rng, rows=5))
@@ -174,32 +173,3 @@ class TestSwitches:
 
         np.testing.assert_array_equal(answer(column), [1.0, 0.3])
         np.testing.assert_allclose(jax.jacfwd(answer)(column), 0.0, rtol=0, atol=1e-9)
-
-
-@pytest.mark.release
-@pytest.mark.parametrize("name", ["quadratic program", "hierarchy", "projections", "saturated"])
-def test_hessian_through_a_loop(name):
-    """The rules of the solvers outlive the linearisation of a scan, also where singular values are equal or 0."""
-    rows = jnp.array([[1.0, 0.2, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 2.0]])
-    box = jnp.full(3, -0.3), jnp.full(3, 0.25)
-
-    def step(x, turn):
-        A, b = rows * jnp.cos(x[0] + turn), jnp.sin(x)
-        if name == "quadratic program":
-            s = solve_qp(A.T @ A + jnp.eye(3), -b, *box)
-            return x + s.x, s.active
-        if name == "hierarchy":
-            s = solve_hqp([Level(A[:1], b[:1]), Level(jnp.eye(3), b)], *box)
-            return x + s.x, s.warm_start
-        levels = [Level(A, b), Level(jnp.eye(3), b)]
-        s = solve_nullspace(levels, *box) if name == "saturated" else solve_nullspace(levels, damping=1e-3)
-        return x + s.x, s.active
-
-    def cost(x):
-        end, active = jax.lax.scan(step, x, jnp.array([0.1, 0.3]))
-        return jnp.sum(jnp.sin(end)), active
-
-    def some_are_active(active):
-        return any(a.any() for a in jax.tree.leaves(active)) or name == "projections"
-
-    assert_hessian(cost, jnp.array([0.4, -0.7, 0.2]), some_are_active)

@@ -106,11 +106,9 @@ ROBOTS = {
     "looking": (lambda: osik.load_robot("nao"), looking),
     "closing": (lambda: quietly(osik.Robot.from_mjcf, LOOP), closing),
 }
-IN_THE_GATE = {"classes-weighted", "closing-hierarchy"}
-AT_NIGHT = {f"{case}-{scheme}" for case in ROBOTS for scheme in SCHEMES} - IN_THE_GATE
 
 
-@pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
+@pytest.mark.variants(ordinary=[], slow=["classes-weighted", "closing-hierarchy"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("case", ROBOTS)
 def test_the_step_with_rows_of_jax_is_that_of_plain_jax(case, scheme):
@@ -151,10 +149,7 @@ def spoiled(a: Array, number: Array) -> Array:
     return jnp.ravel(a).at[0].add(number).reshape(a.shape)
 
 
-@pytest.mark.variants(
-    slow=["True-hierarchy"],
-    release=[f"{b}-{s}" for b in (False, True) for s in SCHEMES if (b, s) != (True, "hierarchy")],
-)
+@pytest.mark.variants(ordinary=[], slow=["True-hierarchy"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 @pytest.mark.parametrize("bounded", [False, True])
 def test_rows_that_are_not_finite_fail_as_in_plain_jax_in_their_lane_alone(bounded, scheme):

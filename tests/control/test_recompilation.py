@@ -150,23 +150,3 @@ def test_callables_that_are_pytrees_may_change_their_numbers(arm):
         b = run(0.5, np.ones(7), 0.3)
     assert count.names == []
     assert np.abs(a - b).max() > 1e-3
-
-
-@pytest.mark.slow
-def test_what_is_static_compiles_again(arm):
-    """The counter counts: an iteration cap, a priority, a task more, another number of steps."""
-    task, scheme = osik.PostureTask(arm, weight=1.0), osik.WeightedQP(backend="jax")  # the core's steps are no programs
-    osik.solve(arm, arm.q0, {"posture": task}, scheme=scheme, limits=osik.no_limits)
-    changes = (
-        ({"posture": task}, osik.WeightedQP(max_iterations=50, backend="jax")),
-        ({"posture": osik.PostureTask(arm, priority=4, weight=1.0)}, scheme),
-        ({"posture": task, "second": task}, scheme),
-    )
-    for tasks, other in changes:
-        with Compilations() as count:
-            osik.solve(arm, arm.q0, tasks, scheme=other, limits=osik.no_limits)
-        assert count.names.count("jit(step)") == 1
-    for steps in (2, 3):
-        with Compilations() as count:
-            osik.rollout(arm, arm.q0, {"posture": task}, scheme=scheme, steps=steps, limits=osik.no_limits)
-        assert count.names.count("jit(_rollout)") == 1

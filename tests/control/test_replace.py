@@ -45,16 +45,11 @@ class TestLimits:
     @pytest.mark.parametrize(
         ("name", "changes", "error", "message"),
         [
-            ("configuration", dict(lower=1.0, upper=-1.0), ValueError, "lower > upper in rows"),
             ("configuration", dict(gain=0.0), ValueError, "above 0 and up to 1"),
-            ("configuration", dict(gain=[0.5, 0.5]), ValueError, r"gain has shape \(2,\)"),
             ("configuration", dict(velocity=1.0), TypeError, "no 'velocity' to replace; it has: lower, upper, gain"),
-            ("velocity", dict(velocity=-1.0), ValueError, "0 or more"),
-            ("acceleration", dict(acceleration=0.0), ValueError, "have to be positive"),
             ("barrier", dict(gain=0.0), ValueError, "has to be positive"),
             ("barrier", dict(normals=0.0), ValueError, "finite and not 0"),
             ("linear", dict(matrix=np.nan), ValueError, "matrix is nan"),
-            ("linear", dict(lower=2.0), ValueError, "lower > upper"),
         ],
     )
     def test_mistakes_are_told(self, arm, name, changes, error, message):
@@ -86,15 +81,8 @@ class TestSchemes:
     @pytest.mark.parametrize(
         ("scheme", "changes", "error", "message"),
         [
-            (osik.WeightedQP(), dict(damping=0.0), ValueError, "needs it positive"),
-            (osik.WeightedQP(), dict(damping=-1.0), ValueError, "damping is"),
             (osik.HierarchicalQP(), dict(curvature_damping=-1.0), ValueError, "curvature_damping"),
-            (
-                osik.WeightedQP(),
-                dict(max_iterations=3),
-                TypeError,
-                "to replace; it has: damping, curvature_damping",
-            ),
+            (osik.WeightedQP(), dict(max_iterations=3), TypeError, "it has: damping, curvature_damping"),
             (osik.NullSpace(), dict(method="saturated"), TypeError, "structure is fixed"),
         ],
     )

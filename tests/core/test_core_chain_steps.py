@@ -17,7 +17,7 @@ LANES = 40
 
 
 @needs_core
-@pytest.mark.variants(slow=["nao-False", "nao-True"], release=["arm7-False", "arm7-True"])
+@pytest.mark.variants(slow=["tree-False", "nao-False", "nao-True"], release=["arm7-False", "arm7-True"])
 @pytest.mark.parametrize("near", [False, True])
 @pytest.mark.parametrize("name", ["arm7", "nao", "tree"])
 def test_steps_are_those_of_plain_jax(name, near, rng):

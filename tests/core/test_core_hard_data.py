@@ -76,7 +76,7 @@ def by_both(solve, p):
     return tuple(jax.tree.map(np.asarray, run(p, backend)) for backend in ("core", "jax"))
 
 
-@pytest.mark.variants(slow=SHAPES[:1], release=SHAPES[1:])
+@pytest.mark.variants(ordinary=[], slow=SHAPES[:1])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_weighted(shape):
     n, m = map(int, shape.split("-"))
@@ -102,11 +102,7 @@ def test_weighted(shape):
     assert judged > LANES / 2
 
 
-IN_THE_GATE = ["6-5-hqp", "6-5-saturated"]
-AT_NIGHT = [name for shape in SHAPES for solver in LEVELS if (name := f"{shape}-{solver}") not in IN_THE_GATE]
-
-
-@pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
+@pytest.mark.variants(ordinary=[], slow=["6-5-hqp", "6-5-saturated"])
 @pytest.mark.parametrize("solver", LEVELS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_levels(shape, solver):

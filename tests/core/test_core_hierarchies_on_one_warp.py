@@ -67,14 +67,7 @@ def on_one_warp(monkeypatch, tmp_path):
     _dispatch.hierarchy_solver.cache_clear()
 
 
-IN_THE_GATE = ("conflicting-exact",)
-AT_NIGHT = {f"{f.__name__}-{d}" for f in FAMILIES for d in ("exact", "damped")} - {
-    "inequality_levels-damped",
-    *IN_THE_GATE,
-}
-
-
-@pytest.mark.variants(slow=IN_THE_GATE, release=AT_NIGHT)
+@pytest.mark.variants(ordinary=[], slow=["inequality_levels-damped", "conflicting-exact"])
 @pytest.mark.parametrize("damping", [0.0, DAMPED], ids=["exact", "damped"])
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.__name__)
 def test_the_answers_are_those_of_the_cpu(family, damping, rng, request):

@@ -10,7 +10,6 @@ import pytest
 from core_checks import needs_core
 from null_space_families import FAMILIES, LANES, Problems, check_active, random_problems
 from recorded import SCALED, check_recorded_saturated, check_scales, recorded_saturated, recorded_scales
-from used_memory import used_memory
 
 from osik_jax.core import _library
 from osik_jax.execution import _candidates
@@ -93,25 +92,12 @@ def test_single_precision_is_double_inside(name):
     assert np.abs(found.x - expected.x).max() < 1e-5 * (1.0 + np.abs(expected.x).max())
 
 
-@pytest.mark.variants(
-    slow=["damped inequalities"],
-    release=[
-        "level without rows",
-        "repeated and damped",
-        "nothing left",
-        "more rows than variables",
-        "dependent",
-        "a humanoid's",
-    ],
-)
-@pytest.mark.parametrize(
-    "name",
-    [
-        *("damped inequalities", "repeated and damped", "level without rows"),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("dependent", "more rows than variables", "tiny")),
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("a humanoid's", "nothing left", "zeros", "huge")),
-    ],
-)
+BOUNDED = ["damped inequalities", "repeated and damped", "level without rows", "dependent", "more rows than variables"]
+BOUNDED += ["tiny", "a humanoid's", "nothing left", "zeros", "huge"]
+
+
+@pytest.mark.variants(ordinary=[], slow=["damped inequalities", "tiny", "zeros", "huge"])
+@pytest.mark.parametrize("name", BOUNDED)
 def test_saturation_lane_by_lane_as_the_plain_method(name):
     p = FAMILIES[name]
     found, expected = solved(p, method="saturated"), solved(p, backend="jax", method="saturated")
@@ -204,30 +190,6 @@ def test_numbers_that_overflow_are_an_error_of_their_lane():
         found = solved(p, backend=backend)
         assert np.isfinite(found.x).all()
         assert (np.delete(np.asarray(found.status), 2) == Status.SOLVED).all()
-
-
-IN_USED_MEMORY = ("dependent and damped", "damped, more rows", "a humanoid's")
-
-
-@pytest.fixture(scope="module")
-def in_used_memory(request):
-    """Answers of the core where its results hold zeros before a call, and where they hold NaN."""
-    found = []
-    for left in (0.0, np.nan):
-        with pytest.MonkeyPatch.context() as patch, used_memory(patch, left):
-            made = {method: jax.jit(partial(cast(Any, solved).__wrapped__, method=method)) for method in METHODS}
-            found.append({method: made[method](FAMILIES[request.param]) for method in METHODS})
-    return found
-
-
-@pytest.mark.release
-@pytest.mark.parametrize("in_used_memory", IN_USED_MEMORY, indirect=True)
-@pytest.mark.parametrize("method", METHODS)
-def test_memory_that_was_used_before_says_nothing(method, in_used_memory):
-    """Whatever the core finds in the memory of its results: it writes all of them."""
-    found = [answers[method] for answers in in_used_memory]
-    assert np.isfinite(found[0].x).all()
-    jax.tree.map(np.testing.assert_array_equal, *found)
 
 
 @pytest.mark.variants(slow=["float32"], release=["float64"])

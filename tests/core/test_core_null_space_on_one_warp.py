@@ -40,11 +40,10 @@ def assert_near(found, expected):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-10 * (1.0 + np.abs(b).max()))
 
 
-IN_EVERY_RUN = ("more than 32 of each", "no rows", "repeated and damped")
 IN_THE_GATE = ("a humanoid's", "more than 64 rows", "more than 64 variables", "dependent and damped", "tiny", "zeros")
 
 
-@pytest.mark.variants(slow=IN_THE_GATE, release=set(CASES) - {*IN_EVERY_RUN, *IN_THE_GATE})
+@pytest.mark.variants(ordinary=["more than 32 of each", "no rows", "repeated and damped"], slow=IN_THE_GATE)
 @pytest.mark.parametrize("p", CASES.values(), ids=CASES)
 def test_the_classical_projection(p, on_one_warp):
     levels = [jax.vmap(lambda *of: Level(*of).scaled())(*level) for level in p.levels]
@@ -78,10 +77,9 @@ def of_family(name):
 IN_BOXES = {name: partial(in_a_box, p) for name, p in CASES.items()}
 IN_BOXES |= {name: partial(of_family, name) for name in saturation_families.FAMILIES}
 IN_BOXES |= {"recorded": partial(recorded_saturated, 1)}
-SLOW = ("a humanoid's", "more than 32 of each", "no rows")
 
 
-@pytest.mark.variants(slow=SLOW, release=set(IN_BOXES) - {"ties", "recorded", *SLOW})
+@pytest.mark.variants(ordinary=["ties", "recorded"], slow=["a humanoid's", "more than 32 of each", "no rows"])
 @pytest.mark.parametrize("name", IN_BOXES)
 def test_saturation(name, on_one_warp):
     p = IN_BOXES[name]()

@@ -51,10 +51,7 @@ def everything(call, robot, q, tasks, frames):
     return found
 
 
-@pytest.mark.variants(
-    slow=["nao-3-False", "coupled-1-False"],
-    release=["arm7-1-False", "arm7-3-False", "nao-1-False", "nao-3-True", "coupled-3-False"],
-)
+@pytest.mark.variants(ordinary=["arm7-3-True", "coupled-3-True"], slow=["nao-3-False", "coupled-1-False"])
 @pytest.mark.parametrize(("lanes", "of_each"), [(1, False), (LANES, False), (LANES, True)])
 @pytest.mark.parametrize("name", ["arm7", "nao", "coupled"])
 def test_the_text_of_a_gpu_is_that_of_a_cpu(name, lanes, of_each, tmp_path, rng, monkeypatch):

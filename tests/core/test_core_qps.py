@@ -100,31 +100,6 @@ def test_a_warm_start_costs_one_factorization():
     np.testing.assert_allclose(warm.x, cold.x, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_lanes_that_are_left_to_the_search():
-    """Rows that cannot hold, numbers that are none, unordered bounds, beside lanes that are as they were alone."""
-    p = problems(seed=4)
-    alone = solved(p)
-    rows, low, high = p.rows.copy(), p.rows_lower.copy(), p.rows_upper.copy()
-    compliance, target, lower = p.rows_compliance.copy(), p.target.copy(), p.lower.copy()
-    rows[3, 1], compliance[3, :2] = rows[3, 0], 0.0
-    low[3, :2], high[3, :2] = (1.0, -2.0), (2.0, -1.0)
-    target[7, 0] = np.nan
-    lower[11, 2] = np.where(np.isfinite(p.upper[11, 2]), p.upper[11, 2], 0.0) + 1.0
-    upper = p.upper.copy()
-    upper[11, 2] = lower[11, 2] - 1.0
-    bad = p._replace(
-        rows=rows, rows_lower=low, rows_upper=high, rows_compliance=compliance, target=target, lower=lower, upper=upper
-    )
-    found, plain = solved(bad), solved(bad, "jax")
-    np.testing.assert_array_equal(found.status, plain.status)
-    assert found.status[3] == Status.INFEASIBLE and found.status[7] == Status.NUMERICAL_ERROR
-    assert found.status[11] == Status.INFEASIBLE and np.isfinite(found.x).all()
-    np.testing.assert_allclose(found.x[3], plain.x[3], atol=1e-8)
-    others = np.setdiff1d(np.arange(COUNT), [3, 7, 11])
-    np.testing.assert_array_equal(found.x[others], alone.x[others])
-
-
 @pytest.mark.parametrize(
     ("family", "seed", "lanes"),
     [
@@ -160,25 +135,3 @@ def test_problems_before_say_nothing():
         first, after = candidates(p), jax.tree.map(lambda a: a[1::2], candidates(mixed))
         assert (first.converged != 0).mean() > 0.99 and np.isfinite(first.x).all()
         jax.tree.map(np.testing.assert_array_equal, first, after)
-
-
-@pytest.mark.slow
-def test_derivatives_against_central_differences():
-    """Along one direction of all data, forward and reverse."""
-    p = problems(seed=6, weakest=1e-1)
-    rng = np.random.default_rng(7)
-    way = [rng.normal(size=a.shape) for a in (p.matrix, p.target, p.rows)]
-
-    def moved(t):
-        data = [a + t * d for a, d in zip((p.matrix, p.target, p.rows), way, strict=True)]
-        found = solved(p._replace(matrix=data[0], target=data[1], rows=data[2]))
-        return found.x, found.active
-
-    step = 1e-6
-    (ahead, same), (behind, other) = moved(step), moved(-step)
-    _, rate = jax.jvp(lambda t: moved(t)[0], (0.0,), (1.0,))
-    reverse = jax.grad(lambda t: jnp.sum(moved(t)[0] ** 2))(0.0)
-    kept = np.asarray(same == other).all(1)
-    assert kept.mean() > 0.9
-    np.testing.assert_allclose(rate[kept], ((ahead - behind) / (2 * step))[kept], rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(reverse, jnp.sum(2.0 * moved(0.0)[0] * rate), rtol=1e-9)

@@ -11,15 +11,13 @@ from core_checks import compile_core, run_tests_with
 
 SOME = (
     "core/test_core_qps.py::test_recorded_problems",
-    "core/test_core_qps.py::test_lanes_that_are_left_to_the_search",
     "core/test_core_hierarchies.py::test_recorded_hierarchies",
     "core/test_core_null_space.py::test_as_numpy",
     "core/test_core_null_space.py::test_saturation_of_recorded_problems_whatever_rounding_does",
     "core/test_core_plans.py::test_the_centre_of_mass_is_kept_as_by_the_plain_method",
-    "kinematics/test_core_kinematics.py::test_beside_mujoco",
+    "kinematics/test_core_kinematics.py::test_beside_the_plain_method",
     "control/test_compiled_step.py::test_the_core_answers_as_plain_jax_does",
     "control/test_compiled_step.py::test_numbers_that_are_not_valid_are_answered_as_by_plain_jax",
-    "control/test_compiled_step.py::test_a_batch_is_a_loop_where_lanes_fail_too",
 )
 ALL = (
     *("-m", ""),  # slow ones too

@@ -1,9 +1,8 @@
-"""Each script of ``examples`` runs, is short, draws its picture, and reaches what its first line promises."""
+"""Each script of ``examples`` runs, is short, draws its picture, and reaches what the function of its name checks."""
 
 import os
 import re
 import runpy
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import osik_jax as osik
 
 FOLDER = Path(__file__).parents[2] / "examples"
 GALLERY = FOLDER.parent / "docs" / "gallery.md"
+SOURCES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "__main__")
 Names = dict[str, Any]
 
 
@@ -178,44 +178,28 @@ def tiago_parks(names: Names) -> None:
     assert names["found"].is_reached.all()
 
 
-CHECKS: list[Callable[[Names], None]] = [
-    ur5_pose, panda_draws, xarm_elbow, so101_pose, so101_teleoperation, so101_chunks, weld_line, allegro_grasp,
-    tiago_drives, go2_body, g1_reaches, nao_one_foot, baxter_two_arms, ur5_keeps_off_a_post, panda_thousand_targets,
-    tune_a_weight, retarget_a_person, carry_a_box, collision_free, pick_and_place, ur5e_calibrated, hand_eye,
-    panda_placed, tiago_parks,
-]  # fmt: skip
-
-
-IN_THE_GATE = [so101_teleoperation, retarget_a_person]
-AT_NIGHT = [check for check in CHECKS if check not in IN_THE_GATE]
-
-
-@pytest.mark.variants(slow=[check.__name__ for check in IN_THE_GATE], release=[check.__name__ for check in AT_NIGHT])
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.variants(ordinary=[], slow=["so101_teleoperation", "retarget_a_person"])
+@pytest.mark.parametrize("name", [path.stem for path in SOURCES])
 @pytest.mark.filterwarnings("error::osik_jax.OsikWarning")
-def test_runs(
-    check: Callable[[Names], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(tmp_path)
     plt.switch_backend("Agg")
     try:
-        names = runpy.run_path(str(FOLDER / f"{check.__name__}.py"))
+        names = runpy.run_path(str(FOLDER / f"{name}.py"))
     finally:
         plt.close("all")
         jax.config.update("jax_enable_x64", True)
-    check(names)
+    globals()[name](names)
     assert len(capsys.readouterr().out.splitlines()) >= 2
-    assert os.listdir(tmp_path) == [f"{check.__name__}.png"]
-    with Image.open(tmp_path / f"{check.__name__}.png") as picture:
+    assert os.listdir(tmp_path) == [f"{name}.png"]
+    with Image.open(tmp_path / f"{name}.png") as picture:
         assert len(picture.convert("RGB").getcolors(1 << 24) or ()) > 200
 
 
-def test_each_example_is_short_tested_and_in_the_gallery() -> None:
-    sources = sorted(path for path in FOLDER.glob("*.py") if path.stem != "__main__")
-    assert [path.stem for path in sources] == sorted(check.__name__ for check in CHECKS)
-    assert max(len(path.read_text().splitlines()) for path in sources) <= 60
+def test_each_example_is_short_and_in_the_gallery() -> None:
+    assert max(len(path.read_text().splitlines()) for path in SOURCES) <= 60
     shown = re.findall(r"images/examples/(\w+)\.png", GALLERY.read_text())
-    assert sorted(shown) == [path.stem for path in sources]
+    assert sorted(shown) == [path.stem for path in SOURCES]
     pictures = {path.stem: path.stat().st_size for path in (GALLERY.parent / "images" / "examples").iterdir()}
-    assert sorted(pictures) == [path.stem for path in sources]
+    assert sorted(pictures) == [path.stem for path in SOURCES]
     assert max(pictures.values()) <= 60_000

@@ -79,11 +79,6 @@ def test_every_feature_of_the_data_file_is_on_the_page():
     assert set(TESTS) <= {(title, row[0]) for title, row in ROWS}
 
 
-def test_a_test_that_does_not_exist_is_seen():
-    assert missing_tests(["test_features.py::test_a_test_that_does_not_exist_is_seen"]) == []
-    assert missing_tests(["test_features.py::test_nothing"]) == ["test_features.py::test_nothing"]
-
-
 def test_names_of_ours_exist():
     """Every name in backquotes in our column: ``Name``, ``Name(option=)``, ``object.name``, ``package.name``."""
     checked = 0

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.data_file import read_csv, write_csv
+from benchmarks.data_file import read_csv
 
 robots_table = importlib.import_module("benchmarks.robots_table")
 HEAD, ROWS = read_csv(robots_table.TABLE)
@@ -32,11 +31,7 @@ def test_sizes_are_those_of_what_loads(row: list[str]):
     assert (robot.floating_base, *sizes) == (base == "floating", int(dofs), int(followers), int(frames))
 
 
-GATE = ("ur5", "g1", "nao", "allegro", "tiago_pro")
-
-
-@pytest.mark.variants(release=[name for name in robots_table.ROBOTS if name not in GATE])
-@pytest.mark.slow
+@pytest.mark.variants(ordinary=[], slow=["ur5", "g1", "nao", "allegro", "tiago_pro"])
 @pytest.mark.parametrize("name", robots_table.ROBOTS)
 def test_poses_are_as_right_as_the_page_says(name: str):
     assert robots_table.pose_error(name, robots_table.load(name)) < robots_table.TOLERANCE
@@ -47,16 +42,3 @@ def test_a_wrong_pose_is_seen():
     robot = robots_table.load("arm7")
     longer = robot.scaled(length={"link6": 1.0 + 1e-3 / 0.088})
     assert 1e-3 / np.sqrt(3.0) <= robots_table.pose_error("arm7", longer) <= 1.000001e-3
-
-
-@pytest.mark.slow
-def test_a_row_is_measured_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(robots_table, "CALLS", 2)
-    row = robots_table.row("ur5")
-    assert row[:5] == ("ur5", False, 6, 0, 11)
-    assert row.error < robots_table.TOLERANCE and row.step > 0.0
-    file = tmp_path / "robots.csv"
-    write_csv(file, robots_table.HEAD, [row.cells()])
-    head, (cells,) = read_csv(file)
-    assert (tuple(head), cells[:5]) == (robots_table.HEAD, ["ur5", "fixed", "6", "0", "11"])
-    np.testing.assert_allclose(float(cells[6]) * 1e-6, row.step, atol=1e-6)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from other_processes import finish, start
 
 import osik_jax as osik
 from osik_jax.execution import _memory_maps as maps
@@ -52,34 +51,6 @@ def test_it_warns_once_where_few_are_left_and_counts_at_new_programs_alone(monke
     maps.watch_memory_maps("solve", Compiled(1))  # caches were cleared, and programs are compiled again
     maps.watch_memory_maps("solve", Compiled(2))
     assert len(counts) == 5
-
-
-CLEARED = """
-import gc, json
-import jax, numpy as np
-import osik_jax as osik
-from osik_jax.execution._memory_maps import counted_maps
-
-body = '<body><joint name="a" axis="0 1 0"/><geom size=".1"/><site name="tip" pos=".3 0 0"/></body>'
-robot = osik.Robot.from_mjcf(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
-counts = [counted_maps()]
-for scheme in (osik.WeightedQP(backend="jax"), osik.HierarchicalQP(backend="jax")):
-    for rows in ("position", "orientation", "pose"):
-        osik.solve(robot, robot.q0, {"tip": osik.FrameTask(robot, "tip", rows=rows)}, scheme=scheme)
-counts.append(counted_maps())
-jax.clear_caches()
-gc.collect()
-print(json.dumps([*counts, counted_maps()]))
-"""
-
-
-@pytest.mark.release
-@pytest.mark.skipif(maps.counted_maps() is None, reason="the system does not say which memory maps a process has")
-def test_cleared_caches_give_memory_maps_back():
-    """As the page on troubleshooting tells; in another process, for tests here keep what they compiled."""
-    before, grown, after = finish(start(CLEARED))
-    assert grown - before > 500
-    assert after - before < 0.2 * (grown - before)
 
 
 @pytest.mark.slow

@@ -120,31 +120,6 @@ def test_counts_are_checked(given):
         configure_cpu(**given)
 
 
-LOCKED = """
-import sys, jax, jax.numpy as jnp
-if "configured" in sys.argv:
-    from osik_jax.runtime import configure_cpu
-    configure_cpu()
-def both(a, b):
-    return jnp.linalg.inv(a), jnp.linalg.inv(b)
-def again(_, pair):
-    return jax.tree.map(lambda new, old: old + 0.0 * new, jax.vmap(both)(*pair), pair)
-a = jnp.broadcast_to(2.0 * jnp.eye(12), (512, 12, 12))
-jax.block_until_ready(jax.jit(lambda a, b: jax.lax.fori_loop(0, 500, again, (a, b)))(a, 1.5 * a))
-print("done")
-"""
-
-
-@pytest.mark.slow
-def test_batches_of_factorisations_side_by_side_come_to_an_end():
-    """Without ``configure_cpu`` the same program may wait for ever on two cores (jaxlib 0.10.2)."""
-    env = {k: v for k, v in os.environ.items() if k not in OURS}
-    done = subprocess.run(
-        [sys.executable, "-c", LOCKED, "configured"], env=env, capture_output=True, text=True, timeout=300
-    )
-    assert done.stdout == "done\n", done.stderr
-
-
 SIDE_BY_SIDE = """
 import os
 os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
@@ -237,29 +212,3 @@ def test_flags_are_set_for_every_jax_that_may_be_installed():
     (bounds,) = [d.removeprefix("jax").split(",") for d in project["dependencies"] if d.startswith("jax>")]
     major, minor = _UNTRIED_JAXLIB
     assert f"<{major}.{minor}" in bounds
-
-
-WHOLE = """
-import os
-os.sched_getaffinity = lambda _: {0, 1}
-import jax, numpy as np
-jax.config.update("jax_enable_x64", True)
-from osik_jax.execution._lapack import lapack_calls
-from osik_jax.solvers import Level, solve_hqp, solve_least_squares_qp
-def qp(A, b):
-    return solve_least_squares_qp(A, b, np.ones(48), -np.ones(48), np.ones(48), backend="jax").x
-def hqp(A, b):
-    return solve_hqp([Level(A[:24], b[:24]), Level(A[24:], b[24:])], -np.ones(48), np.ones(48), backend="jax").x
-A, b = np.random.default_rng(0).normal(size=(64, 48, 48)), np.ones((64, 48))
-for solve in qp, hqp:
-    calls = lapack_calls(jax.vmap(solve), A, b)
-    print(len(calls) > 0, sum(call.is_split() for call in calls) > 0)
-"""
-
-
-@pytest.mark.release
-def test_searches_on_few_workers_have_no_call_that_is_split():
-    """With a pool that is wide enough they have: there, blocks are as long as the cache likes them."""
-    few = in_a_process(WHOLE).stdout.split()
-    assert few == ["True", "False"] * 2 if splits(jaxlib_version()) else ["True", "True"] * 2
-    assert in_a_process(WHOLE, PJRT_NPROC="8").stdout.split() == ["True", "True"] * 2

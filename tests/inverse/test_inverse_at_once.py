@@ -1,7 +1,5 @@
 """Plain calls for poses, which the core answers in one call: against the definition in plain JAX, and each other."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,11 +9,8 @@ from core_checks import needs_core
 from model_files import mjcf
 
 import osik_jax as osik
-from osik_jax.inverse import _run
 from osik_jax.inverse._chain_problem import ChainRoute, Settings
 from osik_jax.inverse._chain_search import Goal
-from osik_jax.inverse._fixed import Explored, Outcomes
-from osik_jax.inverse._pool import Errors
 
 
 def poses_of(robot, frames, q):
@@ -72,39 +67,6 @@ def test_one_target_is_answered_as_in_a_batch(rng):
             for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(many), strict=True):
                 assert isinstance(a, jax.Array) and a.dtype == b.dtype
                 np.testing.assert_allclose(a, b[at], atol=1e-12)
-
-
-@needs_core
-@pytest.mark.slow
-def test_nearest_is_never_farther_than_the_plain_call(rng):
-    """From a corner of the joint ranges, where the pull towards it keeps searches from solutions."""
-    arm = osik.load_robot("ur5")
-    low, high, share = np.full(6, -3.1), np.full(6, 3.1), 0.03 * 6.2 * rng.random((300, 6))
-    q = np.where(rng.random((300, 6)) < 0.5, low + share, high - share)
-    goals = {"tool0": tuple(part[:, 0] for part in poses_of(arm, ("tool0",), q))}
-    plain, near = (
-        osik.inverse_kinematics(arm, goals, q0=jnp.asarray(high), nearest=nearest) for nearest in (False, True)
-    )
-    assert plain.converged.all() and near.converged.all()
-    ways = [np.linalg.norm(np.asarray(found.q) - high, axis=1) for found in (near, plain)]
-    assert (ways[0] <= ways[1] + 1e-3).all()
-    assert (ways[0] < ways[1] - 0.1).mean() > 0.2
-
-
-def test_a_solution_of_a_further_search_is_judged_at_its_configuration():
-    """The searches of `all` have not met the target, so what they say of their own ends does not count."""
-    planar = osik.Robot.from_mjcf(mjcf("two_links_with_a_tip"))
-    q = jnp.array([[0.3, 1.0], [0.3, 0.0], [0.3, 1.0]])  # a point by itself, stretched, and one of a search that met it
-    position = poses_of(planar, ("tip",), q)[0]
-    goals = Goal(position, jnp.broadcast_to(jnp.eye(3), (3, 1, 3, 3)))
-    route = ChainRoute(("tip",), ((True, True, False, False, False, False),))
-    settings = Settings(planar.q0, planar.position_lower, planar.position_upper, 0, jnp.array([1e-3, 1e-2]), 2)
-    score = jnp.array([[9.0, 9.0], [9.0, 9.0], [9.0, 0.5]])
-    found = SimpleNamespace(q=q, seed=np.array([7, 1, 1]), converged=np.ones(3, bool))
-    isolated = jnp.array([[False, False], [True, True], [True, False]])
-    explored = Explored(found, Outcomes(jnp.zeros((3, 2, 2)), Errors(*[score] * 4)), isolated)  # pyright: ignore
-    alone = _run.isolated_at_answers(planar, goals, settings, explored, route=route)
-    assert alone.tolist() == [True, False, False]
 
 
 def test_what_a_trace_has_made_is_not_kept_for_later_calls():

@@ -131,13 +131,6 @@ def test_all_solutions_are_those_of_the_closed_form(planar):
     assert np.isnan(solutions[2:]).all()
 
 
-def test_nearest_is_the_nearest_of_the_closed_form(planar):
-    for expected in two_solutions(0.5, 0.3):
-        start = jnp.asarray(expected + 0.1)
-        found = osik.inverse_kinematics(planar, {"tip": (0.5, 0.3, 0.0)}, q0=start, nearest=True, seeds=16)
-        np.testing.assert_allclose(found.q, expected, atol=1e-4)
-
-
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 def test_nearest_finds_what_the_plain_call_finds(rng):
@@ -160,6 +153,7 @@ def test_nearest_finds_what_the_plain_call_finds(rng):
     assert np.asarray(fixed).any() and (np.asarray(traced) >= np.asarray(fixed)).all()
 
 
+@pytest.mark.variants(slow=["options1"])
 @pytest.mark.parametrize("options", [{}, {"nearest": True}])
 def test_numbers_inside_jit_are_searched_as_outside(planar, options):
     """Of a target out of reach, where the search goes on to the least error."""
@@ -205,6 +199,7 @@ def test_a_start_that_is_right_is_kept(arm, rng):
     assert found.seed == 0
 
 
+@pytest.mark.slow
 def test_pure_form_is_differentiable_and_batched(arm, rng):
     """Against central differences of the same search from its own solution, and MuJoCo's Jacobian."""
     _, rotation = mujoco_pose(arm, np.asarray(arm.q0), "hand")
@@ -394,6 +389,7 @@ class TestMistakes:
         refuses(TypeError, "all=True counts", jax.jit(lambda p: find({"hand": p}, all=True).q), jnp.zeros(3))
 
 
+@pytest.mark.slow
 def test_a_program_with_searches_can_be_exported(planar):
     def solve(position):
         return osik.inverse_kinematics(planar, {"tip": position}, seeds=8, steps=12).q

@@ -126,29 +126,6 @@ def test_hessian_of_the_error_by_central_differences(rng, rows):
     np.testing.assert_allclose(hessian, np.stack(columns, 1), atol=1e-8)
 
 
-@pytest.mark.slow
-def test_explain_counts_rows_and_names_those_to_leave_out(arm):
-    robot = osik.load_robot("arm7", locked_joints={"joint3": 0.0, "joint5": 0.0})
-    pose = (np.array([0.4, 0.2, 0.3]), np.array([0.5, 0.5, 0.5, 0.5]))
-    said = osik.inverse_kinematics(robot, {"hand": pose}, restarts=0).explain()
-    assert "hand asks for 6 rows and 5 joints carry it" in said and "leave out 1 row" in said
-    rows, axes = eval(said.split("rows=")[1].split(")")[0] + ")"), said.split("axes='")[1].split("'")[0]
-    assert sum(rows) == 5 and rows[:3] == (True, True, True)
-    model, q = robot.mj_model, np.asarray(robot.q0) + 0.3
-    data, jacobian = mujoco.MjData(model), np.zeros((6, model.nv))
-    data.qpos[:] = np.asarray(robot.mujoco_qpos(q))
-    mujoco.mj_kinematics(model, data)
-    mujoco.mj_comPos(model, data)
-    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], data.site("hand").id)
-    turn = data.site("hand").xmat.reshape(3, 3) if axes == "frame" else np.eye(3)
-    kept = np.concatenate([turn.T @ jacobian[:3], turn.T @ jacobian[3:]])[list(rows)]
-    moved = [model.joint(name).dofadr[0] for name in robot.joint_names]
-    assert np.linalg.svd(kept[:, moved], compute_uv=False).min() > 1e-2
-    both = osik.inverse_kinematics(arm, {"hand": pose, "link6": pose}, seeds=4, restarts=0).explain()
-    assert "12 rows of 7 joints" in both
-    assert "rows" not in osik.inverse_kinematics(arm, {"hand": (np.array([0.0, 0.0, 9.0]), pose[1])}, seeds=4).explain()
-
-
 @pytest.mark.variants(slow=["two"], release=["one"])
 @pytest.mark.filterwarnings("ignore::osik_jax.OsikWarning")
 @pytest.mark.parametrize(

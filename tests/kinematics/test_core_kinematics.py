@@ -6,13 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from core_checks import needs_core
+from frames_beside_mujoco import random_configurations
 from model_files import mjcf
-from mujoco_states import full_velocities, mujoco_at
-from test_kinematics import quick_jit, random_configurations, toy_robot
+from test_kinematics import quick_jit, toy_robot
 
 import osik_jax as osik
 from osik_jax.kinematics import forward_kinematics
@@ -86,24 +85,6 @@ def test_beside_the_plain_method(robots, name):
         assert_near(*(quick_jit(f)(lengths, q) for f in each))
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_beside_mujoco(robots, name):
-    robot = robots[name]
-    model, to_mujoco = robot.mj_model, full_velocities(robot)
-    run = quick_jit(partial(everything, "core", None))
-    for q in random_configurations(robot, 2, 2):
-        data = mujoco_at(robot, q)
-        _, moving, *_ = run(robot, jnp.asarray(q))
-        for frame, position, rotation, jacobian in zip(robot.frame_names, *moving, strict=True):
-            body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, frame)
-            if body >= 0:
-                linear, angular = np.zeros((2, 3, model.nv))
-                mujoco.mj_jacBody(model, data, linear, angular, body)
-                np.testing.assert_allclose(position, data.xpos[body], atol=ROUNDING)
-                np.testing.assert_allclose(rotation.ravel(), data.xmat[body], atol=ROUNDING)
-                np.testing.assert_allclose(jacobian, np.concatenate([linear, angular]) @ to_mujoco, atol=ROUNDING)
-
-
 @pytest.mark.variants(release=["toy"])
 @pytest.mark.variants(slow=["coupled"])
 @pytest.mark.parametrize("name", (pytest.param("toy", marks=pytest.mark.slow), "coupled"))
@@ -170,10 +151,7 @@ def with_squares(rows: Any) -> Any:
     return {name: replace(one, squares=one.squared_lengths()) for name, one in rows.items()}
 
 
-@pytest.mark.slow
-@pytest.mark.variants(
-    release=["twist", "adaptive", "geometric", "frame's axes", "some", "geometric, frame's", "position", "pose"]
-)
+@pytest.mark.variants(ordinary=[], slow=["bounds"])
 @pytest.mark.parametrize("case", OPTIONS)
 def test_rows_of_poses(robots, case):
     """All that the rows hold, beside the plain method; some errors are 0, one is nearly half a turn."""

@@ -1,7 +1,8 @@
-"""Controllers as files: every class of tasks, limits and schemes comes back to the last bit; errors name the file."""
+"""Files of controllers and rollouts: every class comes back to the last bit; errors name the file."""
 
-import inspect
 import json
+import os
+import stat
 from typing import Any, cast
 
 import jax
@@ -9,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from every_class import all_limits, all_tasks
-from model_files import mjcf
 from refusals import refuses
 from small_files import files_of_at_most
 
 import osik_jax as osik
+from osik_jax._whole_file import whole_file, write_text
 
 
 def same(a: Any, b: Any) -> bool:
@@ -24,9 +25,8 @@ def same(a: Any, b: Any) -> bool:
     )
 
 
-@pytest.mark.parametrize("scheme", [osik.WeightedQP(2e-6), osik.HierarchicalQP(), osik.NullSpace(method="saturated")])
-def test_everything_comes_back(arm, tmp_path, scheme):
-    path, tasks, limits = tmp_path / "c.json", all_tasks(arm), all_limits(arm)
+def test_everything_comes_back(arm, tmp_path):
+    path, tasks, limits, scheme = tmp_path / "c.json", all_tasks(arm), all_limits(arm), osik.WeightedQP(2e-6)
     osik.save_controller(path, arm, tasks, scheme=scheme, limits=limits, dt=0.01, source="arm7")
     found = osik.load_controller(path)
     assert found.dt == 0.01 and same(found.scheme, scheme) and same(found.robot, arm)
@@ -73,36 +73,6 @@ def test_a_robot_from_text_and_a_file_that_changed(tmp_path):
     assert same(osik.load_controller(tmp_path / "f.json").robot, robot)
     file.write_text(text.replace(".3 0 0", ".4 0 0"))
     refuses(ValueError, "has changed since", osik.load_controller, tmp_path / "f.json")
-
-
-def with_what_an_arm_has_not(robot) -> tuple[dict[str, osik.Task], list[osik.Limit]]:
-    tasks = {
-        "loop": osik.EqualityConstraintTask(robot, hard=True),
-        "wheel": osik.WheelTask(robot, "wheel", radius=0.05, roller_angle=0.7, gain=3.0),
-        "crank": osik.PostureTask(robot, joints=("crank",), target=robot.q0.at[8].set(0.3), priority=2),
-    }
-    return tasks, [osik.FloatingBaseVelocityLimit(robot, linear=[0.3, 0.2, 0.1], angular=0.5)]
-
-
-SCHEMES = [osik.WeightedQP(), osik.HierarchicalQP(), *(osik.NullSpace(method=m) for m in ("classical", "saturated"))]
-
-
-@pytest.mark.variants(slow=["scheme2"], release=["scheme1", "scheme3", "scheme0"])
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_loops_wheels_and_limits_of_a_base_come_back(tmp_path, scheme):
-    with pytest.warns(osik.OsikWarning, match="EqualityConstraintTask"):
-        robot = osik.Robot.from_mjcf(mjcf("cart_with_a_loop"))
-    tasks, limits = with_what_an_arm_has_not(robot)
-    osik.save_controller(tmp_path / "c.json", robot, tasks, scheme=scheme, limits=limits, dt=0.02)
-    with pytest.warns(osik.OsikWarning, match="EqualityConstraintTask"):
-        found = osik.load_controller(tmp_path / "c.json")
-    assert list(found.tasks) == list(tasks)
-    assert [name for name, task in tasks.items() if not same(found.tasks[name], task)] == []
-    assert same(found.limits[0], limits[0]) and same(found.scheme, scheme)
-    given = (found.robot, found.robot.q0, found.tasks), (robot, robot.q0, tasks)
-    answers = [osik.solve(*one, scheme=scheme, limits=limits, dt=0.02) for one in given]
-    np.testing.assert_array_equal(answers[0].velocity, answers[1].velocity)
-    assert np.abs(answers[0].velocity).max() > 0.01
 
 
 TABLE = osik.CollisionShape.box((0.5, 0.5, 0.02), (0.6, 0.0, -0.1))
@@ -155,7 +125,7 @@ FUSED = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom
 GEAR = '<equality><joint joint1="d" joint2="a" polycoef="0 1 .5 0 0"/></equality>'
 
 
-@pytest.mark.variants(slow=["None"])
+@pytest.mark.slow
 @pytest.mark.parametrize("source", [None, "arm7"])
 def test_a_robot_of_single_precision_stays_one(arm, tmp_path, source):
     """The whole controller is of one precision, so a step of it is too."""
@@ -295,14 +265,6 @@ def test_an_edited_file_that_solve_does_not_take_is_refused(saved, tmp_path, edi
     refuses(ValueError, rf"{path} cannot be loaded: .*{message}", osik.load_controller, path)
 
 
-def test_an_edited_file_is_loaded(saved, tmp_path):
-    content = json.loads(saved)
-    content["tasks"]["hand"]["weight"] = 3.0
-    path = tmp_path / "c.json"
-    path.write_text(edited(content))
-    assert osik.load_controller(path).tasks["hand"].weight == 3.0
-
-
 def test_on_a_full_disk_the_older_file_stays(saved, arm, tmp_path):
     (path := tmp_path / "c.json").write_text(saved)
     with files_of_at_most(500), pytest.raises(OSError, match="cannot be written: File too large") as caught:
@@ -311,8 +273,55 @@ def test_on_a_full_disk_the_older_file_stays(saved, arm, tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["c.json"] and path.read_text() == saved
 
 
-def test_no_public_class_is_left_out(arm):
-    tried = {type(one) for one in (*all_tasks(arm).values(), *all_limits(arm))}
-    public = {c for c in vars(osik).values() if inspect.isclass(c) and issubclass(c, osik.Task | osik.Limit)}
-    elsewhere = {osik.EqualityConstraintTask, osik.WheelTask, osik.FloatingBaseVelocityLimit}  # the test of the cart
-    assert public - tried == {osik.Task, osik.Limit, osik.FunctionTask} | elsewhere
+def check_trajectory(path, trajectory) -> None:
+    trajectory.save(path)
+    found = osik.load_trajectory(path)
+    wanted = (trajectory.time, trajectory.q, vars(trajectory.solution) | {"warm_start": None})
+    found = (found.time, found.q, vars(found.solution))
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_array_equal(own, other)
+        assert own.dtype == other.dtype
+
+
+def test_a_file_gives_the_same_rollout(tmp_path, nao) -> None:
+    tasks = {"hand/left": osik.FrameTask(nao, "l_gripper", priority=2), "com": osik.ComTask(nao)}
+    check_trajectory(tmp_path / "a.npz", osik.rollout(nao, nao.q0, tasks, steps=3))
+
+
+def test_of_many_rollouts(tmp_path, arm) -> None:
+    tasks = {"posture.all": osik.PostureTask(arm)}
+    many = jax.vmap(lambda q: osik.rollout(arm, q, tasks, steps=3))(arm.q0 + jnp.linspace(0.0, 0.1, 4)[:, None])
+    check_trajectory(tmp_path / "many.npz", many)
+
+
+def test_what_is_no_trajectory_is_refused(tmp_path) -> None:
+    np.savez(tmp_path / "other.npz", time=np.zeros(3))
+    with pytest.raises(osik.OsikError, match="other.npz is no trajectory: it has no q"):
+        osik.load_trajectory(tmp_path / "other.npz")
+    with pytest.raises(FileNotFoundError):
+        osik.load_trajectory(tmp_path / "none.npz")
+
+
+def test_links_devices_and_permissions_stay(tmp_path):
+    file, link, nothing = tmp_path / "file", tmp_path / "link", tmp_path / "nothing"
+    write_text(file, "older")
+    file.chmod(0o640)
+    link.symlink_to(file)
+    write_text(link, "ä\n")
+    assert link.is_symlink() and file.read_bytes() == "ä\n".encode() and stat.S_IMODE(file.stat().st_mode) == 0o640
+    nothing.symlink_to(os.devnull)
+    write_text(nothing, "text")
+    assert nothing.is_char_device() and sorted(path.name for path in tmp_path.iterdir()) == ["file", "link", "nothing"]
+
+
+def test_after_an_error_the_older_file_stays(tmp_path):
+    write_text(path := tmp_path / "file", "older")
+    with pytest.raises(RuntimeError), whole_file(path) as file:
+        file.write(b"new")
+        raise RuntimeError
+    assert path.read_text() == "older" and [one.name for one in tmp_path.iterdir()] == ["file"]
+    missing = tmp_path / "none" / "file"
+    with pytest.raises(FileNotFoundError) as caught:
+        write_text(missing, "text")
+    assert caught.value.filename == str(missing)

@@ -168,28 +168,6 @@ def test_chunks_of_another_job_are_refused_and_kept(done, tmp_path_factory):
     assert (other / "00000002.npz").read_bytes() == before["00000002.npz"]
 
 
-def test_an_earlier_format_is_refused(done):
-    """Manifests and chunks as they were before chunks said of which job they are."""
-    manifest = json.loads((done / "manifest.json").read_text())
-    del manifest["job"]
-    for path in done.glob("*.npz"):
-        with np.load(path) as file:
-            arrays = {name: file[name] for name in file.files if name not in ("job", "part", "names")}
-        np.savez(path, **arrays)
-    (done / "manifest.json").write_text(json.dumps(manifest | {"format": 1}))
-    for call in (lambda: run(done, program, shared=(3.0,)), lambda: scaling.load(done)):
-        refuses(ValueError, r"has format 1, .* reads and writes 2: name another folder.* np\.load", call)
-    (done / "manifest.json").unlink()
-    refuses(ValueError, r"00000000\.npz has results of another job", run, done, program, shared=(3.0,))
-
-
-def test_plain_numpy_reads_a_chunk(done):
-    with np.load(done / "00000004.npz", allow_pickle=False) as file:
-        np.testing.assert_array_equal(file["result.square"], 3.0 * X[16:] ** 2)
-        assert (str(file["job"]), file["part"].tolist()) == (scaling.load(done).manifest["job"], [4, 0, 1])
-        assert file["lanes"].tolist() == [[0, 4]]
-
-
 def test_two_jobs_in_one_folder(tmp_path):
     """The second is told who works there; the first goes on as if nothing had been."""
     told = []
@@ -263,22 +241,6 @@ def test_a_folder_that_cannot_be_written_to(tmp_path):
             run(out, function)
         assert caught.value.filename == str(out)
     assert function.ran == []
-
-
-def test_a_read_only_folder(tmp_path, monkeypatch):
-    """The first file that is opened for writing tells, before anything runs."""
-    real = os.open
-
-    def read_only(path: Any, flags: int, *args: Any, **kwargs: Any) -> int:
-        if flags & os.O_CREAT and Path(path).parent == tmp_path:
-            raise PermissionError(13, "Permission denied", str(path))
-        return real(path, flags, *args, **kwargs)
-
-    monkeypatch.setattr(os, "open", read_only)  # rights do not stop root, who may run the tests
-    function = Counted()
-    with pytest.raises(PermissionError, match="folder for the results cannot be made or written to") as caught:
-        run(tmp_path, function)
-    assert caught.value.filename == str(tmp_path) and function.ran == []
 
 
 def test_a_disk_that_is_too_small_is_found_before_the_work(tmp_path):

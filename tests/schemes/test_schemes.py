@@ -7,13 +7,11 @@ import dataclasses
 import daqp
 import jax
 import jax.numpy as jnp
-import mink
 import numpy as np
 import pytest
 from example_files import example_file
 from hierarchy_families import Hierarchies, Rows
 from lexicographic import certificate
-from mujoco_states import mujoco_at
 from task_checks import kinematics_at, moved_by
 from urdfs import joint, tree
 
@@ -215,67 +213,6 @@ class TestWeightedQP:
         np.testing.assert_allclose(ours.velocity, 0.0, rtol=0, atol=1e-12)
         assert int(ours.status) == osik.Status.SOLVED
 
-    @pytest.mark.slow
-    def test_the_closed_loop_is_minks(self, g1):
-        """Error and Jacobian of a FrameTask are mink's to second order in the error: the feet stay, the rest moves."""
-        robot, gain, count = g1.robot, 8.0, 60
-        feet = ("left_ankle_roll_link", "right_ankle_roll_link")
-        c = np.asarray(osik.center_of_mass(robot, kinematics_at(robot, robot.q0)))
-        goal, turn = c + np.array([0.02, 0.03, -0.08]), "right_wrist_yaw_link"
-        R = at_home(robot, turn)[1] @ mink.SO3.exp(np.array([0.5, -0.4, 0.3])).as_matrix()
-        posture = np.array(robot.q0)
-        posture[robot.joint_qpos_index("left_shoulder_pitch_joint")] -= 0.8
-        ours = {
-            **{
-                foot: osik.FrameTask(robot, foot, axes="frame", weight=25.0, orientation_weight=1.0, gain=gain)
-                for foot in feet
-            },
-            "com": osik.ComTask(robot, target=goal, weight=4.0, gain=gain),
-            "turn": osik.FrameTask(
-                robot,
-                turn,
-                target=(np.zeros(3), R),
-                axes="frame",
-                rows="orientation",
-                orientation_weight=0.25,
-                gain=gain,
-            ),
-            "posture": osik.PostureTask(robot, target=posture, weight=0.01, gain=gain),
-        }
-        limits = osik.ConfigurationLimit(robot), osik.VelocityLimit(robot, velocity={"*": 1.2})
-        scheme = osik.WeightedQP(damping=1e-4, curvature_damping=0.0)
-        trajectory = osik.rollout(robot, robot.q0, ours, scheme=scheme, limits=limits, dt=DT, steps=count)
-        theirs = mink_loop(robot, feet, goal, (turn, R), posture, gain * DT, count)
-        np.testing.assert_array_equal(trajectory.solution.status, osik.Status.SOLVED)
-        np.testing.assert_allclose(trajectory.q, theirs, rtol=0, atol=1e-6)
-        assert np.abs(theirs[-1] - theirs[0]).max() > 0.2
-        assert (np.abs(np.abs(trajectory.solution.velocity[:, 6:]) - 1.2) < 1e-9).any()
-
-
-def mink_loop(robot, feet, com, turn, posture, gain, count):
-    model = robot.mj_model
-    configuration = mink.Configuration(model, q=np.array(robot.q0))
-    tasks: list = [mink.FrameTask(foot, "body", 5.0, 5.0, gain=gain) for foot in feet]
-    tasks += [mink.ComTask(2.0, gain=gain), mink.FrameTask(turn[0], "body", 0.0, 0.5, gain=gain)]
-    tasks += [mink.PostureTask(model, 0.1, gain=gain)]
-    for foot in tasks[:2]:
-        foot.set_target_from_configuration(configuration)
-    tasks[2].set_target(com)
-    rotation = mink.SO3.from_matrix(turn[1])
-    tasks[4].set_target(posture)
-    limits = [
-        mink.ConfigurationLimit(model, gain=1.0),
-        mink.VelocityLimit(model, {name: 1.2 for name in robot.joint_names}),
-    ]
-    out = [configuration.q.copy()]
-    for _ in range(count):
-        here = configuration.get_transform_frame_to_world(turn[0], "body").translation()
-        tasks[3].set_target(mink.SE3.from_rotation_and_translation(rotation, here))
-        v = mink.solve_ik(configuration, tasks, DT, "daqp", damping=1e-4, limits=limits)
-        configuration.integrate_inplace(v, DT)
-        out.append(configuration.q.copy())
-    return np.array(out)
-
 
 def levels(case, q):
     """By priority: weighted rows and their bounds."""
@@ -385,67 +322,6 @@ class TestHierarchicalQP:
         for k in range(LANES):
             expected = projected(levels(case, q[k]), case.robot.nv, np.zeros(case.robot.nv))
             np.testing.assert_allclose(ours.velocity[k], expected, rtol=0, atol=1e-8)
-
-    @pytest.mark.release
-    def test_one_level_equals_the_weighted_qp(self, arm, rng):
-        q, weights = configurations(arm, rng), (5.0, 2.0, 0.1)
-        schemes = osik.HierarchicalQP(curvature_damping=0.0), osik.WeightedQP(damping=1e-11, curvature_damping=0.0)
-        ranks = (1, 1, 1), (1, 2, 3)  # which a weighted QP does not look at: a program that is there already
-        hierarchical, weighted = (
-            solve_lanes(dataclasses.replace(arm, tasks=arm_tasks(arm.robot, rank, weights)), q, scheme)
-            for scheme, rank in zip(schemes, ranks, strict=True)
-        )
-        np.testing.assert_allclose(hierarchical.velocity, weighted.velocity, rtol=0, atol=1e-8)
-
-    @pytest.mark.slow
-    def test_growing_weights_tend_to_it(self, arm, rng):
-        q = configurations(arm, rng)
-        strict = solve_lanes(arm, q, osik.HierarchicalQP(curvature_damping=0.0)).velocity
-        apart = []
-        for k in (1, 2, 3):
-            ratio = 10.0 ** (2 * k)
-            tasks = {name: t.replace(weight=ratio ** (2 - i)) for i, (name, t) in enumerate(arm.tasks.items())}
-            case = dataclasses.replace(arm, tasks=tasks)
-            apart.append(
-                np.abs(
-                    solve_lanes(case, q, osik.WeightedQP(damping=1e-10, curvature_damping=0.0)).velocity - strict
-                ).max()
-            )
-        assert apart[1] < 0.1 * apart[0]
-        assert apart[2] < 0.1 * apart[1]
-        assert apart[2] < 1e-3
-
-
-@pytest.mark.slow
-def test_the_centre_of_mass_is_kept_over_the_feet_while_the_waist_pulls(nao):
-    """MuJoCo C says where the centre of mass and the feet are. Without the task it would leave the polygon."""
-    robot, feet = nao.robot, ("l_sole", "r_sole")
-    polygon = osik.support_polygon(robot, robot.q0, feet, margin=0.03)
-    p, R = at_home(robot, "torso")
-    com = osik.ComTask(robot, polygon=polygon, gain=50.0, priority=2)
-    tasks = {
-        **{foot: osik.FrameTask(robot, foot, gain=50.0) for foot in feet},
-        "waist": osik.FrameTask(robot, "torso", target=(p + np.array([0.0, 0.1, -0.02]), R), gain=2.0, priority=3),
-        "posture": osik.PostureTask(robot, gain=1.0, priority=4, weight=1.0),
-    }
-    limits = (osik.ConfigurationLimit(robot), osik.VelocityLimit(robot))
-    outside, scheme = {}, osik.HierarchicalQP(curvature_damping=0.0)
-    for weight in (0.0, 1.0):
-        now = {**tasks, "com": com.replace(weight=weight)}
-        run = osik.rollout(robot, robot.q0, now, scheme=scheme, limits=limits, dt=0.01, steps=150)
-        np.testing.assert_array_equal(run.solution.status, osik.Status.SOLVED)
-        path = [mujoco_at(robot, q) for q in np.asarray(run.q)]
-        feet_at = np.array([[data.site(foot).xpos for foot in feet] for data in path])
-        com_at = np.array([data.subtree_com[0, :2] for data in path])
-        beyond = com_at @ np.asarray(polygon.normals).T - np.asarray(polygon.offsets)
-        outside[weight] = beyond.max(1)
-        assert np.abs(feet_at - feet_at[0]).max() < 1e-4
-        joints = np.asarray(run.q)[:, 7:]
-        assert (joints >= np.asarray(robot.position_lower)[6:]).all()
-        assert (joints <= np.asarray(robot.position_upper)[6:]).all()
-    assert outside[0.0][-1] > 2e-3
-    assert outside[1.0].max() < 1e-5
-    assert outside[1.0][-1] > -1e-4  # it got as far as it may
 
 
 HELD = tree(

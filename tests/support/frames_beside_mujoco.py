@@ -21,9 +21,9 @@ def poses(robot: osik.Robot, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     return *kinematics.frame_poses(robot, robot.frame_names), osik.center_of_mass(robot, kinematics)
 
 
-def random_configurations(robot: osik.Robot, count: int = 3) -> np.ndarray:
+def random_configurations(robot: osik.Robot, seed: int = 3, count: int = 4) -> np.ndarray:
     """Any positions, unit quaternions. (count, nq)"""
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(seed)
     q = rng.uniform(-1.5, 1.5, (count, robot.nq))
     free, ball = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL
     for joint, start in robot.tree.qpos_address.items():

@@ -8,13 +8,10 @@ import subprocess
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-
-from osik_jax.core import _cuda as core_cuda
-from osik_jax.solvers.qp import _core
 
 SHARED = 1 << 18
 _RUN = """
@@ -35,22 +32,6 @@ extern "C" void run(void** a, int problems) {
   for (blockIdx.x = 0; blockIdx.x < problems; ++blockIdx.x) osik_kernel(ARGUMENTS, problems);
 }
 """
-
-
-class Found(NamedTuple):
-    """The kernel's results."""
-
-    x: np.ndarray
-    multipliers: np.ndarray
-    active: np.ndarray
-    report: np.ndarray
-    residual: np.ndarray
-
-
-@cache
-def library(folder: Path, m: int, n: int, p: int, single: bool) -> ctypes.CDLL:
-    """The kernel of a shape as a C library."""
-    return of_warps(folder, _core._source(m, n, p, single, 1000, 1), _core._bytes(m, n, p, single))
 
 
 @cache
@@ -132,19 +113,3 @@ def call_of_lanes(
     source = source.replace("__shared__ Real s", "static Real s")  # one of all threads
     compiled(folder, source + run.replace("ARGUMENTS", arguments_of(source))).run(pointers, problems)
     return [np.moveaxis(a, -1, 0) if last else a for a, last in zip(results, orders, strict=True)]
-
-
-def solve(folder: Path, problems: tuple[np.ndarray, ...], guess: np.ndarray, tolerance: float, kind: type) -> Found:
-    """Solve a batch: matrix, target, weight, damping, center, rows, compliance, lower and upper bounds."""
-    (count, m, n), p = problems[0].shape, problems[5].shape[1]
-    given = [np.ascontiguousarray(a, kind) for a in problems]
-    given += [np.ascontiguousarray(guess, np.int32), np.full(count, tolerance, kind)]
-    numbers, labels = ((n,), (p,)), ((n + p,), (3,))
-    x, y = (np.zeros((count, *shape), kind) for shape in numbers)
-    active, report = (np.zeros((count, *shape), np.int32) for shape in labels)
-    numbers_outside = core_cuda.space_outside("weighted_qp", n, p, int(kind == np.float32))
-    residual, outside = np.zeros(count, kind), np.zeros((count, numbers_outside), kind)
-    arrays = [*given, x, y, active, report, residual, outside]
-    pointers = (ctypes.c_void_p * len(arrays))(*(a.ctypes.data for a in arrays))
-    library(folder, m, n, p, kind == np.float32).run(pointers, count)
-    return Found(x, y, active, report, residual)

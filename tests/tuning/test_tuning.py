@@ -131,7 +131,9 @@ BOUNDS = [
 class TestParameterSpace:
     def test_begins_at_the_loops_numbers(self, loop):
         space = ParameterSpace(loop, BOUNDS)
-        for a, b in zip(jax.tree.leaves(space.apply(loop, space.initial)), jax.tree.leaves(loop), strict=True):
+        for a, b in zip(
+            jax.tree.leaves(eqx.filter_jit(space.apply)(loop, space.initial)), jax.tree.leaves(loop), strict=True
+        ):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
     @settings(max_examples=20, deadline=None)
@@ -149,13 +151,13 @@ class TestParameterSpace:
 
     def test_gradients_are_finite_far_away(self, loop):
         space = ParameterSpace(loop, BOUNDS)
+        slope = jax.jit(jax.jacobian(space.numbers))
         for far in (-300.0, 300.0):
-            slope = jax.jacobian(space.numbers)(jnp.full(len(space.names), far))
-            assert np.isfinite(slope).all()
+            assert np.isfinite(slope(jnp.full(len(space.names), far))).all()
 
     def test_a_step_in_log_space_is_a_factor(self, loop):
         space = ParameterSpace(loop, ["posture.weight", tuning.Parameter("elbow.gain", lower=1.0, upper=9.0)])
-        step = jax.jacobian(lambda z: jnp.log(space.numbers(z)))(space.initial)
+        step = jax.jit(jax.jacobian(lambda z: jnp.log(space.numbers(z))))(space.initial)
         np.testing.assert_allclose(step, np.eye(2), atol=1e-12)  # 3 is in the middle of 1 and 9
 
     def test_every_finite_entry_is_a_parameter(self, arm, nao):
@@ -166,7 +168,7 @@ class TestParameterSpace:
         space = ParameterSpace(loop, ["hand.position_weight", "limits[0].velocity"])
         assert space.names[:3] == tuple(f"hand.position_weight[{i}]" for i in range(3))
         assert len(space.names) == 3 + nao.nv - 6 and "limits[0].velocity[5]" not in space.names
-        moved: Any = space.apply(loop, space.initial + 1.0)
+        moved: Any = eqx.filter_jit(space.apply)(loop, space.initial + 1.0)
         assert np.isinf(moved.limits[0].velocity[:6]).all()
         assert space.by_name(space.initial)["hand.position_weight[1]"] == pytest.approx(2.0)
 
@@ -312,6 +314,17 @@ class TestTune:
         best: Any = tuned.loop
         assert tuned.parameters["hand.gain.decay"] == pytest.approx(float(best.tasks["hand"].gain.decay))
         assert float(best.tasks["hand"].weight) == 1.0
+
+    @pytest.mark.slow
+    def test_the_step_is_the_gradient(self, loop, scenarios):
+        """Plain descent with rate 1, against central differences of the loss."""
+        tuned = run(loop, scenarios, optimizer=optax.sgd(1.0), iterations=1)
+        start, space = tuned.space.initial, tuned.space
+        gradient = np.asarray(start - tuned.state.vector)
+        assert np.linalg.norm(gradient) == pytest.approx(tuned.history.gradient_norm[0])
+        for direction in np.random.default_rng(1).normal(size=(4, len(gradient))):
+            ends = [tuning.evaluate(LOSS, space.apply(loop, start + h * direction), scenarios) for h in (1e-5, -1e-5)]
+            assert gradient @ direction == pytest.approx(float(ends[0].loss - ends[1].loss) / 2e-5, rel=1e-5)
 
     @pytest.mark.release
     def test_chunks_change_nothing(self, loop, scenarios):

@@ -2,11 +2,9 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import Array
 
 import osik_jax as osik
 
@@ -95,16 +93,3 @@ def test_targets_by_step_are_those_of_the_step(planar: osik.Robot) -> None:
     np.testing.assert_allclose(found.errors["hand"][:, 0], np.linalg.norm(reached - points, axis=1), atol=1e-12)
     assert found.missed["hand"] == (np.linalg.norm(reached - points, axis=1) > 1e-3).sum() > (lifts > 1.2).sum()
     assert found.last is not None and "lift" in found.last.joints
-
-
-def test_traced_arguments_and_wrong_tolerances_are_refused(planar: osik.Robot) -> None:
-    tasks: Any = {"hand": reach(planar, place(0.3, 0.9))}
-
-    def traced(q: Array) -> Array:
-        osik.explain_step(planar, q, tasks)
-        return q
-
-    with pytest.raises(ValueError, match="outside of jit"):
-        jax.jit(traced)(planar.q0)
-    with pytest.raises(ValueError, match="positive numbers"):
-        osik.explain_step(planar, planar.q0, tasks, position_tolerance=0.0)
