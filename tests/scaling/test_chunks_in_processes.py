@@ -1,19 +1,17 @@
-"""Jobs in processes of their own: killed while they write, again and again; several at once in one folder."""
+"""Jobs in processes of their own, killed while they write, again and again."""
 
 from __future__ import annotations
 
 import signal
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from other_processes import finish, start
+from other_processes import start
 
 from osik_jax import scaling
 
 JOB = """
-import json, os, signal, sys, time
+import json, os, signal, sys
 from pathlib import Path
 import numpy as np
 from osik_jax.scaling import run_in_chunks
@@ -26,10 +24,6 @@ def fsync(file):  # every file goes to the disk through it
     real(file)
 os.fsync = fsync
 def lanes(start, stop):
-    if start == 16 and not dies:
-        (folder.parent / "started").touch()
-        while not (folder.parent / "go on").exists():
-            time.sleep(0.01)
     return np.arange(start, stop, dtype=float)
 square = lambda x, a: {"y": a * np.square(np.asarray(x))}
 saved = run_in_chunks(square, lanes, count=64, chunk=8, shared=(3.0,), out=folder, progress=False)
@@ -53,29 +47,3 @@ def test_killed_again_and_again(tmp_path):
     np.testing.assert_array_equal(saved[:]["y"], 3.0 * np.arange(64.0) ** 2)
     assert [path.name for path in folder.glob(".*")] == [".lock"]
     assert all((folder / name).stat().st_mtime_ns == then for name, (then, _) in finished.items())
-
-
-@pytest.mark.release
-def test_three_processes_in_one_folder(tmp_path):
-    """The first does the job; the others are told its number at once. Once it is killed, another one goes on."""
-    folder = tmp_path / "job"
-    first = start(JOB, folder, 0)
-    waited = time.monotonic()
-    while not (tmp_path / "started").exists() and first.poll() is None and time.monotonic() < waited + 120:
-        time.sleep(0.01)
-    try:
-        assert_told(folder, first.pid)
-    finally:
-        first.kill()
-    first.communicate()
-    assert (folder / ".lock").exists()
-    (tmp_path / "go on").touch()
-    assert finish(start(JOB, folder, 0))
-    assert [path.name for path in folder.glob(".*")] == [".lock"]
-
-
-def assert_told(folder: Path, pid: int) -> None:
-    for second in [start(JOB, folder, 0) for _ in range(2)]:
-        errors = second.communicate(timeout=300)[1]
-        assert second.returncode == 1
-        assert f"process {pid} on " in errors.splitlines()[-1] and "BlockingIOError" in errors.splitlines()[-1]
