@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import optax
 import pytest
@@ -36,11 +38,12 @@ def test_the_step_is_the_gradient(name, arm):
     names = ["hand.gain", "posture.gain", "elbow.weight", "limits[1].velocity"]
     descent = optax.sgd(1.0)
 
-    def first(own):
-        return tuning.tune(loss, names, scenarios, loop=own, optimizer=descent, iterations=1, progress=False)
+    def first(own, iterations=1):
+        options: Any = dict(optimizer=descent, iterations=iterations, progress=False)
+        return tuning.tune(loss, names, scenarios, loop=own, **options)
 
-    tuned = first(loop)
-    gradient = np.asarray(tuned.space.initial - tuned.state.vector)
+    tuned = first(loop, iterations=2)
+    gradient = tuned.history.vectors[0] - tuned.history.vectors[1]
     assert np.linalg.norm(gradient) == pytest.approx(tuned.history.gradient_norm[0]) and len(gradient) == 12
     start = tuned.space.initial
     for direction in np.random.default_rng(1).normal(size=(4, 12)):
