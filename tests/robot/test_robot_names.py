@@ -5,12 +5,12 @@ import warnings
 
 import numpy as np
 import pytest
+from osik_jax.viewer.live._session import RobotSource
 from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.cli import CommandError, read_robot
 from osik_jax.robot.loading import NAMES, example_urdf
-from osik_jax.viewer.live._session import RobotSource
 
 
 @pytest.mark.parametrize("name", NAMES)

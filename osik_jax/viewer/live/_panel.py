@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...limits import Limit, NoLimits
+from ...saving._controller import read_controller
 from ...tasks import AdaptiveGain
 from ._desk import SCHEMES, Desk
 from ._obstacles import NearestPair
 from ._readout import error_table, state_text, timing_text
-from ._server import show_texts
-from ._session import session_from_json
 
 if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
@@ -42,8 +41,8 @@ class Panel:
             self._add_tasks()
         with tabs.add_tab("Limits"):
             self._add_limits()
-        with tabs.add_tab("Session"):
-            self._add_session()
+        with tabs.add_tab("File"):
+            self._add_file()
         self.refill()
 
     def tell(self, near: NearestPair | None) -> None:
@@ -55,10 +54,12 @@ class Panel:
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
             (self._near, f"{near.names[0]} and {near.names[1]}: {1e3 * near.distance:.0f} mm" if near else ""),
         )
-        show_texts(texts)
+        for handle, text in texts:
+            if handle.content != text:  # what is shown already is not sent again
+                handle.content = text
 
     def refill(self) -> None:
-        """Show the session after tasks changed or another session was loaded."""
+        """Show the session after tasks changed or another controller was loaded."""
         session = self._desk.session
         for box in self._boxes.values():
             box.remove()
@@ -132,21 +133,21 @@ class Panel:
         box.on_update(self._guarded(lambda event: self._desk.switch_limit(number, event.target.value)))
         self._limit_boxes.append(box)
 
-    def _add_session(self) -> None:
+    def _add_file(self) -> None:
         gui = self._server.gui
-        save = gui.add_button("Download session.json")
-        load = gui.add_upload_button("Load a session", mime_type="application/json")
+        save = gui.add_button("Download controller.json")
+        load = gui.add_upload_button("Load a controller", mime_type="application/json")
         save.on_click(self._guarded(self._send))
         load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
 
     def _load(self, content: bytes) -> None:
-        self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
+        self._desk.load(read_controller(content, "the file"))
         self.refill()
 
     def _send(self, event: Any) -> None:
-        """Send the session to the visitor who asked for it."""
-        content = self._desk.session.to_json().encode()
-        event.client.send_file_download("session.json", content, save_immediately=True)
+        """Send the controller of what is switched on to the visitor who asked for it."""
+        content = self._desk.session.to_text().encode()
+        event.client.send_file_download("controller.json", content, save_immediately=True)
 
     @property
     def _name(self) -> str:

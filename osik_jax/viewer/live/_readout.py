@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ...solvers import Status
 from ...tasks import Task
-from ._snapshot import Snapshot
+from ._loop import Snapshot
 from ._timing import Timing
 
 _VISIBLE = 5e-4
