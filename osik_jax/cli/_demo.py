@@ -15,15 +15,13 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Moves NAO with each scheme, and writes a film, a figure and the motion to a folder.
+    """Moves NAO with each scheme, prints how well, and writes a film and the motion to a folder.
 
     NAO sways over both feet (double-support), or lifts one (single-support).
     """
 
     motion: Literal["double-support", "single-support"] = "double-support"
     """Motion of the NAO."""
-    physics: bool = False
-    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every step."""
     duration: float = 8.0
     """Length of the motion [s]."""
     frequency: float = 200.0
@@ -55,7 +53,6 @@ class Demo:
                 self.out,
                 schemes=self.schemes,
                 dt=dt,
-                physics=self.physics,
                 animation=self.animation,
                 picture=self.picture,
                 announce=status.update,
