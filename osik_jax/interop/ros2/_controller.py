@@ -102,7 +102,7 @@ class Memory:
 
 
 class Controller:
-    """Control loop of a robot as a function of received messages, for ``osik ros2`` and replays of bags.
+    """Control loop of a robot as a function of received messages, for ``osik ros2``.
 
         memory = controller.memory()
         memory, output = controller.tick(memory, now_ns, received)

@@ -81,27 +81,3 @@ def __getattr__(name: str) -> Any:
         if full.rpartition("/")[2] == name:
             return kind
     raise AttributeError(name)
-
-
-def ros_name(kind: Any) -> str:
-    """Return the name that ROS 2 has for a type, such as ``sensor_msgs/msg/JointState``."""
-    return _short_name(kind).replace("/", "/msg/")
-
-
-def definition(kind: Any) -> str:
-    """Return the ROS 2 definition of a type, followed by those of its fields' types."""
-    parts, names = [], [_short_name(kind)]
-    for name in names:  # grows
-        fields = _fields(name)
-        names += [text for text in dict.fromkeys(t.removesuffix("[]") for t, _ in fields) if _is_new(text, names)]
-        head = f"MSG: {name}\n" if parts else ""
-        parts.append(head + "".join(f"{text} {own}\n" for text, own in fields))
-    return (("=" * 80) + "\n").join(parts)
-
-
-def _is_new(name: str, names: list[str]) -> bool:
-    return name in _DEFINITIONS and name not in names
-
-
-def _short_name(kind: Any) -> str:
-    return next(name for name, own in _TYPES.items() if own is kind)
