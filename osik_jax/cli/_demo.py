@@ -32,8 +32,6 @@ class Demo:
     """Folder to write to."""
     animation: bool = True
     """Write the film (motion.gif; motion.mp4 too where the program ffmpeg is installed)."""
-    picture: bool = False
-    """Write picture.png as well: three instants side by side."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -54,7 +52,6 @@ class Demo:
                 schemes=self.schemes,
                 dt=dt,
                 animation=self.animation,
-                picture=self.picture,
                 announce=status.update,
             )
         console.print(shown)

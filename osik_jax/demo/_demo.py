@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from ..viewer import animate, hero_picture
+from ..viewer import animate
 from ._figures import figures, table
 from ._motion import Motion
 from ._run import TITLES, Run, run_scheme
@@ -24,15 +24,13 @@ def run_demo(
     schemes: Sequence[str],
     dt: float = 0.005,
     animation: bool = True,
-    picture: bool = False,
     announce: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Table, Sequence[Run]]:
     """Run the schemes in turn and write ``motion.npz`` and a film.
 
     Return the table of all figures, and the runs. The film is that of the last scheme, ``motion.gif``, and
-    ``motion.mp4`` where the program ffmpeg is installed. ``picture`` adds ``picture.png``, three instants side by side.
-    ``announce`` is called with the current stage. ``motion.npz`` has the time and, of each scheme, q_SCHEME
-    (steps + 1, nq) and v_SCHEME (steps, nv).
+    ``motion.mp4`` where the program ffmpeg is installed. ``announce`` is called with the current stage. ``motion.npz``
+    has the time and, of each scheme, q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv).
 
     Raises:
         KeyError: no such scheme.
@@ -49,8 +47,6 @@ def run_demo(
         announce("filming")
         for name in ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]:
             _film(folder / name, motion, runs[-1], dt)
-    if picture:
-        _draw_picture(folder / "picture.png", motion, runs[-1])
     return table(motion.title, {run.scheme: figures(motion, run) for run in runs}), runs
 
 
@@ -73,11 +69,3 @@ def _film(path: Path, motion: Motion, run: Run, dt: float) -> None:
         curves_title="moved from the start [mm], dashed: wanted",
         caption=f"{motion.title}: {TITLES[run.scheme]}",
     )
-
-
-def _draw_picture(path: Path, motion: Motion, run: Run) -> None:
-    """Write a PNG with three instants of a motion side by side."""
-    shown = [round(part * (len(run.q) - 1)) for part in (0.0, 0.26, 0.45)]
-    support = [run.seen.support[k] for k in shown] if run.seen.support else None
-    labels = [f"{run.seen.time[k]:.1f} s" for k in shown]
-    hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels)

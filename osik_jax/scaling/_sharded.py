@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +22,6 @@ def sharded(
     in_axes: Any = 0,
     *,
     mesh: Mesh | None = None,
-    donate_argnums: int | Sequence[int] = (),
 ) -> ShardedFunction:
     """Return a function like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
 
@@ -35,7 +34,6 @@ def sharded(
             (``osik_jax.batch_axes``). What is None is copied to every device.
         mesh: the devices, such as ``jax.sharding.Mesh(jax.devices()[:2], ("lanes",))``; the batch is split over all of
             its axes. Default: all devices, those of other hosts too where ``jax.distributed`` joined them.
-        donate_argnums: arguments whose memory the results may take, as in ``jax.jit``; they are lost to the caller.
 
     Returns:
         A function of batches. Results have the lanes in front and stay on their devices. Compiled once for each shape;
@@ -48,7 +46,7 @@ def sharded(
         raise OsikTypeError(f"{function!r} is no function")
     if mesh is not None and not isinstance(mesh, Mesh):
         raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh of devices")
-    return ShardedFunction(function, in_axes, Mesh(jax.devices(), ("lanes",)) if mesh is None else mesh, donate_argnums)
+    return ShardedFunction(function, in_axes, Mesh(jax.devices(), ("lanes",)) if mesh is None else mesh)
 
 
 class ShardedFunction:
@@ -61,9 +59,7 @@ class ShardedFunction:
         run: the compiled function of arguments whose lanes the devices divide; it takes none from another device.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], in_axes: Any, mesh: Mesh, donate_argnums: int | Sequence[int] = ()
-    ):
+    def __init__(self, function: Callable[..., Any], in_axes: Any, mesh: Mesh):
         self.function, self.in_axes, self.mesh = function, in_axes, mesh
         self._axes = tuple(in_axes) if isinstance(in_axes, list) else in_axes
         self._known: dict[Any, list[NamedSharding]] = {}  # where arrays are wanted, by the structure of the arguments
@@ -76,7 +72,7 @@ class ShardedFunction:
             out_specs=PartitionSpec(mesh.axis_names),
             check_vma=False,
         )
-        self.run = jax.jit(mapped, donate_argnums=donate_argnums)
+        self.run = jax.jit(mapped)
         functools.update_wrapper(self, function, updated=())
 
     def __call__(self, *args: Any) -> Any:

@@ -108,15 +108,11 @@ def test_limits_hold_on_the_way_to_what_is_out_of_reach(loop: ControlLoop) -> No
     assert loop.snapshot.failures == 0
 
 
-@pytest.mark.parametrize("way", ["silence", "leaving"])
-def test_an_abandoned_target_leaves_the_robot_at_rest_where_it_is(loop: ControlLoop, way: str) -> None:
+def test_an_abandoned_target_leaves_the_robot_at_rest_where_it_is(loop: ControlLoop) -> None:
     far = moved(-0.4, 0.4, -0.2)
-    if way == "silence":
-        loop.aim("hand", far, timeout=0.1)
-    else:
-        loop.aim("hand", far, owner="somebody")
-        assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() > 0.2))
-        loop.release("somebody")
+    loop.aim("hand", far, owner="somebody")
+    assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() > 0.2))
+    loop.release("somebody")
     assert until(lambda: bool(np.linalg.norm(target_of(loop) - far[0]) > 0.05))
     assert until(lambda: bool(np.abs(loop.snapshot.velocity).max() < 1e-3))
     assert np.linalg.norm(hand(loop.snapshot.q) - target_of(loop)) < 1e-3

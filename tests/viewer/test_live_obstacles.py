@@ -56,14 +56,3 @@ def test_a_scene_of_the_command_line_is_kept_off(tmp_path: Path, capsys: pytest.
     assert list(Desk(dataclasses.replace(default_session(arm), limits=(limit,))).obstacles) == ["ball"]
     assert cli.main(["view", str(tmp_path / "motion.npz"), "--scene", "cell.xml"]) == 2
     assert "--scene goes with a robot to drag, not with a file" in capsys.readouterr().err
-
-
-def test_a_ball_of_a_limit_is_moved_with_its_numbers_alone() -> None:
-    arm = osik.load_robot("arm7")
-    ball = {"ball": osik.CollisionShape.sphere(0.05, [0.0, 2.0, 0.5])}
-    limit = osik.CollisionAvoidanceLimit(arm, shapes=ball, pairs=[("ball", "link7:0")])
-    desk = Desk(dataclasses.replace(default_session(arm), limits=(limit,)))
-    structure = desk.session.controller().structure()
-    desk.move_obstacle("ball", np.array([0.0, 1.0, 0.5]), np.eye(3))
-    np.testing.assert_allclose(desk.obstacles["ball"].position, [0.0, 1.0, 0.5])
-    assert desk.session.controller().structure() == structure

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -62,20 +62,13 @@ class Snapshot:
     problem: str = ""
 
 
-class _Lease(NamedTuple):
-    """Owner of a task's target, and the time until which the target counts as fresh [s]."""
-
-    owner: Hashable
-    until: float
-
-
 class ControlLoop:
     """Controller running at a fixed rate in its own thread.
 
     All methods may be called from any thread, and take effect in the next step. The first step of another structure
     (another task, scheme, priority or limit) takes some milliseconds, or the seconds of a compilation where the core
     does not have it; the robot stands still meanwhile, as while paused and after an answer that is not finite. If the
-    owner of a target (``aim``) leaves or its timeout passes, the target becomes the robot's current pose.
+    owner of a target (``aim``) leaves, the target becomes the robot's current pose.
 
     Attributes:
         robot: the robot.
@@ -102,7 +95,7 @@ class ControlLoop:
         self._laid: Controller | None = None
         self._refused: Controller | None = None
         self._stepper: control.Controller | None = None
-        self._leases: dict[str, _Lease] = {}
+        self._owners: dict[str, Hashable] = {}  # of targets, by task
         self._problem = ""
         self._orders: deque[Callable[[], None]] = deque()
         self._stopwatch = Stopwatch()
@@ -176,14 +169,13 @@ class ControlLoop:
         with self._lock:
             self._wanted, self._problem = edit(self._wanted), ""
 
-    def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
+    def aim(self, name: str, target: Any, *, owner: Hashable = None) -> None:
         """Set the target of a task.
 
         Args:
             name: of the task.
             target: what ``task.replace(target=...)`` takes.
             owner: who leads it; ``release(owner)`` holds the robot where it is.
-            timeout: if no other target comes within this time, the robot is held where it is [s].
 
         Raises:
             KeyError: no such task.
@@ -193,11 +185,8 @@ class ControlLoop:
             raise unknown_name("task", name, tuple(self._wanted.tasks))
         task: Any = self._wanted.tasks[name]
         new = task.replace(target=target).target
-        until = np.inf if timeout is None else time.monotonic() + timeout
         with self._lock:
-            self._leases.pop(name, None)
-            if owner is not None or timeout is not None:
-                self._leases[name] = _Lease(owner, until)
+            self._owners[name] = owner
             self._wanted = with_targets(self._wanted, {name: new})
 
     def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
@@ -206,14 +195,14 @@ class ControlLoop:
             self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, position, rotation))
 
     def let_go(self, owner: Hashable) -> None:
-        """Keep the targets where their owner left them, without a timeout."""
+        """Keep the targets where their owner left them."""
         with self._lock:
-            self._leases = {name: lease for name, lease in self._leases.items() if lease.owner != owner}
+            self._owners = {name: other for name, other in self._owners.items() if other != owner}
 
     def release(self, owner: Hashable) -> None:
         """Set the targets of an owner who left to the robot's current pose."""
         with self._lock:
-            left = [name for name, lease in self._leases.items() if lease.owner == owner]
+            left = [name for name, other in self._owners.items() if other == owner]
         if left:
             self._orders.append(lambda: self._hold(left))
 
@@ -247,7 +236,6 @@ class ControlLoop:
         begin = time.perf_counter()
         while self._orders:
             self._orders.popleft()()
-        self._hold(self._abandoned())
         self._lay_out()
         self._show(problem=self._problem)
         if self._stepper is None or self._snapshot.paused:
@@ -315,16 +303,9 @@ class ControlLoop:
             self._stepper.forget()
         self._show(time=0.0, q=self._start, velocity=np.zeros_like(self._snapshot.velocity), failures=0)
 
-    def _abandoned(self) -> list[str]:
-        """Return the tasks whose target is older than allowed."""
-        now = time.monotonic()
-        return [name for name, lease in list(self._leases.items()) if lease.until < now]
-
     def _hold(self, names: list[str]) -> None:
         """Set the targets of these tasks to the robot's current pose."""
-        if not names:
-            return
         here = targets_here(self.robot, self._snapshot.q, self._wanted.tasks, names)
         with self._lock:
-            self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
+            self._owners = {name: other for name, other in self._owners.items() if name not in names}
             self._wanted = with_targets(self._wanted, here)

@@ -104,14 +104,14 @@ class LiveView:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def aim(self, task: str, target: Any, *, timeout: float | None = None) -> None:
-        """Set the target of a task; the robot stops if no further call follows within the timeout [s].
+    def aim(self, task: str, target: Any) -> None:
+        """Set the target of a task.
 
         Raises:
             KeyError: no such task.
             TypeError, ValueError: no such target.
         """
-        self.loop.aim(task, target, timeout=timeout)
+        self.loop.aim(task, target)
 
     def _run(self) -> None:
         """Run the drawing thread."""
@@ -199,8 +199,7 @@ def serve(
         The view.
 
         - ``url``: address of the page.
-        - ``aim(task, target, timeout=None)``: sets the target of a task, as ``replace(target=...)`` takes it; the robot
-            stops if no further call follows within the timeout [s].
+        - ``aim(task, target)``: sets the target of a task, as ``replace(target=...)`` takes it.
         - ``save(path)``: writes the present controller for ``load_controller``.
         - ``loop``: the control loop. ``wait_until_ready()`` returns when the controller is compiled;
             ``snapshot`` has the last step's ``q`` and ``status``, ``timing`` the loop's times.

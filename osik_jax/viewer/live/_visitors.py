@@ -1,8 +1,7 @@
-"""Which web pages may open a live view's connection, and what happens to messages that cannot be read."""
+"""Which web pages may open a live view's connection."""
 
 from __future__ import annotations
 
-import asyncio
 import ipaddress
 import sys
 from typing import Any
@@ -15,27 +14,21 @@ _LONGEST = 120
 
 
 def guard(server: Any) -> None:
-    """Refuse connections of pages of other sites, and drop bad messages with one line on stderr each.
+    """Refuse connections of pages of other sites, with one line on stderr each.
 
-    viser has no option for either. Its websocket server awaits these callbacks before it reads the first message.
+    viser has no option for it. Its websocket server awaits this callback before it reads the first message.
     """
     sockets = server._websock_server
 
     async def admit(client: Any) -> None:
         connection = sockets._live_connections[client.client_id]
         headers = connection.request.headers
-        if is_own_page(headers.get("Origin"), headers.get("Host", ""), sockets._host):
-            connection.recv = _readable(connection.recv, sockets._message_class)
-        else:
+        if not is_own_page(headers.get("Origin"), headers.get("Host", ""), sockets._host):
             _tell(f"refused a connection from a page of {headers.get('Origin')}: open {server_url(server)}")
             connection.recv = _nothing_of(connection)
             await connection.close(POLICY_VIOLATION, "a page of another site")
 
-    def tell_failed(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        _tell(f"dropped a message: {context.get('exception') or context['message']}")
-
     sockets.on_client_connect(admit)
-    sockets._background_event_loop.set_exception_handler(tell_failed)
 
 
 def server_url(server: Any) -> str:
@@ -71,22 +64,6 @@ def _nothing_of(connection: Any) -> Any:
         raise connection.protocol.close_exc
 
     return end
-
-
-def _readable(receive: Any, messages: Any) -> Any:
-    """Return a function that receives the next message that viser can read."""
-
-    async def next_readable() -> bytes:
-        while True:
-            raw = await receive()
-            try:
-                messages.deserialize(raw)
-            except Exception as error:  # whatever a stranger sends
-                _tell(f"dropped a message of {len(raw)} bytes: {type(error).__name__}: {error}")
-            else:
-                return raw
-
-    return next_readable
 
 
 def _tell(text: str) -> None:
