@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ._inputs import read_robot
 from ._messages import CommandError
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
+from ._inputs import read_robot
 from ._messages import CommandError, refuse, told
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from ..interop.ros2 import Controller

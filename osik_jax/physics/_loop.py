@@ -24,9 +24,6 @@ from ..robot import Robot
 from ..schemes import Scheme
 from ._simulation import Simulation
 
-Command = Callable[[Robot, Array, Array, Array, Any], Array]
-"""Function of robot, last command, sensed configuration, velocity and time step that returns the next servo target."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
@@ -52,7 +49,7 @@ def simulate(
     dt: float = 0.005,
     steps: int,
     targets: Targets | None = None,
-    command: Command | float | None = None,
+    command: float | None = None,
     before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
     """Run the loop from the simulation's present state, and stop if the robot falls.
@@ -79,8 +76,6 @@ def simulate(
               A steady error remains, as with a servo whose stiffness is multiplied by gain times time. With a gain of
               20 / s and 0.05 s, a servo holds its load as if the plan were its target. With one step as the time the
               robot sinks.
-            - A function (an ``equinox.Module``, if its numbers change) of robot, last command (nq,), sensed
-              configuration (nq,), velocity (nv,) and dt [s], which returns the configuration.
         before_step: called with the time [s] since the start and the simulation, to push the robot, say.
 
     Returns:
@@ -107,7 +102,7 @@ def simulate(
     robot = simulation.world.robot
     numbers, static = taken_apart(tasks if callable(tasks) else dict(tasks))
     own = checked_limits(robot, limits)
-    how = command if command is None or callable(command) else np.asarray(command, float)
+    how = None if command is None else np.asarray(command, float)
     program = partial(_control_step, robot, numbers, scheme, own, how, np.asarray(dt))
     step = partial(program, static=static)
     held = jnp.asarray(simulation.sense())
@@ -142,7 +137,7 @@ def _control_step(
     numbers: Any,
     scheme: Scheme | None,
     limits: tuple[Limit, ...] | None,
-    command: Command | Array | None,
+    command: Array | None,
     dt: Array,
     t: Array,
     last: Array,
@@ -158,8 +153,6 @@ def _control_step(
     velocity, warm_start = memory
     todo, kept = remembering((todo, limits), velocity, t > 0.0)
     solution = solve(robot, sensed, todo, scheme=scheme, limits=kept, dt=dt, warm_start=warm_start)
-    if callable(command):
-        return command(robot, last, sensed, solution.velocity, dt), solution
     start, time = (last, dt) if command is None else (sensed, command)
     return integrate(robot, start, solution.velocity, time), solution
 

@@ -19,9 +19,8 @@ from PIL import Image
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
-from ._outline import floor_height
 from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, polygon_layer
-from ._parts import RobotParts, robot_parts
+from ._parts import RobotParts, floor_height, robot_parts
 from ._raycast import RayCaster
 from ._stage import Camera, Stage, frame_camera
 

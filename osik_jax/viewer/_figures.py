@@ -13,9 +13,8 @@ from ..collision import CollisionShape
 from ..robot import Robot
 from ..robot._mujoco import mujoco_poses, robot_com
 from ._animate import paint_over
-from ._outline import floor_height
 from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer
-from ._parts import fixed_parts, robot_parts
+from ._parts import fixed_parts, floor_height, robot_parts
 from ._raycast import RayCaster
 from ._stage import Camera, Stage, frame_camera
 

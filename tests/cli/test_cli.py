@@ -16,7 +16,7 @@ from urdfs import joint, tree
 import osik_jax as osik
 from osik_jax import cli
 from osik_jax._progress import spoken
-from osik_jax.cli._pose_file import read_pose_file
+from osik_jax.cli._inputs import read_pose_file
 
 ARM_FILE = str(MJCF / "three_joints.xml")
 
@@ -101,9 +101,9 @@ def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):
 
 
 def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path):
-    """The system refuses to write files of more than 8 kB: smaller than the motion."""
+    """The system refuses to write files of more than 2 kB: smaller than the motion."""
     words = ["demo", "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
-    with files_of_at_most(8_000):
+    with files_of_at_most(2_000):
         code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
     told = capsys.readouterr().err.strip().splitlines()
     assert code == 2 and len(told) == 1

@@ -42,7 +42,6 @@ def examples():
         msg.JointTrajectory(head, ["joint1", "j"], [point, msg.JointTrajectoryPoint()]),
         msg.Float64MultiArray(layout, [1.0, 2.0]),
         msg.DiagnosticArray(head, status),
-        msg.Bool(True),
     ]
 
 

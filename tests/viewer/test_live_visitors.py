@@ -13,9 +13,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
 
-from osik_jax.viewer.live import _visitors
-from osik_jax.viewer.live._server import close_server, open_server
-from osik_jax.viewer.live._visitors import is_own_page
+from osik_jax.viewer.live import _server
+from osik_jax.viewer.live._server import close_server, is_own_page, open_server
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +39,9 @@ def moved(position: list[float]) -> bytes:
 def test_a_page_of_another_site_moves_nothing(
     server: Any, origin: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tell = _visitors._tell
+    tell = _server._tell
     # The page's message arrives before the refusal, and waits to be read.
-    monkeypatch.setattr(_visitors, "_tell", lambda text: (time.sleep(0.2), tell(text)))
+    monkeypatch.setattr(_server, "_tell", lambda text: (time.sleep(0.2), tell(text)))
     handle = server.scene.add_transform_controls("/hand")
     with opened(server, origin) as page, pytest.raises(ConnectionClosed, match="a page of another site"):
         page.send(moved([1.0, 2.0, 3.0]))

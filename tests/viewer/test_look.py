@@ -16,8 +16,7 @@ from osik_jax import viewer
 from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.robot.loading._collada import read_collada
 from osik_jax.robot.loading._meshes import read_mesh
-from osik_jax.viewer._outline import lowest_points
-from osik_jax.viewer._parts import robot_parts
+from osik_jax.viewer._parts import lowest_points, robot_parts
 from osik_jax.viewer._stage import frame_camera
 from osik_jax.viewer.live._surfaces import part_triangles
 

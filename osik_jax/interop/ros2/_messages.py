@@ -17,7 +17,6 @@ _DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec, uint32 nanosec",
     "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
-    "std_msgs/Bool": "bool data",
     "std_msgs/MultiArrayDimension": "string label, uint32 size, uint32 stride",
     "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim, uint32 data_offset",
     "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout, float64[] data",

@@ -92,8 +92,6 @@ class Node:
         for frame in controller.frames:
             name = topic_of_frame(topics.targets, frame)
             self._read("target", frame, name, msg.PoseStamped, reliable=settings.reliable_targets)
-            if settings.clutch:
-                self._read("clutch", frame, topic_of_frame(topics.clutch, frame), msg.Bool, reliable=True)
         is_trajectory = settings.commands == "trajectory"
         kind = msg.JointTrajectory if is_trajectory else msg.Float64MultiArray
         self._commands = endpoints.writer(topics.trajectory if is_trajectory else topics.positions, kind)

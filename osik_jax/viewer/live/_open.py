@@ -18,8 +18,7 @@ from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
 from ...tasks._background import angle_scale
 from .._crouch import crouched
-from .._outline import lowest_points
-from .._parts import RobotParts, robot_parts
+from .._parts import RobotParts, lowest_points, robot_parts
 from ._desk import Session
 from ._page import LiveView, serve_session
 from ._surfaces import part_triangles

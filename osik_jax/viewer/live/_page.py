@@ -22,8 +22,7 @@ from ...robot._mujoco import mujoco_poses, robot_com
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
-from .._outline import floor_height
-from .._parts import robot_parts
+from .._parts import floor_height, robot_parts
 from ._desk import Desk, Session
 from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
 from ._obstacles import NearestPair, nearest_pair

@@ -18,8 +18,7 @@ from ..._npz import open_npz
 from ...control import Trajectory
 from ...robot import Robot
 from ...robot._mujoco import mujoco_poses
-from .._outline import floor_height
-from .._parts import robot_parts
+from .._parts import floor_height, robot_parts
 from ._robot_nodes import RobotNodes, add_label, side_by_side
 from ._server import close_server, open_server
 from ._stick_figure import StickFigure, StickNodes
