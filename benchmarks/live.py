@@ -25,9 +25,9 @@ from osik_jax.cli import read_robot
 from osik_jax.robot._feet import guess_feet
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer.live import _open
+from osik_jax.viewer.live._loop import Stopwatch
 from osik_jax.viewer.live._open import find_hands
 from osik_jax.viewer.live._page import LiveView
-from osik_jax.viewer.live._timing import Stopwatch
 
 _IDLE = """
 import json, sys, time

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -94,23 +93,6 @@ class ComMark:
         self._foot.set_data([x1], [y1])
 
 
-def card(canvas: Canvas, rectangle: tuple[float, float, float, float], title: str) -> Axes:
-    """Return axes for a panel on a light card.
-
-    ``rectangle``: left, bottom, width and height as shares of the picture.
-    """
-    axes = canvas.figure.add_axes(rectangle)
-    axes.set_facecolor(_CARD)
-    axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
-    axes.tick_params(labelsize=7, colors=INK, length=2.5, width=0.7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#9aa3ad")
-        axes.spines[side].set_linewidth(0.8)
-    return axes
-
-
 class CurvePanel:
     """Curves over time, drawn up to the current frame; dashed references are drawn from the start."""
 
@@ -125,7 +107,12 @@ class CurvePanel:
     ) -> None:
         """Draw the static part; each curve has one value per frame."""
         self._time, self._curves, self._lines = time, list(curves.values()), []
-        axes = card(canvas, rectangle, title)
+        axes = canvas.figure.add_axes(rectangle)
+        axes.set_facecolor(_CARD)
+        axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
+        axes.tick_params(labelsize=7, colors=INK, length=2.5, width=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set(color="#9aa3ad", linewidth=0.8)
         values = np.concatenate([*curves.values(), *wanted.values()])
         room = max(np.ptp(values), _LEAST_RANGE)
         middle = 0.5 * (values.min() + values.max())

@@ -20,9 +20,8 @@ from waiting import until as until_within
 
 import osik_jax as osik
 from osik_jax.robot._mujoco import robot_com
-from osik_jax.viewer.live._loop import ControlLoop
+from osik_jax.viewer.live._loop import ControlLoop, Stopwatch
 from osik_jax.viewer.live._step import Controller, targets_here
-from osik_jax.viewer.live._timing import Stopwatch
 
 ROBOT = osik.load_robot("arm7")
 LIMITS = (osik.ConfigurationLimit(ROBOT), osik.VelocityLimit(ROBOT))

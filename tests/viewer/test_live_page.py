@@ -21,8 +21,8 @@ from osik_jax.retargeting._robot_motion import in_mujoco_order
 from osik_jax.viewer import export_html, serve
 from osik_jax.viewer._parts import Part, robot_parts
 from osik_jax.viewer.live._open import sole_polygon, standing
+from osik_jax.viewer.live._panel import error_text
 from osik_jax.viewer.live._playback import read_motion
-from osik_jax.viewer.live._readout import error_text
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")

@@ -25,12 +25,11 @@ from ...tasks import ComTask, SupportPolygon, Task
 from .._parts import floor_height, robot_parts
 from ._desk import Desk, Session
 from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
+from ._loop import DRAWING, be_nice
 from ._obstacles import NearestPair, nearest_pair
 from ._panel import Panel
-from ._robot_nodes import RobotNodes
+from ._robot_nodes import RobotNodes, add_surroundings
 from ._server import close_server, open_server
-from ._surroundings import add_surroundings
-from ._timing import DRAWING, be_nice
 
 if TYPE_CHECKING:
     from viser import ClientHandle, SceneApi

@@ -19,10 +19,9 @@ from ...control import Trajectory
 from ...robot import Robot
 from ...robot._mujoco import mujoco_poses
 from .._parts import floor_height, robot_parts
-from ._robot_nodes import RobotNodes, add_label, side_by_side
+from ._robot_nodes import RobotNodes, add_label, add_surroundings, side_by_side
 from ._server import close_server, open_server
 from ._stick_figure import StickFigure, StickNodes
-from ._surroundings import add_surroundings
 
 _PICTURES = 30.0
 """Number of pictures kept per second."""
