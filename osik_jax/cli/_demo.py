@@ -5,12 +5,9 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from ._messages import CommandError, told, writing
-
-if TYPE_CHECKING:
-    from ..demo._motion import Motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,9 +36,12 @@ class Demo:
         from rich.markup import escape
 
         from ..demo._demo import run_demo
+        from ..demo._nao import double_support, single_support
 
         console = Console()
-        motion, dt = demo_motion(self), 1.0 / self.frequency
+        _check(self)
+        make = single_support if self.motion == "single-support" else double_support
+        motion, dt = make(self.duration), 1.0 / self.frequency
         with told():
             self.out.mkdir(parents=True, exist_ok=True)
         console.print(escape(motion.title))
@@ -57,15 +57,6 @@ class Demo:
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)
         return 0
-
-
-def demo_motion(command: Demo) -> Motion:
-    """Return the motion that the options ask for."""
-    from ..demo._nao import double_support, single_support
-
-    _check(command)
-    make = single_support if command.motion == "single-support" else double_support
-    return make(command.duration)
 
 
 def _check(command: Demo) -> None:

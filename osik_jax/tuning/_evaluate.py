@@ -15,10 +15,9 @@ from .._errors import OsikTypeError, OsikValueError
 from ..batching._structure import Static, put_together, taken_apart
 from ..numerics._arguments import check_count
 from ..solvers import Status
-from ._loop import Loop
+from ._loop import Loop, Scenarios, run_one
 from ._losses import LossFunction
 from ._parameters import ParameterSpace
-from ._scenarios import Scenarios, run_one
 
 
 class Evaluation(eqx.Module):

@@ -20,10 +20,9 @@ from .._progress import progress_bar
 from ..batching._structure import Static, put_together, taken_apart
 from ._evaluate import Evaluation, Problem, check_loss, chunk_size
 from ._history import History, State, load_state, save_state
-from ._loop import Loop
+from ._loop import Loop, Scenarios
 from ._losses import LossFunction
 from ._parameters import Parameter, ParameterSpace, overlap
-from ._scenarios import Scenarios
 
 try:
     import optax
