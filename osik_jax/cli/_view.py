@@ -50,7 +50,8 @@ class View(InScene):
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends; or write one that plays a motion."""
         from ..saving import load_controller
-        from ..viewer.live import _open, _server, serve
+        from ..viewer.live import _open, _server
+        from ..viewer.live._page import serve
 
         with told():
             saved, moves = (self.file is not None and self.file.suffix == end for end in (".json", ".npz"))

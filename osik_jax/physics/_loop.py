@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -107,14 +108,15 @@ def simulate(
     step = partial(program, static=static)
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
+    targets_of = [jax.tree.map(itemgetter(k), paths) for k in range(steps)]
     # traced and not run, so that the first step finds its program compiled
-    first = jax.eval_shape(lambda: step(0.0, held, held, (None, None), _at(paths, 0))[1])
+    first = jax.eval_shape(lambda: step(0.0, held, held, (None, None), targets_of[0])[1])
     memory = jax.tree.map(jnp.zeros_like, (first.velocity, first.warm_start))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_step is not None:
             before_step(k * dt, simulation)
-        held, solution = step(k * dt, held, simulation.sense(), memory, _at(paths, k))
+        held, solution = step(k * dt, held, simulation.sense(), memory, targets_of[k])
         memory = solution.velocity, solution.warm_start
         simulation.step(held, dt)
         frames.append(_frame(simulation))
@@ -155,11 +157,6 @@ def _control_step(
     solution = solve(robot, sensed, todo, scheme=scheme, limits=kept, dt=dt, warm_start=warm_start)
     start, time = (last, dt) if command is None else (sensed, command)
     return integrate(robot, start, solution.velocity, time), solution
-
-
-def _at(paths: Targets | None, k: int) -> Targets | None:
-    """Return the targets of step k."""
-    return jax.tree.map(lambda path: path[k], paths)
 
 
 def _frame(simulation: Simulation) -> dict[str, np.ndarray]:

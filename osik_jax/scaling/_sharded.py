@@ -125,6 +125,8 @@ class ShardedFunction:
         return leaves, structure, self._known[structure]
 
     def _spec(self, axis: int | None) -> PartitionSpec:
+        if axis is not None and axis < 0:
+            raise OsikValueError(f"in_axes has axis {axis}; axes count from the first, 0")
         return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, self.mesh.axis_names)
 
 

@@ -5,5 +5,5 @@ Not imported with the package, because it loads matplotlib.
 
 from ._animate import animate as animate
 from ._figures import hero_picture as hero_picture
-from .live import export_html as export_html
-from .live import serve as serve
+from .live._page import serve as serve
+from .live._playback import export_html as export_html

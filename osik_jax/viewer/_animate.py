@@ -77,12 +77,8 @@ def animate(
     _check_path(path)
     stride = max(1, round(1.0 / (frames_per_second * dt)))
     frames = np.arange(0, len(q), stride)
-    q, time, shape, polygons = (
-        np.asarray(q)[frames],
-        frames * dt,
-        robot_parts(robot),
-        _each(support, frames),
-    )
+    q, time = np.asarray(q)[frames], frames * dt
+    shape, polygons = robot_parts(robot), _each(support, frames)
     seen, com, paths = _survey(robot, q, shape, trails)
     floor = floor_height(robot, shape, mujoco_poses(robot, q))
     corners = np.concatenate([np.zeros((0, 2)), *(polygons or ())])

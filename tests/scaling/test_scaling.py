@@ -230,6 +230,7 @@ def test_mistakes_in_sharded():
         scaling.sharded(lambda x, y: x + y)(jnp.ones(3), jnp.ones(2))
     with pytest.raises(ValueError, match="in_axes splits no argument"):
         scaling.sharded(lambda x: x, None)(jnp.ones(3))
+    refuses(ValueError, "in_axes has axis -1", scaling.sharded, lambda x: x, -1)
     number: Any = 3
     refuses(TypeError, "mesh is 3", scaling.sharded, lambda x: x, mesh=number)
     refuses(TypeError, "3 is no function", scaling.sharded, number)

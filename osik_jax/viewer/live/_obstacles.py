@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...collision._convex import ConvexShape, table_shapes
+from ...collision._convex import table_shapes
 from ...collision._core import core_scene, gaps_at
 from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
@@ -58,12 +58,9 @@ def _in_scene(limit: Limit) -> Iterator[Obstacle]:
         return
     for name, body, shape in zip(scene.names, np.asarray(scene.body), table_shapes(scene.table), strict=False):
         if shape.kind in _KINDS and body < 0:
-            yield _obstacle(name, shape)
-
-
-def _obstacle(name: str, shape: ConvexShape) -> Obstacle:
-    mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
-    return Obstacle(name, Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh), shape.position, shape.rotation)
+            mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
+            part = Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh)
+            yield Obstacle(name, part, shape.position, shape.rotation)
 
 
 @lru_cache

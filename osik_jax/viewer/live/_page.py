@@ -24,7 +24,7 @@ from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
 from .._parts import floor_height, robot_parts
 from ._desk import Desk, Session
-from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
+from ._gizmos import Gizmos, ObstacleNodes, Pose
 from ._loop import DRAWING, be_nice
 from ._obstacles import NearestPair, nearest_pair
 from ._panel import Panel
@@ -150,7 +150,8 @@ class LiveView:
     def _drag(self, name: str, pose: Pose, visitor: int, phase: str) -> None:
         """Apply a visitor's drag of a handle; a visitor who left stops the robot."""
         if phase != "end":
-            self.loop.aim(name, gizmo_target(self._desk.session.tasks[name], pose), owner=visitor)
+            target = self._desk.session.tasks[name].gripped(pose[0], pose[1] / np.linalg.norm(pose[1]))
+            self.loop.aim(name, target, owner=visitor)
         elif visitor in self._server.get_clients():
             self.loop.let_go(visitor)
         else:

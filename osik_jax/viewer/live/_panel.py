@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ...limits import Limit, NoLimits
+from ...limits import NoLimits
 from ...saving._controller import read_controller
 from ...solvers import Status
 from ...tasks import AdaptiveGain, Task
@@ -19,12 +19,6 @@ from ._obstacles import NearestPair
 if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
 
-_LIMIT_WORDS = {
-    "ConfigurationLimit": "joint ranges",
-    "VelocityLimit": "joint speeds",
-    "AccelerationLimit": "joint accelerations",
-    "CollisionAvoidanceLimit": "collisions",
-}
 _VISIBLE = 5e-4
 """Distance [m or rad] outside of bounds below which an error counts as inside: it would read as 0 mm outside."""
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
@@ -129,7 +123,7 @@ class Panel:
             for number, limit in enumerate(session.limits):
                 if isinstance(limit, NoLimits):
                     continue
-                self._switch_limit(_words(limit), number not in session.limits_off, number)
+                self._switch_limit(type(limit).__name__, number not in session.limits_off, number)
 
     def _switch_limit(self, words: str, on: bool, number: int) -> None:
         """Add a switch for a limit."""
@@ -194,12 +188,6 @@ class Panel:
                 self.refill()
 
         return answer
-
-
-def _words(limit: Limit) -> str:
-    """Return the label of a limit's switch."""
-    kind = type(limit).__name__
-    return _LIMIT_WORDS.get(kind, kind)
 
 
 def state_text(snapshot: Snapshot) -> str:
