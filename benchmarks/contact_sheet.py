@@ -74,7 +74,7 @@ def demonstrate(name: str, folder: Path) -> Row:
     """Runs the demonstration of a robot."""
     started = time.process_time()
     motion = file_motion(read_robot(str(file_of(name))), name=file_of(name).stem, duration=DURATION)
-    _, (run,) = run_demo(motion, folder / name, schemes=(SCHEME,), picture=True, animation=False)
+    _, (run,) = run_demo(motion, folder / name, schemes=(SCHEME,), animation=False)
     found = {figure.label: figure for figure in figures(motion, run)}
     return Row(name, motion, run.q, found, len(run.solution.status), time.process_time() - started)
 

@@ -25,10 +25,9 @@ from osik_jax.cli import read_robot
 from osik_jax.robot._feet import guess_feet
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer.live import _open
+from osik_jax.viewer.live._loop import Stopwatch
 from osik_jax.viewer.live._open import find_hands
 from osik_jax.viewer.live._page import LiveView
-from osik_jax.viewer.live._session import RobotSource
-from osik_jax.viewer.live._timing import Stopwatch
 
 _IDLE = """
 import json, sys, time
@@ -113,8 +112,8 @@ def recorded(view: LiveView) -> list[np.ndarray]:
     path: list[np.ndarray] = []
     step = view.loop._step
 
-    def kept() -> None:
-        step()
+    def kept(own: Any) -> None:
+        step(own)
         path.append(view.loop.snapshot.q)
 
     view.loop._step = kept
@@ -129,11 +128,10 @@ def resident() -> float:
 
 def measure(name: str, seconds: float) -> dict[str, object]:
     """One session."""
-    source = RobotSource(name)
-    robot = read_robot(source.robot)
+    robot = read_robot(name)
     feet = guess_feet(robot) if robot.floating_base else ()
     load = os.getloadavg()[0]
-    with _open.open_robot(robot, source, feet, host="127.0.0.1", port=0) as view:
+    with _open.open_robot(robot, name, feet, host="127.0.0.1", port=0) as view:
         view.loop.wait_until_ready(300.0)
         visitor = visit(view.url)
         time.sleep(5.0)

@@ -47,9 +47,10 @@ HALF_A_MINUTE = 30.0
 
 def measure(given: Setting, scheme: str, devices: int, lanes: int, wanted: dict[str, np.ndarray]) -> dict[str, Any]:
     """One row: so many devices, with so many lanes on each."""
-    mapped = partial(sharded, mesh=jax.sharding.Mesh(jax.devices()[:devices], ("lanes",)), donate_argnums=4)
+    mapped = partial(sharded, mesh=jax.sharding.Mesh(jax.devices()[:devices], ("lanes",)))
     step, arguments, first = batch_of(given, SCHEMES[scheme](), devices * lanes, mapped=mapped)
     *arguments, state = step.place(*arguments, first)
+    step = jax.jit(step, donate_argnums=4)
     solved: list[float] = []
     seconds: list[float] = []
     worst, calls = np.inf, CHECKED + TIMED[0]

@@ -17,8 +17,7 @@ from osik_jax.robot import Robot
 from osik_jax.robot._joint_selection import scalar_layout
 from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.robot._tree import SLIDE
-from osik_jax.viewer._outline import base_height, lowest_points
-from osik_jax.viewer._parts import robot_parts
+from osik_jax.viewer._parts import base_height, lowest_points, robot_parts
 
 SWAY = 0.05
 """Distance of the frame's motion [m] for a robot sized between ``_SMALL`` and ``_LARGE``; the same share of the size

@@ -24,6 +24,7 @@
 import os
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import matplotlib.pyplot as plt
@@ -32,7 +33,9 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.demo._nao import double_support, single_support  # the motions of `osik demo`
-from osik_jax.demo._physics import run_physics
+from osik_jax.demo._observed import observe
+from osik_jax.demo._run import make_scheme, run_scheme
+from osik_jax.physics import Servo, Simulation, build_world, simulate
 from osik_jax.solvers import Level, Status, solve_nullspace, solve_qp
 from osik_jax.viewer import hero_picture
 
@@ -68,8 +71,29 @@ plt.rcParams |= {"axes.spines.top": False, "axes.spines.right": False, "axes.tit
 # it out.
 
 # %%
+LEGS = dict.fromkeys(("*Hip*", "*Knee*", "*Ankle*"), Servo(stiffness=150.0, damping=5.0))
+
+
+def run_both(motion):
+    """The motion on the screen as ``plan``, and what is sensed of it in MuJoCo."""
+    plan = run_scheme(motion, SCHEME, dt=DT)
+    simulation = Simulation(build_world(motion.robot, servos=LEGS), motion.q0)
+
+    def tasks(t):  # servos follow a gain of 5 / s without swinging; the kinematic loop takes 20
+        every = motion.tasks(t).items()
+        return {k: task if isinstance(task, osik.PostureTask) else task.replace(gain=5.0) for k, task in every}
+
+    scheme = make_scheme(SCHEME).replace(curvature_damping=0.0)
+    found = simulate(simulation, tasks, scheme=scheme, dt=DT, steps=len(plan.q) - 1)
+    base = motion.robot.tree.qpos_address[motion.robot.tree.free_bases[0]]
+    sensed, wanted = (q[: len(found.q), base : base + 7] for q in (found.q, plan.q))
+    angle = 2.0 * np.arccos(np.clip(np.abs(np.sum(sensed[:, 3:] * wanted[:, 3:], axis=1)), 0.0, 1.0))
+    off = dict(height_error=np.abs(sensed[:, 2] - wanted[:, 2]), tilt_error=angle)
+    return SimpleNamespace(plan=plan, recording=found, q=found.q, seen=observe(motion, found.q, DT), **off)
+
+
 motions = {name: scene(DURATION) for name, scene in SCENES.items()}
-runs = {name: run_physics(motion, SCHEME, dt=DT) for name, motion in motions.items()}
+runs = {name: run_both(motion) for name, motion in motions.items()}
 for name, run in runs.items():
     print(f"{name}: {len(run.plan.q) - 1} steps, fell: {run.recording.fell}")
     assert not run.recording.fell

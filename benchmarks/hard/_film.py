@@ -12,9 +12,8 @@ import numpy as np
 import osik_jax as osik
 from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.viewer._animate import paint_over, write_gif
-from osik_jax.viewer._outline import floor_height
 from osik_jax.viewer._overlay import INK, ORANGE, Canvas
-from osik_jax.viewer._parts import RobotParts, robot_parts
+from osik_jax.viewer._parts import RobotParts, floor_height, robot_parts
 from osik_jax.viewer._raycast import RayCaster
 from osik_jax.viewer._stage import Camera, Stage, frame_camera
 

@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ._inputs import read_robot
 from ._messages import CommandError, told, writing
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from ..calibration import FixedFrame, Unknown

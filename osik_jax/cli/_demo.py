@@ -5,25 +5,20 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from ._messages import CommandError, told, writing
-
-if TYPE_CHECKING:
-    from ..demo._motion import Motion
 
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Moves NAO with each scheme, and writes a film, a figure and the motion to a folder.
+    """Moves NAO with each scheme, prints how well, and writes a film and the motion to a folder.
 
     NAO sways over both feet (double-support), or lifts one (single-support).
     """
 
     motion: Literal["double-support", "single-support"] = "double-support"
     """Motion of the NAO."""
-    physics: bool = False
-    """Run NAO in MuJoCo: feet on the floor with contact, position servos, what is sensed fed back every step."""
     duration: float = 8.0
     """Length of the motion [s]."""
     frequency: float = 200.0
@@ -34,8 +29,6 @@ class Demo:
     """Folder to write to."""
     animation: bool = True
     """Write the film (motion.gif; motion.mp4 too where the program ffmpeg is installed)."""
-    picture: bool = False
-    """Write picture.png as well: three instants side by side."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -43,9 +36,12 @@ class Demo:
         from rich.markup import escape
 
         from ..demo._demo import run_demo
+        from ..demo._nao import double_support, single_support
 
         console = Console()
-        motion, dt = demo_motion(self), 1.0 / self.frequency
+        _check(self)
+        make = single_support if self.motion == "single-support" else double_support
+        motion, dt = make(self.duration), 1.0 / self.frequency
         with told():
             self.out.mkdir(parents=True, exist_ok=True)
         console.print(escape(motion.title))
@@ -55,23 +51,12 @@ class Demo:
                 self.out,
                 schemes=self.schemes,
                 dt=dt,
-                physics=self.physics,
                 animation=self.animation,
-                picture=self.picture,
                 announce=status.update,
             )
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)
         return 0
-
-
-def demo_motion(command: Demo) -> Motion:
-    """Return the motion that the options ask for."""
-    from ..demo._nao import double_support, single_support
-
-    _check(command)
-    make = single_support if command.motion == "single-support" else double_support
-    return make(command.duration)
 
 
 def _check(command: Demo) -> None:

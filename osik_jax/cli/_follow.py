@@ -9,10 +9,8 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from ._inputs import InScene, read_pose_file, read_robot
 from ._messages import told
-from ._pose_file import read_pose_file
-from ._robots import read_robot
-from ._scene import InScene
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ._inputs import InScene, read_robot
 from ._messages import told
-from ._robots import read_robot
-from ._scene import InScene
 
 if TYPE_CHECKING:
     from ..robot import Robot

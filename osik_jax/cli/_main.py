@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import tyro
 
@@ -22,7 +23,18 @@ from ._ros2 import Ros2
 from ._view import View
 
 _DESCRIPTION = "Operational-space inverse kinematics for redundant robots, in JAX. osik --version prints the version."
-_Command = Calibrate | Demo | Follow | Ik | Place | Reach | Retarget | Ros2 | View | Info
+_COMMANDS = {
+    "demo": Demo,
+    "ik": Ik,
+    "follow": Follow,
+    "reach": Reach,
+    "calibrate": Calibrate,
+    "place": Place,
+    "retarget": Retarget,
+    "ros2": Ros2,
+    "view": View,
+    "info": Info,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,21 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"osik-jax {importlib.metadata.version('osik-jax')}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {
-            "demo": Demo,
-            "ik": Ik,
-            "follow": Follow,
-            "reach": Reach,
-            "calibrate": Calibrate,
-            "place": Place,
-            "retarget": Retarget,
-            "ros2": Ros2,
-            "view": View,
-            "info": Info,
-        },
-        prog="osik",
-        description=_DESCRIPTION,
-        args=arguments or ["--help"],
+        _COMMANDS, prog="osik", description=_DESCRIPTION, args=arguments or ["--help"]
     )
     try:
         with notes():
@@ -63,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _run(command: _Command) -> int:
+def _run(command: Any) -> int:
     """Run a command in double precision; return the exit code."""
     import jax
 
@@ -74,7 +72,7 @@ def _run(command: _Command) -> int:
     return command.run()
 
 
-def _left_behind(command: _Command) -> str:
+def _left_behind(command: Any) -> str:
     """Return a remark where an interrupted command has written something."""
     if isinstance(command, Reach) and command.unfinished.is_dir():
         return f"; the same command goes on where it was ({command.unfinished})"

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from ._inputs import read_pose_file, read_robot
 from ._messages import CommandError, told, writing
-from ._pose_file import read_pose_file
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from ..collision import Scene

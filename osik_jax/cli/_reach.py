@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from ._inputs import InScene, read_robot
 from ._messages import told, writing
-from ._robots import read_robot
-from ._scene import InScene
 
 if TYPE_CHECKING:
     from rich.table import Table

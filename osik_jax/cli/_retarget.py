@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from .._errors import OsikValueError
+from ._inputs import read_robot
 from ._messages import told
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from ..retargeting import Retargeter

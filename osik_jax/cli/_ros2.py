@@ -10,8 +10,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
+from ._inputs import read_robot
 from ._messages import CommandError, refuse, told
-from ._robots import read_robot
 
 if TYPE_CHECKING:
     from ..interop.ros2 import Controller
@@ -22,7 +22,7 @@ class Ros2:
     """Leads a robot over ROS 2 topics, without ROS on this machine: joint states and targets in, commands out.
 
     Needs the extra ros2. It starts at the measured configuration, stays there until a target comes, and holds where
-    states stop. With --replay it gives a recorded bag to the controller instead, and compares the commands.
+    states stop.
     """
 
     robot: str | None = None
@@ -38,15 +38,9 @@ class Ros2:
     """Speak with this machine alone, as with ROS_LOCALHOST_ONLY=1 or ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST."""
     duration: float | None = None
     """Seconds after which it ends. Default: Ctrl-C ends it."""
-    record: Path | None = None
-    """An MCAP file for all messages that come in, and the commands."""
-    replay: Path | None = None
-    """An MCAP file whose messages the controller is given."""
-    tolerance: float = 1e-9
-    """Largest difference of a joint from the recorded command for exit code 0, with --replay [rad or m]."""
 
     def run(self) -> int:
-        """Run the command; return the exit code: 1 if a replay does not reproduce its commands, 130 after Ctrl-C."""
+        """Run the command; return the exit code: 130 after Ctrl-C."""
         with told():
             from ..interop.ros2 import Controller, Settings, dds
             from ..interop.ros2._settings import read_settings
@@ -55,20 +49,8 @@ class Ros2:
             if (self.robot is None) == (settings.controller is None):
                 raise CommandError("give --robot, or a controller in the settings of --config")
             refuse(self, self.robot is None, ("base",), "--robot, not with a controller, which has its own")
-            moving = ("domain", "loopback", "duration", "record")
-            refuse(self, self.replay is not None, moving, "a robot that moves, not with --replay")
-            refuse(self, self.replay is None, ("tolerance",), "--replay")
             robot = None if self.robot is None else read_robot(self.robot, self.base)
-            controller = Controller(robot, settings)
-            return self._lead(dds, controller) if self.replay is None else self._replay(dds, controller)
-
-    def _replay(self, dds: ModuleType, controller: Controller) -> int:
-        found = dds.replay(controller, self.replay)
-        print(
-            f"{len(found.recorded)} commands of {len(found.names)} joints, largest difference {found.difference:.3g}; "
-            f"tolerance {self.tolerance:g}"
-        )
-        return 0 if found.difference <= self.tolerance else 1
+            return self._lead(dds, Controller(robot, settings))
 
     def _lead(self, dds: ModuleType, controller: Controller) -> int:
         stop, received = threading.Event(), set[int]()
@@ -78,10 +60,7 @@ class Ros2:
             stop.set()
 
         with contextlib.ExitStack() as stack:
-            bag = None if self.record is None else stack.enter_context(dds.BagWriter(self.record))
-            node = dds.Node(
-                controller, dds.Endpoints(self.domain, self.loopback or None), None if bag is None else bag.add
-            )
+            node = dds.Node(controller, dds.Endpoints(self.domain, self.loopback or None))
             for number in (signal.SIGINT, signal.SIGTERM):
                 stack.callback(signal.signal, number, signal.signal(number, end))
             if self.duration is not None:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from ._inputs import InScene, read_robot
 from ._messages import CommandError, refuse, told
-from ._robots import FLOATING, read_robot
-from ._scene import InScene
 
 if TYPE_CHECKING:
     from ..collision import Scene
@@ -27,12 +26,12 @@ _CLEARANCE = 0.01
 class View(InScene):
     """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
 
-    With a file: plays the motion.npz that osik demo wrote, opens a session that a view has saved, or shows slices of
-    the map.npz that osik reach wrote.
+    With a file: writes a page that plays the motion.npz of osik demo or osik retarget, or runs the controller that a
+    page or osik.save_controller has written.
     """
 
     file: Annotated[Path | None, tyro.conf.Positional] = None
-    """A motion.npz to play, a session.json to open, or a map.npz. Default: drag the robot."""
+    """A motion.npz to play, or a controller.json to run. Default: drag the robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     base: Literal["auto", "floating", "fixed"] = "auto"
@@ -46,47 +45,52 @@ class View(InScene):
     browser: bool = True
     """Open the page in a browser."""
     html: Path | None = None
-    """Write a page that plays a motion.npz without a server, instead of serving one."""
+    """With a motion.npz: the page to write, one file that plays without a server. Default: its name, .html."""
 
     def run(self) -> int:
-        """Serve a page until Ctrl-C, which is how a view ends."""
-        from ..viewer.live import _open, _playback, _server, load_session, serve
-        from ..viewer.live._export import write_page
-        from ..viewer.live._session import RobotSource
+        """Serve a page until Ctrl-C, which is how a view ends; or write one that plays a motion."""
+        from ..saving import load_controller
+        from ..viewer.live import _open, _server
+        from ..viewer.live._page import serve
 
         with told():
-            if self.html is not None and (self.file is None or self.file.suffix == ".json" or _open.is_map(self.file)):
-                raise CommandError("--html goes with a motion.npz")
-            saved = self.file is not None and self.file.suffix == ".json"
-            refuse(self, saved, ("robot", "base"), "a robot or a motion, not with a session, which has its own")
+            saved, moves = (self.file is not None and self.file.suffix == end for end in (".json", ".npz"))
+            refuse(self, saved, ("robot", "base"), "a robot or a motion, not with a controller, which has its own")
             refuse(self, self.file is not None, ("support", "scene"), "a robot to drag, not with a file")
+            refuse(self, not moves, ("html",), "a motion.npz")
+            if self.file is not None and not (saved or moves):
+                raise CommandError(f"{self.file} is no .npz of a motion, nor .json of a controller")
             obstacles = self.obstacles()
             _server.import_viser()
-            _server.check_port(self.host, 0 if self.html is not None else self.port)
+            if moves:
+                return self._play()
+            _server.check_port(self.host, self.port)
             options: Any = dict(host=self.host, port=self.port)
-            if self.file is not None and saved:
-                view = serve(load_session(self.file), **options)
-            elif self.file is None:
-                robot = read_robot(self.robot, self.base)
-                source = RobotSource(self.robot, FLOATING[self.base])
-                keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()
-                view = _open.open_robot(robot, source, self.support or _feet(robot), limits=keeps_off, **options)
-            elif _open.is_map(self.file):
-                view = _open.open_map(self.file, read_robot(self.robot, self.base), **options)
+            if self.file is not None:
+                view = serve(load_controller(self.file), **options)
             else:
                 robot = read_robot(self.robot, self.base)
-                motion = _playback.read_motion(self.file, robot)
-                if self.html is not None:
-                    write_page(robot, motion, self.html, title=self.file.stem)
-                    print(f"written: {self.html}")
-                    return 0
-                view = _playback.Player(robot, motion, title=self.file.name, **options)
+                keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()
+                view = _open.open_robot(robot, self.robot, self.support or _feet(robot), limits=keeps_off, **options)
         print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
         if self.browser:
             webbrowser.open(view.url)
         with suppress(KeyboardInterrupt):
             view.wait()
         view.stop()
+        return 0
+
+    def _play(self) -> int:
+        """Write a page that plays a motion; return the exit code."""
+        from ..viewer.live._playback import read_motion, write_page
+
+        assert self.file is not None
+        robot = read_robot(self.robot, self.base)
+        page = self.html or self.file.with_suffix(".html")
+        write_page(robot, read_motion(self.file, robot), page, title=self.file.stem)
+        print(f"written: {page}")
+        if self.browser:
+            webbrowser.open(page.resolve().as_uri())
         return 0
 
 

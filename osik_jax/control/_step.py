@@ -143,8 +143,7 @@ def build_problem(
         limits: as in ``solve``.
         dt: as in ``solve``.
         targets: as in ``solve``.
-        kinematics: at q. Default: ``forward_kinematics(robot, q)``; that of another library is made by
-            ``osik_jax.interop.kinematics.kinematics_from``.
+        kinematics: at q. Default: ``forward_kinematics(robot, q)``.
 
     Raises:
         KeyError, TypeError, ValueError: as in ``solve``.

@@ -1,1 +1,1 @@
-"""The demonstration behind ``osik demo``: NAO's two motions, and their runs in physics."""
+"""The demonstration behind ``osik demo``: NAO's two motions."""

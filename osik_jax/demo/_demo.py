@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,10 +9,9 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from ..viewer import animate, hero_picture
-from ._figures import comparison, figures, table
+from ..viewer import animate
+from ._figures import figures, table
 from ._motion import Motion
-from ._physics import PhysicsRun, run_physics
 from ._run import TITLES, Run, run_scheme
 
 _DIRECTIONS = ("forward", "to the left", "up")
@@ -25,58 +23,31 @@ def run_demo(
     *,
     schemes: Sequence[str],
     dt: float = 0.005,
-    physics: bool = False,
     animation: bool = True,
-    picture: bool = False,
     announce: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Table, Sequence[Run]]:
-    """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
+    """Run the schemes in turn and write ``motion.npz`` and a film.
 
-    Return the table of all figures, and the runs. With ``physics`` the loop is closed with MuJoCo; the motion is then
-    one of NAO. The film is that of the last scheme, ``motion.gif``, and ``motion.mp4`` where the program ffmpeg is
-    installed. ``picture`` adds ``picture.png``, three instants side by side. ``announce`` is called with the current
-    stage.
+    Return the table of all figures, and the runs. The film is that of the last scheme, ``motion.gif``, and
+    ``motion.mp4`` where the program ffmpeg is installed. ``announce`` is called with the current stage. ``motion.npz``
+    has the time and, of each scheme, q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv).
 
     Raises:
         KeyError: no such scheme.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    run, doing = run_scheme, "compiling and running"
-    if physics:
-        run, doing = run_physics, "planning, then simulating"
-        motion = dataclasses.replace(motion, title=f"{motion.title}, with dynamics")
-    runs = []
+    runs, arrays = [], {}
     for scheme in schemes:
-        announce(f"{TITLES.get(scheme, scheme)}: {doing}")
-        runs.append(run(motion, scheme, dt=dt))
-    announce("drawing the comparison")
-    found = {run.scheme: figures(motion, run) for run in runs}
-    comparison(motion.title, found, dt).savefig(folder / "comparison.png")
-    np.savez_compressed(folder / "motion.npz", allow_pickle=False, **_arrays(runs))
+        announce(f"{TITLES.get(scheme, scheme)}: compiling and running")
+        runs.append(run := run_scheme(motion, scheme, dt=dt))
+        name = scheme.replace("-", "_")
+        arrays |= {"time": run.seen.time, f"q_{name}": run.q, f"v_{name}": run.solution.velocity}
+    np.savez_compressed(folder / "motion.npz", allow_pickle=False, **arrays)
     if animation:
         announce("filming")
         for name in ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]:
             _film(folder / name, motion, runs[-1], dt)
-    if picture:
-        _draw_picture(folder / "picture.png", motion, runs[-1])
-    return table(motion.title, found), runs
-
-
-def _arrays(runs: Sequence[Run]) -> dict[str, np.ndarray]:
-    """Return the arrays of ``motion.npz``: time, and of each scheme q_SCHEME (steps + 1, nq) and v_SCHEME (steps, nv).
-
-    With dynamics, of each scheme: time, q (sensed), plan, command, effort, com, contact_points and contact_forces.
-    """
-    arrays: dict[str, np.ndarray] = {}
-    for run in runs:
-        if isinstance(run, PhysicsRun):
-            names = ("time", "q", "command", "effort", "com", "contact_points", "contact_forces")
-            parts = {name: getattr(run.recording, name) for name in names} | {"plan": run.plan.q}
-        else:
-            arrays["time"] = run.seen.time
-            parts = {"q": run.q, "v": run.solution.velocity}
-        arrays |= {f"{name}_{run.scheme.replace('-', '_')}": np.asarray(value) for name, value in parts.items()}
-    return arrays
+    return table(motion.title, {run.scheme: figures(motion, run) for run in runs}), runs
 
 
 def _film(path: Path, motion: Motion, run: Run, dt: float) -> None:
@@ -98,11 +69,3 @@ def _film(path: Path, motion: Motion, run: Run, dt: float) -> None:
         curves_title="moved from the start [mm], dashed: wanted",
         caption=f"{motion.title}: {TITLES[run.scheme]}",
     )
-
-
-def _draw_picture(path: Path, motion: Motion, run: Run) -> None:
-    """Write a PNG with three instants of a motion side by side."""
-    shown = [round(part * (len(run.q) - 1)) for part in (0.0, 0.26, 0.45)]
-    support = [run.seen.support[k] for k in shown] if run.seen.support else None
-    labels = [f"{run.seen.time[k]:.1f} s" for k in shown]
-    hero_picture(path, motion.robot, [run.q[k] for k in shown], support=support, labels=labels)

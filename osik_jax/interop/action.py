@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,8 +23,6 @@ from ..robot import Robot
 from ..robot._joint_selection import is_scalar, select_joints
 from ..schemes import Scheme
 from ..tasks import FrameTask, Task
-
-Mode = Literal["relative", "absolute"]
 
 
 class _JointTargets(NamedTuple):
@@ -54,8 +52,7 @@ class TaskSpaceAction(eqx.Module):
     has position rows, then a rotation vector if it has orientation rows, in world axes. An entry is cut at -1 and 1 and
     multiplied by its scale.
 
-    - ``mode="relative"``: the target is the frame's pose at q, moved by the scaled action.
-    - ``mode="absolute"``: the target is the task's own target, moved by the scaled action.
+    The target is the frame's pose at q, moved by the scaled action.
 
     A task of gain ``1 / dt`` asks for all of its error in one step. Limits, other tasks and the damping of the scheme
     leave a part of it; ``WeightedQP(curvature_damping=0.0)`` follows small actions exactly, and is less calm where a
@@ -65,9 +62,8 @@ class TaskSpaceAction(eqx.Module):
         robot: the robot.
         tasks: by name, as ``solve`` takes them.
         commanded: names of the ``FrameTask`` that the action moves. Default: every ``FrameTask``.
-        mode: "relative" to the frame's pose, or "absolute": to the task's target.
-        position_scale: largest motion of a position [m], one number or one for each task by name.
-        rotation_scale: largest rotation [rad], in the same way.
+        position_scale: largest motion of a position [m].
+        rotation_scale: largest rotation [rad].
         joints: names of the joints whose targets are returned, hinges and slides, such as those of the actuators in
             their order. Default: all independent ones, in the order of q.
         scheme: as in ``solve``.
@@ -82,7 +78,7 @@ class TaskSpaceAction(eqx.Module):
     Raises:
         KeyError: a task or joint that does not exist.
         TypeError: a commanded task that is no ``FrameTask``.
-        ValueError: as in ``solve``; a scale that is not positive, a joint of several entries, an unknown mode.
+        ValueError: as in ``solve``; a scale that is not positive, a joint of several entries.
     """
 
     robot: Robot
@@ -92,7 +88,6 @@ class TaskSpaceAction(eqx.Module):
     limits: tuple[Limit, ...] | None
     dt: Float[Array, ""]
     commanded: tuple[str, ...] = eqx.field(static=True)
-    mode: Mode = eqx.field(static=True)
     joints: tuple[str, ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)
 
@@ -102,9 +97,8 @@ class TaskSpaceAction(eqx.Module):
         tasks: Mapping[str, Task],
         *,
         commanded: Sequence[str] | None = None,
-        mode: Mode = "relative",
-        position_scale: float | Mapping[str, float] = 0.05,
-        rotation_scale: float | Mapping[str, float] = 0.2,
+        position_scale: float = 0.05,
+        rotation_scale: float = 0.2,
         joints: Sequence[str] | None = None,
         scheme: Scheme | None = None,
         limits: Limits | None = None,
@@ -112,17 +106,17 @@ class TaskSpaceAction(eqx.Module):
     ):
         check_setting("TaskSpaceAction(robot, tasks)", robot, scheme, dt)
         check_tasks(tasks, robot)
-        if mode not in ("relative", "absolute"):
-            raise OsikValueError(f"mode is {mode!r}; it is 'relative' or 'absolute'")
-        self.robot, self.tasks, self.mode = robot, dict(tasks), mode
+        for what, scale in (("position_scale", position_scale), ("rotation_scale", rotation_scale)):
+            if not (np.ndim(scale) == 0 and 0.0 < scale < np.inf):
+                raise OsikValueError(f"{what} is {scale!r}; it is a positive number")
+        self.robot, self.tasks = robot, dict(tasks)
         self.scheme, self.limits = scheme, checked_limits(robot, limits)
         self.dt = jnp.asarray(dt, robot.q0.dtype)
         self.commanded = _commanded(tasks, commanded)
-        given = (position_scale, "position_scale"), (rotation_scale, "rotation_scale")
         scales = [
-            _scale(scale, name, what)
+            scale
             for name in self.commanded
-            for (scale, what), moved in zip(given, _moves(tasks[name]), strict=True)
+            for scale, moved in zip((position_scale, rotation_scale), _moves(tasks[name]), strict=True)
             for _ in range(3 * moved)
         ]
         self.scale = jnp.asarray(scales, robot.q0.dtype)
@@ -176,12 +170,12 @@ class TaskSpaceAction(eqx.Module):
     def targets(self, q: Float[Array, " nq"], action: Float[Array, " size"]) -> dict[str, tuple[Array, Array]]:
         """Return the pose (position (3,), rotation (3, 3)) that an action asks of each commanded frame."""
         motion = jnp.clip(action, -1.0, 1.0) * self.scale
-        kinematics = forward_kinematics(self.robot, q) if self.mode == "relative" else None
+        kinematics = forward_kinematics(self.robot, q)
         out, first = {}, 0
         for name in self.commanded:
             task = self.tasks[name]
             assert isinstance(task, FrameTask)
-            p, R = task.target if kinematics is None else kinematics.frame_pose(self.robot, task.frame)
+            p, R = kinematics.frame_pose(self.robot, task.frame)
             moves_position, moves_rotation = _moves(task)
             if moves_position:
                 p, first = p + motion[first : first + 3], first + 3
@@ -211,15 +205,6 @@ def _commanded(tasks: Mapping[str, Task], names: Sequence[str] | None) -> tuple[
 def _moves(task: Any) -> tuple[bool, bool]:
     """Return whether a frame task has position rows, and orientation rows."""
     return any(task.kept[:3]), any(task.kept[3:])
-
-
-def _scale(given: float | Mapping[str, float], name: str, what: str) -> float:
-    value = given.get(name) if isinstance(given, Mapping) else given
-    if value is None:
-        raise OsikValueError(f"{what} has no entry for {name!r}; give one for each commanded task, or one number")
-    if not (np.ndim(value) == 0 and 0.0 < value < np.inf):
-        raise OsikValueError(f"{what} of {name!r} is {value!r}; it is a positive number")
-    return float(value)
 
 
 def _joints(robot: Robot, names: Sequence[str] | None) -> tuple[tuple[str, ...], tuple[int, ...]]:

@@ -1,4 +1,4 @@
-"""JAX functions on PyTorch tensors, with PyTorch's gradients: ``wrap`` and ``StepLayer``. Extra: ``torch``."""
+"""JAX functions on PyTorch tensors, with PyTorch's gradients (extra ``torch``)."""
 
 from __future__ import annotations
 
@@ -40,25 +40,6 @@ def wrap(step: Callable[..., Any]) -> Callable[..., Any]:
         return bridge.call(*jax.tree.flatten(args))
 
     return of_tensors
-
-
-class StepLayer(torch.nn.Module):
-    """Module without parameters that runs a JAX step, as the last layer of a policy.
-
-    ``StepLayer(jax.vmap(action))(q, network(observation))`` gives joint targets from the outputs of a network, and
-    gradients flow back into the network.
-
-    Args:
-        step: as in ``wrap``.
-    """
-
-    def __init__(self, step: Callable[..., Any]):
-        super().__init__()
-        self._step = wrap(step)
-
-    def forward(self, *args: Any) -> Any:
-        """Return the step's results for tensors."""
-        return self._step(*args)
 
 
 class _Bridge:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import jax
@@ -23,9 +24,6 @@ from ..limits import Limit, Limits
 from ..robot import Robot
 from ..schemes import Scheme
 from ._simulation import Simulation
-
-Command = Callable[[Robot, Array, Array, Array, Any], Array]
-"""Function of robot, last command, sensed configuration, velocity and time step that returns the next servo target."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +50,7 @@ def simulate(
     dt: float = 0.005,
     steps: int,
     targets: Targets | None = None,
-    command: Command | float | None = None,
+    command: float | None = None,
     before_step: Callable[[float, Simulation], None] | None = None,
 ) -> Recording:
     """Run the loop from the simulation's present state, and stop if the robot falls.
@@ -79,8 +77,6 @@ def simulate(
               A steady error remains, as with a servo whose stiffness is multiplied by gain times time. With a gain of
               20 / s and 0.05 s, a servo holds its load as if the plan were its target. With one step as the time the
               robot sinks.
-            - A function (an ``equinox.Module``, if its numbers change) of robot, last command (nq,), sensed
-              configuration (nq,), velocity (nv,) and dt [s], which returns the configuration.
         before_step: called with the time [s] since the start and the simulation, to push the robot, say.
 
     Returns:
@@ -107,19 +103,20 @@ def simulate(
     robot = simulation.world.robot
     numbers, static = taken_apart(tasks if callable(tasks) else dict(tasks))
     own = checked_limits(robot, limits)
-    how = command if command is None or callable(command) else np.asarray(command, float)
+    how = None if command is None else np.asarray(command, float)
     program = partial(_control_step, robot, numbers, scheme, own, how, np.asarray(dt))
     step = partial(program, static=static)
     held = jnp.asarray(simulation.sense())
     paths = jax.tree.map(np.asarray, targets)
+    targets_of = [jax.tree.map(itemgetter(k), paths) for k in range(steps)]
     # traced and not run, so that the first step finds its program compiled
-    first = jax.eval_shape(lambda: step(0.0, held, held, (None, None), _at(paths, 0))[1])
+    first = jax.eval_shape(lambda: step(0.0, held, held, (None, None), targets_of[0])[1])
     memory = jax.tree.map(jnp.zeros_like, (first.velocity, first.warm_start))
     frames, commands, solutions = [_frame(simulation)], [], []
     for k in range(steps):
         if before_step is not None:
             before_step(k * dt, simulation)
-        held, solution = step(k * dt, held, simulation.sense(), memory, _at(paths, k))
+        held, solution = step(k * dt, held, simulation.sense(), memory, targets_of[k])
         memory = solution.velocity, solution.warm_start
         simulation.step(held, dt)
         frames.append(_frame(simulation))
@@ -142,7 +139,7 @@ def _control_step(
     numbers: Any,
     scheme: Scheme | None,
     limits: tuple[Limit, ...] | None,
-    command: Command | Array | None,
+    command: Array | None,
     dt: Array,
     t: Array,
     last: Array,
@@ -158,15 +155,8 @@ def _control_step(
     velocity, warm_start = memory
     todo, kept = remembering((todo, limits), velocity, t > 0.0)
     solution = solve(robot, sensed, todo, scheme=scheme, limits=kept, dt=dt, warm_start=warm_start)
-    if callable(command):
-        return command(robot, last, sensed, solution.velocity, dt), solution
     start, time = (last, dt) if command is None else (sensed, command)
     return integrate(robot, start, solution.velocity, time), solution
-
-
-def _at(paths: Targets | None, k: int) -> Targets | None:
-    """Return the targets of step k."""
-    return jax.tree.map(lambda path: path[k], paths)
 
 
 def _frame(simulation: Simulation) -> dict[str, np.ndarray]:

@@ -85,6 +85,19 @@ def save_controller(
             its source does not make again, or whose MJCF gives other numbers, for example the distances of its meshes.
         OSError: the file cannot be written. An older file of this name is unchanged.
     """
+    write_text(path, controller_text(robot, tasks, scheme=scheme, limits=limits, dt=dt, source=source))
+
+
+def controller_text(
+    robot: Robot,
+    tasks: Mapping[str, Task],
+    *,
+    scheme: Scheme | None,
+    limits: Limits | Sequence[Limit] | None,
+    dt: float,
+    source: str | os.PathLike[str] | None,
+) -> str:
+    """Return the content of the file that ``save_controller`` writes."""
     check_setting("save_controller(path, robot, tasks)", robot, scheme, dt)
     check_tasks(tasks, robot)
     given = checked_limits(robot, limits) or ()
@@ -97,7 +110,7 @@ def save_controller(
     saved = _Saved(robot, dict(tasks), used, given, content["dt"])
     if source is None:
         saved = _check_written(saved, content)
-    write_text(path, _with_packed_step(json.dumps(content, indent=1), saved))
+    return _with_packed_step(json.dumps(content, indent=1), saved)
 
 
 def _with_packed_step(text: str, saved: _Saved) -> str:
@@ -120,7 +133,12 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
         ValueError: the file is no controller, or one of another version, is damaged, or was edited to something that
             ``solve`` does not take; the robot's file has changed.
     """
-    content = _content(path)
+    return read_controller(Path(path).read_bytes(), str(path))
+
+
+def read_controller(text: bytes, path: str) -> Controller:
+    """Return the controller of a file's content; ``path`` names the file in messages."""
+    content = _content(text, path)
     try:
         found = _made(content, _robot(content["robot"]))
         check_setting("load_controller(path)", found.robot, found.scheme, found.dt)
@@ -137,10 +155,10 @@ def load_controller(path: str | os.PathLike[str]) -> Controller:
     return Controller(robot, tasks, scheme=scheme, limits=limits, dt=dt)
 
 
-def _content(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return the content of a file; raise ValueError if it is no controller, or not as it was written."""
+def _content(data: bytes, path: str) -> dict[str, Any]:
+    """Return the content of a file as data; raise ValueError if it is no controller, or not as it was written."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = data.decode("utf-8")
         content = json.loads(text)
         known = isinstance(content, dict) and content.get("format") == _FORMAT
     except (RecursionError, ValueError):

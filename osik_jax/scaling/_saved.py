@@ -1,4 +1,4 @@
-"""Results in a folder: a file for each chunk, and a manifest of the job."""
+"""Results in a folder: a ``.npz`` file for each chunk, and a manifest of the job."""
 
 from __future__ import annotations
 
@@ -6,69 +6,34 @@ import dataclasses
 import json
 import os
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from .._errors import OsikKeyError, OsikTypeError, OsikValueError
-from ..batching._names import leaf_names
-from ._chunk_file import DamagedFile, Part, chunk_files, complete, job_file, opened, read_chunk, result_names
-from ._fingerprint import identifier
+from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
+from .._npz import open_npz
+from .._whole_file import whole_file, write_text
+from ._fingerprint import differences
 
-FORMAT = 2
-MANIFEST = "manifest.json"
-
-
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest."""
-    with job_file(folder / MANIFEST) as file:
-        file.write(json.dumps(manifest, indent=1).encode())
-
-
-def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """Return the manifest of a folder; None if there is none."""
-    path = folder / MANIFEST
-    if not path.exists():
-        return None
-    try:
-        manifest = json.loads(path.read_bytes())
-        form = manifest["format"]
-    except (ValueError, TypeError, KeyError) as error:
-        raise DamagedFile(path, f"is damaged ({error})") from error
-    if form != FORMAT:
-        raise OsikValueError(
-            f"{folder} has format {form!r}, and this version reads and writes {FORMAT}: name another folder for a job; "
-            "np.load opens the files of this one"
-        )
-    if manifest.get("job") != identifier(manifest):
-        raise DamagedFile(path, "is damaged (its checksum, called job, is wrong)")
-    return manifest
+FORMAT = 3
+_MANIFEST = "manifest.json"
+_RESULT = "result."
 
 
 @dataclasses.dataclass(frozen=True)
 class Saved:
     """Results on disk of a finished or running job. ``saved[a:b]`` reads lanes a to b, ``saved[:]`` all.
 
-    Only the chunks that hold the lanes wanted are read.
+    Arrays come by name, such as ``velocity`` and ``slack.hand``. Only the chunks that hold the lanes are read.
 
     Attributes:
         folder: where they are.
-        like: the structure that they come back in; None: a dict by name.
+        manifest: number of lanes, size of chunks, versions, fingerprints of the inputs.
     """
 
     folder: Path
-    like: Any = None
-
-    @cached_property
-    def manifest(self) -> dict[str, Any]:
-        """Return the number of lanes, size of chunks, versions, fingerprints of the inputs."""
-        found = read_manifest(self.folder)
-        if found is None:
-            raise FileNotFoundError(f"{self.folder} has no {MANIFEST}: it is no folder of run_in_chunks")
-        return found
+    manifest: Mapping[str, Any]
 
     def __len__(self) -> int:
         """Return the number of lanes, including missing ones."""
@@ -82,91 +47,122 @@ class Saved:
     @property
     def missing(self) -> tuple[int, ...]:
         """Return the indices of missing chunks."""
-        there = complete(chunk_files(self.folder))
-        return tuple(k for k in range(self.chunks) if k not in there)
+        return tuple(k for k in range(self.chunks) if not self._path(k).exists())
 
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Return the names of the arrays, such as ``velocity`` and ``slack.hand``."""
-        for path in chunk_files(self.folder).values():
-            with opened(path) as file:
-                return result_names(file)
-        raise OsikValueError(f"{self.folder} has no finished chunk")
+    def __getitem__(self, lanes: slice) -> dict[str, np.ndarray]:
+        """Return all arrays of a slice of lanes; exceptions are those of ``read``."""
+        return self.read(None, lanes)
 
-    def __getitem__(self, lanes: slice) -> Any:
-        """Return the results of a slice of lanes: a pytree like ``like``, or a dict by name.
-
-        Raises:
-            ValueError: lanes that are missing.
-        """
-        if not isinstance(lanes, slice):
-            raise OsikTypeError(f"lanes are a slice, not {lanes!r}: use [{lanes} : {lanes} + 1]")
-        arrays = self.read(self.names, lanes)
-        if self.like is None:
-            return arrays
-        return jax.tree.unflatten(jax.tree.structure(self.like), [arrays[name] for name in leaf_names(self.like)])
-
-    def read(self, names: Sequence[str], lanes: slice = slice(None)) -> dict[str, np.ndarray]:
-        """Return some of the arrays, by name, of a slice of lanes; nothing else is read.
+    def read(self, names: Sequence[str] | None, lanes: slice = slice(None)) -> dict[str, np.ndarray]:
+        """Return some of the arrays, by name, of a slice of lanes; None: all arrays.
 
         Raises:
             KeyError: no such array; the message lists them.
-            ValueError: lanes that are missing.
+            TypeError: the lanes are no slice.
+            ValueError: lanes that are missing, a damaged file, or a slice with a step.
         """
-        unknown = [name for name in names if name not in self.names]
-        if unknown:
-            raise OsikKeyError(f"no array {unknown[0]!r}; arrays: {', '.join(self.names)}")
+        if not isinstance(lanes, slice):
+            raise OsikTypeError(f"lanes are a slice, not {lanes!r}: use [{lanes} : {lanes} + 1]")
         start, stop, step = lanes.indices(len(self))
-        if step < 1:
-            raise OsikValueError(f"the step of a slice of lanes is positive, not {step}")
+        if step != 1:
+            raise OsikValueError(f"the step of a slice of lanes is 1, not {step}")
         size = self.manifest["chunk"]
-        touched = range(start // size, -(-stop // size)) if stop > start else ()
-        parts = [self._chunk(k, names, max(start - k * size, 0), min(stop - k * size, size)) for k in touched]
-        if not parts:
-            parts = [self._chunk(0, names, 0, 0)]
-        return {name: np.concatenate([part[name] for part in parts])[::step] for name in names}
+        touched = range(start // size, -(-stop // size)) or range(1)
+        parts = [self._chunk(k, names) for k in touched]
+        first = touched[0] * size
+        return {
+            name: np.concatenate([part[name] for part in parts])[start - first : max(start, stop) - first]
+            for name in parts[0]
+        }
 
-    def _parts(self, chunk: int) -> list[Part]:
-        """Return the parts of a chunk: one set of them if different numbers of processes wrote it."""
-        alone = Part(chunk)
-        if (self.folder / alone.file_name).exists():
-            return [alone]
-        paths = self.folder.glob(f"{chunk:08d}.*-of-*.npz")
-        return complete(part for path in paths if (part := Part.of(path))).get(chunk, [])
+    def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a chunk; its file gets its name when it is complete."""
+        for name, array in arrays.items():
+            if array.dtype.hasobject or (array.dtype.names is None and np.dtype(array.dtype.str) != array.dtype):
+                raise OsikValueError(f"{name or 'the result'} is of type {array.dtype}, which no .npz keeps")
+        named: dict[str, Any] = {_RESULT + name: array for name, array in arrays.items()}
+        with whole_file(self._path(chunk)) as file:
+            np.savez(file, allow_pickle=False, **named)
 
-    def _chunk(self, chunk: int, names: Sequence[str], start: int, stop: int) -> dict[str, np.ndarray]:
-        """Return lanes start to stop of a chunk, counted from its first."""
-        parts = self._parts(chunk)
-        if not parts:
-            count = len(self.missing)
+    def claim(self) -> list[int]:
+        """Assign the folder to the job; return the chunks to run: missing ones, and damaged ones, which are removed."""
+        old = _read_manifest(self.folder)
+        if old is None and any(self.folder.glob("[0-9]*.npz")):
+            raise OsikValueError(f"{self.folder} has chunks of a job without its {_MANIFEST}; name another folder")
+        changed = differences(old or self.manifest, self.manifest)
+        if changed:
+            what = "; ".join(changed)
+            raise OsikValueError(f"{self.folder} has another job in it; name another folder. What differs: {what}")
+        for partial in self.folder.glob(".*.npz.*.partial"):  # of processes that were killed
+            partial.unlink(missing_ok=True)
+        if old is None:
+            write_text(self.folder / _MANIFEST, json.dumps(self.manifest, indent=1))
+        return [k for k in range(self.chunks) if not self._is_whole(k)]
+
+    def _is_whole(self, chunk: int) -> bool:
+        """Return whether a chunk is there; read it against its checksums, and remove it if it is damaged."""
+        if not self._path(chunk).exists():
+            return False
+        try:
+            self._chunk(chunk, None)
+        except ValueError as damaged:
+            warn(f"{str(damaged).partition(';')[0]}; it is made anew")
+            self._path(chunk).unlink()
+            return False
+        return True
+
+    def _path(self, chunk: int) -> Path:
+        return self.folder / f"{chunk:08d}.npz"
+
+    def _chunk(self, chunk: int, names: Sequence[str] | None) -> dict[str, np.ndarray]:
+        """Return arrays of a chunk by name."""
+        again = "call run_in_chunks again with the same arguments"
+        if not self._path(chunk).exists():
+            more = len(self.missing) - 1
             raise OsikValueError(
-                f"chunk {chunk} of {self.folder} is missing, with {count - 1} more of {self.chunks}: call "
-                "run_in_chunks again, it goes on where it was; if hosts wrote to folders of their own, join them"
+                f"chunk {chunk} of {self.folder} is missing, with {more} more of {self.chunks}; {again}, it goes on "
+                "where it was"
             )
-        job = self.manifest["job"]
-        read = [read_chunk(self.folder / part.file_name, part, job, names) for part in parts]
-        own = min(self.manifest["chunk"], len(self) - chunk * self.manifest["chunk"])
-        lanes = np.concatenate([np.arange(*block) for blocks, _ in read for block in blocks])
-        if not np.array_equal(np.sort(lanes), np.arange(own)):
-            raise DamagedFile(self.folder / parts[0].file_name, f"and its like do not have each of {own} lanes once")
-        wanted = np.argsort(lanes)[start:stop]
-        return {name: np.concatenate([arrays[name] for _, arrays in read])[wanted] for name in names}
+        try:
+            with open_npz(self._path(chunk)) as file:
+                known = [name.removeprefix(_RESULT) for name in file.files]
+                unknown = [name for name in names or () if name not in known]
+                if not unknown:
+                    return {name: file[_RESULT + name] for name in (known if names is None else names)}
+        except (KeyError, ValueError) as error:
+            raise OsikValueError(f"{error}; {again}, it makes the file anew") from error
+        raise OsikKeyError(f"no array {unknown[0]!r}; arrays: {', '.join(known)}")
 
 
-def load(folder: str | os.PathLike[str], *, like: Any = None) -> Saved:
+def _read_manifest(folder: Path) -> dict[str, Any] | None:
+    """Return the manifest of a folder; None if there is none."""
+    path = folder / _MANIFEST
+    if not path.exists():
+        return None
+    try:
+        manifest = json.loads(path.read_bytes())
+        form = manifest["format"]
+    except (ValueError, TypeError, KeyError) as error:
+        raise OsikValueError(f"{path} is damaged ({error}); name another folder") from error
+    if form != FORMAT:
+        raise OsikValueError(
+            f"{folder} has format {form!r}, and this version reads and writes {FORMAT}: name another folder for a job; "
+            "np.load opens the files of this one"
+        )
+    return manifest
+
+
+def load(folder: str | os.PathLike[str]) -> Saved:
     """Return the results that ``run_in_chunks`` wrote, or has written so far.
 
     Args:
         folder: its ``out``.
-        like: a pytree of the structure of the results, whose numbers do not matter (``jax.eval_shape`` makes one).
-            Default: they come as a dict by name.
 
     Raises:
         FileNotFoundError: the folder was not written by ``run_in_chunks``.
-        ValueError: this version cannot read it, or ``like`` has other arrays.
+        ValueError: this version cannot read it.
     """
-    saved = Saved(Path(folder), like)
-    if like is not None and (len(saved.missing) < saved.chunks) and set(leaf_names(like)) != set(saved.names):
-        raise OsikValueError(f"like has the arrays {', '.join(leaf_names(like))}; saved are {', '.join(saved.names)}")
-    len(saved)
-    return saved
+    manifest = _read_manifest(Path(folder))
+    if manifest is None:
+        raise FileNotFoundError(f"{folder} has no {_MANIFEST}: it is no folder of run_in_chunks")
+    return Saved(Path(folder), manifest)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,16 +16,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from .._errors import OsikTypeError, OsikValueError
 from ..execution._lanes import refuse_explicit_axes
 
-_SHARED = -1
-"""Marker in place of an axis: every device has the whole array."""
-
 
 def sharded(
     function: Callable[..., Any],
     in_axes: Any = 0,
     *,
     mesh: Mesh | None = None,
-    donate_argnums: int | Sequence[int] = (),
 ) -> ShardedFunction:
     """Return a function like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
 
@@ -38,7 +34,6 @@ def sharded(
             (``osik_jax.batch_axes``). What is None is copied to every device.
         mesh: the devices, such as ``jax.sharding.Mesh(jax.devices()[:2], ("lanes",))``; the batch is split over all of
             its axes. Default: all devices, those of other hosts too where ``jax.distributed`` joined them.
-        donate_argnums: arguments whose memory the results may take, as in ``jax.jit``; they are lost to the caller.
 
     Returns:
         A function of batches. Results have the lanes in front and stay on their devices. Compiled once for each shape;
@@ -51,7 +46,7 @@ def sharded(
         raise OsikTypeError(f"{function!r} is no function")
     if mesh is not None and not isinstance(mesh, Mesh):
         raise OsikTypeError(f"mesh is {mesh!r}; it is a jax.sharding.Mesh of devices")
-    return ShardedFunction(function, in_axes, Mesh(jax.devices(), ("lanes",)) if mesh is None else mesh, donate_argnums)
+    return ShardedFunction(function, in_axes, Mesh(jax.devices(), ("lanes",)) if mesh is None else mesh)
 
 
 class ShardedFunction:
@@ -61,14 +56,23 @@ class ShardedFunction:
         function: of one lane.
         in_axes: which axes are split.
         mesh: the devices.
+        run: the compiled function of arguments whose lanes the devices divide; it takes none from another device.
     """
 
-    def __init__(
-        self, function: Callable[..., Any], in_axes: Any, mesh: Mesh, donate_argnums: int | Sequence[int] = ()
-    ):
+    def __init__(self, function: Callable[..., Any], in_axes: Any, mesh: Mesh):
         self.function, self.in_axes, self.mesh = function, in_axes, mesh
-        self._donated = {donate_argnums} if isinstance(donate_argnums, int) else set(donate_argnums)
-        self._known: dict[Any, _Program] = {}  # by the structure of the arguments
+        self._axes = tuple(in_axes) if isinstance(in_axes, list) else in_axes
+        self._known: dict[Any, list[NamedSharding]] = {}  # where arrays are wanted, by the structure of the arguments
+        specs = jax.tree.map(self._spec, self._axes, is_leaf=lambda axis: axis is None)
+        # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
+        mapped = jax.shard_map(
+            jax.vmap(_making_empty_arrays(function), in_axes=self._axes),
+            mesh=mesh,
+            in_specs=specs,
+            out_specs=PartitionSpec(mesh.axis_names),
+            check_vma=False,
+        )
+        self.run = jax.jit(mapped)
         functools.update_wrapper(self, function, updated=())
 
     def __call__(self, *args: Any) -> Any:
@@ -81,100 +85,109 @@ class ShardedFunction:
             ValueError: ``in_axes`` does not fit the arguments, lanes differ in number, or there are none.
             TypeError: an array is sharded over an explicit axis of a mesh.
         """
-        leaves, program = self._program(args)
-        count = program.count(leaves)
+        leaves, structure, places = self._flat(args)
+        count = _count_lanes(leaves, places)
         missing = -count % self.mesh.size
         if missing:
-            leaves = [_filled(a, axis, missing) for a, axis in zip(leaves, program.axes, strict=True)]
-        out = program.run(*program.reachable(leaves))
+            leaves = [_filled(a, _axis(place), missing) for a, place in zip(leaves, places, strict=True)]
+        if jax.process_count() == 1:
+            wanted = [isinstance(a, jax.Array) and not isinstance(a, Tracer) and a.committed for a in leaves]
+        else:
+            wanted = [not isinstance(a, _NUMBERS) for a in leaves]
+        out = self.run(*structure.unflatten(_moved(leaves, places, wanted)))
         return jax.tree.map(lambda a: a[:count], out) if missing else out
 
     def place(self, *args: Any) -> tuple[Any, ...]:
         """Return the arguments on the function's devices, so that calls in a loop copy nothing.
 
+        Python numbers stay, because they adapt to any precision.
+
         Raises:
             ValueError: as a call does, and where the devices do not divide the number of lanes.
         """
-        leaves, program = self._program(args)
-        count = program.count(leaves)
+        leaves, structure, places = self._flat(args)
+        count = _count_lanes(leaves, places)
         if count % self.mesh.size:
             raise OsikValueError(f"{count} lanes do not divide over {self.mesh.size} devices")
-        return jax.tree.unflatten(program.structure, program.placed(leaves))
+        return structure.unflatten(_moved(leaves, places, [not isinstance(a, _NUMBERS) for a in leaves]))
 
-    def _program(self, args: tuple[Any, ...]) -> tuple[list[Any], _Program]:
-        """Return the arrays of the arguments, and the program for their structure."""
+    def _flat(self, args: tuple[Any, ...]) -> tuple[list[Any], Any, list[NamedSharding]]:
+        """Return the arrays of the arguments, their structure, and where each array is wanted."""
         refuse_explicit_axes(args)
         leaves, structure = jax.tree.flatten(args)
-        known = self._known.get(structure)
-        if known is None:
-            known = self._known[structure] = _Program(self, args, structure)
-        return leaves, known
+        if structure not in self._known:
+            if isinstance(self._axes, tuple) and len(self._axes) != len(args):
+                raise OsikValueError(f"in_axes has {len(self._axes)} parts, for {len(args)} arguments")
+            places = jax.tree.map(
+                lambda axis: NamedSharding(self.mesh, self._spec(axis)), self._axes, is_leaf=lambda axis: axis is None
+            )
+            self._known[structure] = jax.tree.leaves(jax.tree.broadcast(places, args))
+        return leaves, structure, self._known[structure]
+
+    def _spec(self, axis: int | None) -> PartitionSpec:
+        if axis is not None and axis < 0:
+            raise OsikValueError(f"in_axes has axis {axis}; axes count from the first, 0")
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, self.mesh.axis_names)
 
 
-class _Program:
-    """Compiled function of arrays, for arguments of one structure.
+_NUMBERS = (bool, int, float, complex)
 
-    Attributes:
-        structure: of the arguments.
-        axes: for each array, ``_SHARED`` where it is not split.
-        places: where each array is wanted.
-        run: the compiled function; takes what is elsewhere from the host, but not from another device.
-    """
 
-    def __init__(self, owner: ShardedFunction, args: tuple[Any, ...], structure: Any):
-        self.structure, self.axes = structure, _flat_axes(owner.in_axes, args)
-        self._split = [(i, axis) for i, axis in enumerate(self.axes) if axis != _SHARED]
-        names = owner.mesh.axis_names
-        specs = [PartitionSpec(*[None] * axis, names) if axis != _SHARED else PartitionSpec() for axis in self.axes]
-        self.places = [NamedSharding(owner.mesh, spec) for spec in specs]
-        ends = np.cumsum([0, *(argument.num_leaves for argument in structure.children())])
-        donated = [i for k in owner._donated for i in range(ends[k], ends[k + 1])]
-        axes = [None if axis == _SHARED else axis for axis in self.axes]
+def _axis(place: NamedSharding) -> int:
+    """Return the axis that is split, or -1 where every device has the whole array."""
+    return len(place.spec) - 1
 
-        lane = _making_empty_arrays(lambda *own: owner.function(*jax.tree.unflatten(structure, own)))
 
-        # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
-        mapped = jax.shard_map(
-            jax.vmap(lane, in_axes=tuple(axes)),
-            mesh=owner.mesh,
-            in_specs=tuple(specs),
-            out_specs=PartitionSpec(names),
-            check_vma=False,
-        )
-        self.run = jax.jit(mapped, in_shardings=self.places, donate_argnums=donated)
+def _count_lanes(leaves: list[Any], places: list[NamedSharding]) -> int:
+    lengths: set[int] = set()
+    for leaf, axis in zip(leaves, map(_axis, places), strict=True):
+        shape = np.shape(leaf)
+        if axis >= len(shape):
+            raise OsikValueError(f"in_axes has axis {axis} for an array of shape {shape}")
+        lengths |= {shape[axis]} if axis >= 0 else set()
+    if len(lengths) != 1 or 0 in lengths:
+        found = ", ".join(str(n) for n in sorted(lengths)) or "none, for in_axes splits no argument"
+        raise OsikValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
+    return lengths.pop()
 
-    def count(self, leaves: list[Any]) -> int:
-        """Return the number of lanes."""
-        lengths: set[int] = set()
-        for i, axis in self._split:
-            shape = np.shape(leaves[i])
-            if not 0 <= axis < len(shape):
-                raise OsikValueError(f"in_axes has axis {axis} for an array of shape {shape}")
-            lengths.add(shape[axis])
-        if len(lengths) != 1 or 0 in lengths:
-            found = ", ".join(str(n) for n in sorted(lengths)) or "none, for in_axes splits no argument"
-            raise OsikValueError(f"the arguments that are split need one number of lanes, at least 1; found: {found}")
-        return lengths.pop()
 
-    def reachable(self, leaves: list[Any]) -> list[Any]:
-        """Return the arrays; those whose sharding ``run`` does not accept are moved."""
-        if jax.process_count() > 1:
-            return self.placed(leaves)
-        return self._with_moved(leaves, [isinstance(a, jax.Array) and not isinstance(a, Tracer) for a in leaves])
+def _filled(a: Any, axis: int, missing: int) -> Any:
+    """Return an array with its last lane repeated ``missing`` times."""
+    if axis < 0:
+        return a
+    xp = np if isinstance(a, np.ndarray) else jnp
+    last = xp.take(a, xp.asarray([a.shape[axis] - 1]), axis=axis)
+    return xp.concatenate([a, xp.repeat(last, missing, axis=axis)], axis=axis)
 
-    def placed(self, leaves: list[Any]) -> list[Any]:
-        """Return the arrays with the wanted shardings; Python numbers stay, because they adapt to any precision."""
-        return self._with_moved(leaves, [not isinstance(a, (bool, int, float, complex)) for a in leaves])
 
-    def _with_moved(self, leaves: list[Any], wanted: list[bool]) -> list[Any]:
-        """Return the arrays; selected ones without the wanted sharding are moved."""
-        pairs = zip(leaves, self.places, strict=True)
-        away = [i for i, (a, place) in enumerate(pairs) if wanted[i] and not _is_there(a, place)]
-        there = moved([leaves[i] for i in away], [self.places[i] for i in away])
-        whole = list(leaves)
-        for i, a in zip(away, there, strict=True):
-            whole[i] = a
-        return whole
+def _moved(leaves: list[Any], places: list[NamedSharding], wanted: list[bool]) -> list[Any]:
+    """Return the arrays; those that are wanted on other devices than where they are, are moved."""
+    pairs = zip(leaves, places, wanted, strict=True)
+    away = [i for i, (a, place, here) in enumerate(pairs) if here and not _is_there(a, place)]
+    if not away:
+        return leaves
+    some, there = [leaves[i] for i in away], [places[i] for i in away]
+    if jax.process_count() == 1:
+        new = jax.device_put(some, there)
+    else:
+        new = [_on_all_hosts(a, place) for a, place in zip(some, there, strict=True)]
+    replaced = dict(zip(away, new, strict=True))
+    return [replaced.get(i, leaf) for i, leaf in enumerate(leaves)]
+
+
+def _is_there(leaf: Any, place: NamedSharding) -> bool:
+    """Return whether an array has the wanted sharding."""
+    if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or not leaf.committed:
+        return False
+    return leaf.sharding == place or leaf.sharding.is_equivalent_to(place, leaf.ndim)  # a spec has several spellings
+
+
+def _on_all_hosts(a: Any, place: NamedSharding) -> Any:
+    """Return a global array from the whole array on each host; each host takes its part without communication."""
+    if isinstance(a, Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
+        return jax.device_put(a, place)
+    whole = np.asarray(a, jax.dtypes.canonicalize_dtype(a.dtype))
+    return jax.make_array_from_callback(whole.shape, place, lambda part: whole[part])
 
 
 def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -190,49 +203,7 @@ def _making_empty_arrays(function: Callable[..., Any]) -> Callable[..., Any]:
     def inside(*args: Any) -> Any:
         traced, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
         traced = traced.replace(consts=[anew(a) for a in traced.consts])
-        results = jaxpr_as_fun(traced)(*(anew(a) for a in args))
+        results = jaxpr_as_fun(traced)(*map(anew, jax.tree.leaves(args)))
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
     return inside
-
-
-def _flat_axes(in_axes: Any, args: tuple[Any, ...]) -> list[int]:
-    if isinstance(in_axes, (tuple, list)):
-        if len(in_axes) != len(args):
-            raise OsikValueError(f"in_axes has {len(in_axes)} parts, for {len(args)} arguments")
-        in_axes = tuple(in_axes)
-    marked = jax.tree.map(lambda axis: _SHARED if axis is None else axis, in_axes, is_leaf=lambda axis: axis is None)
-    return jax.tree.leaves(jax.tree.broadcast(marked, args))
-
-
-def _is_there(leaf: Any, place: NamedSharding) -> bool:
-    """Return whether an array has the wanted sharding."""
-    if not isinstance(leaf, jax.Array) or isinstance(leaf, Tracer) or not leaf.committed:
-        return False
-    return leaf.sharding == place or leaf.sharding.is_equivalent_to(place, leaf.ndim)  # a spec has several spellings
-
-
-def moved(leaves: list[Any], places: list[NamedSharding]) -> list[Any]:
-    """Return arrays with the wanted shardings, over all hosts; each host has the whole arrays."""
-    if not leaves:
-        return []
-    if jax.process_count() == 1:
-        return jax.device_put(leaves, places)
-    return [_on_all_hosts(a, place) for a, place in zip(leaves, places, strict=True)]
-
-
-def _filled(a: Any, axis: int, missing: int) -> Any:
-    """Return an array with its last lane repeated ``missing`` times."""
-    if axis == _SHARED:
-        return a
-    xp = np if isinstance(a, np.ndarray) else jnp
-    last = xp.take(a, xp.asarray([a.shape[axis] - 1]), axis=axis)
-    return xp.concatenate([a, xp.repeat(last, missing, axis=axis)], axis=axis)
-
-
-def _on_all_hosts(a: Any, place: NamedSharding) -> Any:
-    """Return a global array from the whole array on each host; each host takes its part without communication."""
-    if isinstance(a, Tracer) or (isinstance(a, jax.Array) and not a.is_fully_addressable):
-        return jax.device_put(a, place)
-    whole = np.asarray(a, jax.dtypes.canonicalize_dtype(a.dtype))
-    return jax.make_array_from_callback(whole.shape, place, lambda part: whole[part])

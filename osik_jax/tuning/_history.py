@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from .._errors import OsikValueError
 from .._npz import open_npz
 from .._whole_file import whole_file
-from ._parameters import ParameterSpace
 
 _FORMAT = 1
 
@@ -54,61 +53,38 @@ class History:
         loss = np.where(np.isfinite(self.loss), self.loss, np.inf)
         return int(np.lexsort((loss, self.dropped))[0])
 
-    def stale(self, improvement: float) -> int:
-        """Return the number of iterations since the best loss fell by a fraction, or fewer scenarios were dropped."""
-        last, best, fewest = 0, np.inf, np.inf
-        for k, (loss, dropped) in enumerate(zip(self.loss, self.dropped, strict=True)):
-            if dropped < fewest or (dropped == fewest and loss < best * (1.0 - improvement)):
-                last, best, fewest = k, loss, dropped
-        return len(self) - 1 - last
-
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """State to resume a tuning: next parameters, optimiser state and history."""
+    """State to resume a tuning."""
 
     vector: Any  # parameters of the next iteration, in the space that the optimiser moves in. (p,)
     optimizer: Any  # the optimiser's state
     history: History  # of the iterations so far
 
 
-def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
-    """Write a state as .npz; it replaces an older file only when it is complete."""
+def save_state(path: str | os.PathLike[str], state: State, names: tuple[str, ...]) -> None:
+    """Write a state of parameters of these names as .npz; it replaces an older file only when it is complete."""
     arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
     arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
-    arrays |= {f"space/{name}": value for name, value in _described(space).items()}
+    arrays |= {"format": np.array(_FORMAT), "vector": np.asarray(state.vector), "space/names": np.array(names)}
     with whole_file(path) as file:
-        np.savez(file, allow_pickle=False, format=_FORMAT, vector=np.asarray(state.vector), **arrays)
+        np.savez(file, allow_pickle=False, **arrays)
 
 
-def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:
-    """Return a state that ``save_state`` wrote.
-
-    ``space`` is that of the saved state; ``optimizer`` is the first state of the optimiser, for its structure.
-    """
+def load_state(path: str | os.PathLike[str], names: tuple[str, ...], optimizer: Any) -> State:
+    """Return a state that ``save_state`` wrote; ``optimizer`` is the first state of the optimiser."""
     with open_npz(path) as file:
         arrays = dict(file)
     if arrays.get("format") != _FORMAT:
         raise OsikValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")
-    for name, value in _described(space).items():
-        saved = arrays[f"space/{name}"]
-        if saved.shape != value.shape or not (saved == value).all():
-            raise OsikValueError(
-                f"the parameters are not those saved in {os.fspath(path)}: {name} {saved}, now {value}"
-            )
-    history = History(**{name: arrays[f"history/{name}"] for name in History.__dataclass_fields__})
-    return State(jnp.asarray(arrays["vector"]), _restored(arrays, optimizer, path), history)
-
-
-def _described(space: ParameterSpace) -> dict[str, np.ndarray]:
-    return {"names": np.array(space.names)} | {
-        name: np.asarray(getattr(space, name)) for name in ("log", "lower", "upper", "scale")
-    }
-
-
-def _restored(arrays: dict[str, np.ndarray], optimizer: Any, path: str | os.PathLike[str]) -> Any:
+    saved = tuple(arrays["space/names"].tolist())
+    if saved != names:
+        raise OsikValueError(f"the parameters are not those saved in {os.fspath(path)}: {saved}, now {names}")
     leaves, structure = jax.tree.flatten(optimizer)
-    saved = [arrays[f"optimizer/{i}"] for i in range(sum(name.startswith("optimizer/") for name in arrays))]
-    if [leaf.shape for leaf in saved] != [np.shape(leaf) for leaf in leaves]:
+    memory = [arrays[f"optimizer/{i}"] for i in range(sum(name.startswith("optimizer/") for name in arrays))]
+    if [leaf.shape for leaf in memory] != [np.shape(leaf) for leaf in leaves]:
         raise OsikValueError(f"{os.fspath(path)} was saved with another optimizer: it has arrays of other shapes")
-    return jax.tree.unflatten(structure, [jnp.asarray(new, old.dtype) for new, old in zip(saved, leaves, strict=True)])
+    memory = [jnp.asarray(new, old.dtype) for new, old in zip(memory, leaves, strict=True)]
+    history = History(**{name: arrays[f"history/{name}"] for name in History.__dataclass_fields__})
+    return State(jnp.asarray(arrays["vector"]), jax.tree.unflatten(structure, memory), history)

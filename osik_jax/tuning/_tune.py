@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from .._errors import OsikTypeError, OsikValueError, missing_extra
 from .._progress import progress_bar
 from ..batching._structure import Static, put_together, taken_apart
-from ._evaluate import Evaluation, Problem, check_loss, check_mesh, chunk_size, replicas, replicated, shares
+from ._evaluate import Evaluation, Problem, check_loss, chunk_size
 from ._history import History, State, load_state, save_state
-from ._loop import Loop
+from ._loop import Loop, Scenarios
 from ._losses import LossFunction
 from ._parameters import Parameter, ParameterSpace, overlap
-from ._scenarios import Scenarios
 
 try:
     import optax
@@ -46,13 +44,7 @@ class Tuning:
     held_out: float
     iteration: int
     history: History
-    stopped: str
     space: ParameterSpace
-    state: State
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the state as .npz, to go on from: ``tune(..., resume=path)``."""
-        save_state(path, self.state, self.space)
 
 
 def tune(
@@ -64,14 +56,10 @@ def tune(
     held_out: Scenarios | None = None,
     optimizer: optax.GradientTransformation | None = None,
     iterations: int = 100,
-    patience: int | None = None,
-    improvement: float = 1e-3,
     chunk: int | None = None,
-    mesh: Mesh | None = None,
-    resume: Tuning | str | os.PathLike[str] | None = None,
+    resume: str | os.PathLike[str] | None = None,
     save: str | os.PathLike[str] | None = None,
     progress: bool = True,
-    callback: Callable[[History], None] | None = None,
 ) -> Tuning:
     """Lower the mean loss of a closed loop over scenarios, by the gradient through its rollouts.
 
@@ -85,16 +73,11 @@ def tune(
         optimizer: any of optax's, or a chain of them; also those that ask for values, as line searches do.
             Default: ``optax.adam(LEARNING_RATE)``.
         iterations: gradients taken, those of a resumed state among them.
-        patience: stops after so many iterations without a better training loss; None: never.
-        improvement: a share by which a loss has to be lower to be better, for ``patience``.
-        chunk: scenarios that run at a time on a device. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
-        mesh: devices that the scenarios are split over, such as ``jax.sharding.Mesh(jax.devices(), ("lanes",))``. Each
-            has all parameters, and gradients are summed over them. Default: one device.
-        resume: goes on from this result, or from a file that ``save`` wrote; the loss, the scenarios and the numbers
-            that are not tuned may be others, the parameters and the optimiser may not.
-        save: a .npz file, written after each iteration; where there are several processes, by the first.
+        chunk: scenarios that run at a time. Fewer take less memory. Default: 64 on a CPU, all elsewhere.
+        resume: goes on from a file that ``save`` wrote; the loss, the scenarios and the numbers that are not tuned may
+            be others, the parameters and the optimiser may not.
+        save: a .npz file, written after each iteration.
         progress: whether to show a bar with the loss.
-        callback: told the history after each iteration.
 
     Returns:
         The best loop and the history. The best iteration has the lowest training loss; held-out scenarios do not
@@ -109,9 +92,7 @@ def tune(
             over the scenarios kept (k,); ``dropped`` and ``held_out_dropped``, numbers of scenarios not kept (k,);
             ``gradient_norm``, of the mean loss in the space that the optimiser moves in (k,); ``seconds``, the first
             compiles (k,); ``vectors``, the parameters in that space (k, p); ``best``, the iteration.
-        - ``stopped``: ``"iterations"`` or ``"patience"``.
         - ``space``: maps between parameters and the vector without bounds that the optimiser moves.
-        - ``state``: to go on from with ``tune(..., resume=tuned)``; ``save(path)`` writes it as .npz.
 
         A scenario whose loss or gradient is not finite, or in which a
         step failed on a NaN, is left out of that iteration's mean, and counted in ``history.dropped``.
@@ -122,26 +103,21 @@ def tune(
         ValueError: parameters, bounds, scenarios or a saved state that do not fit; no training scenario can be kept.
     """
     check_loss(loss)
-    check_mesh(mesh)
     space = ParameterSpace(loop, parameters)
     overlap(space, loop, scenarios.values | (held_out.values if held_out is not None else {}))
     rule = _optimizer(optimizer)
-    state = _first_state(space, rule, resume)
-    step = _compiled_step(Problem(loss, loop, space, mesh), scenarios, held_out, rule, chunk)
-    stopped = "iterations"
-    with reported(iterations, shown=progress and jax.process_index() == 0) as show:
-        show(state.history)
+    state = State(space.initial, rule.init(space.initial), History.empty(len(space.names)))
+    if resume is not None:
+        state = load_state(resume, space.names, state.optimizer)
+    step = _compiled_step(Problem(loss, loop, space), scenarios, held_out, rule, chunk)
+    bar = progress_bar(iterations, len(state.history), unit="iterations") if progress else nullcontext(lambda *_: None)
+    with bar as show:
         while len(state.history) < iterations:
             state = step(state)
-            if save is not None and jax.process_index() == 0:
-                save_state(save, state, space)
-            show(state.history)
-            if callback is not None:
-                callback(state.history)
-            if patience is not None and state.history.stale(improvement) >= patience:
-                stopped = "patience"
-                break
-    return _result(loop, space, state, stopped)
+            if save is not None:
+                save_state(save, state, space.names)
+            show(len(state.history), _described(state.history))
+    return _result(loop, space, state.history)
 
 
 def _optimizer(given: Any) -> optax.GradientTransformationExtraArgs:
@@ -152,19 +128,6 @@ def _optimizer(given: Any) -> optax.GradientTransformationExtraArgs:
     return optax.with_extra_args_support(given)
 
 
-def _first_state(space: ParameterSpace, optimizer: optax.GradientTransformationExtraArgs, resume: Any) -> State:
-    fresh = State(space.initial, optimizer.init(space.initial), History.empty(len(space.names)))
-    if resume is None:
-        return fresh
-    if not isinstance(resume, Tuning):
-        return load_state(resume, space, fresh.optimizer)
-    if resume.space.names != space.names:
-        raise OsikValueError(f"the parameters are not those to resume: {resume.space.names}, now {space.names}")
-    if jax.tree.structure(resume.state.optimizer) != jax.tree.structure(fresh.optimizer):
-        raise OsikValueError("the optimizer is not the one to resume: its state has another structure")
-    return resume.state
-
-
 def _compiled_step(
     problem: Problem,
     scenarios: Scenarios,
@@ -173,17 +136,14 @@ def _compiled_step(
     chunk: int | None,
 ) -> Callable[[State], State]:
     """Return one iteration, on the host."""
-    mesh = problem.mesh
     numbers, static = taken_apart(problem)
-    numbers = replicas(numbers, mesh)
-    given = [scenarios] if held_out is None else [scenarios, held_out]
-    batches = [shares(each.fitted(problem.loop), mesh) for each in given]
-    chunks = tuple(chunk_size(chunk, len(each), mesh) for each in given)
+    batches = [each.fitted(problem.loop) for each in (scenarios, held_out) if each is not None]
+    chunks = tuple(chunk_size(chunk, len(each)) for each in batches)
 
     def step(state: State) -> State:
         start = time.perf_counter()
-        at, memory = replicas((state.vector, state.optimizer), mesh)
-        vector, memory, row = _step(numbers, at, memory, batches, static=static, chunks=chunks, optimizer=optimizer)
+        options: Any = dict(static=static, chunks=chunks, optimizer=optimizer)
+        vector, memory, row = _step(numbers, state.vector, state.optimizer, batches, **options)
         row = {name: np.asarray(value) for name, value in row.items()}
         if row["dropped"] == len(scenarios):
             raise OsikValueError(
@@ -231,11 +191,10 @@ def _step(
         "held_out_dropped": held.dropped,
         "gradient_norm": jnp.linalg.norm(gradient),
     }
-    return replicated((vector + updates, memory, row), problem.mesh)
+    return vector + updates, memory, row
 
 
-def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tuning:
-    history = state.history
+def _result(loop: Loop, space: ParameterSpace, history: History) -> Tuning:
     if not len(history):
         raise OsikValueError("iterations is 0: there is nothing to report")
     best = history.best
@@ -247,28 +206,14 @@ def _result(loop: Loop, space: ParameterSpace, state: State, stopped: str) -> Tu
         held_out=float(history.held_out[best]),
         iteration=best,
         history=history,
-        stopped=stopped,
         space=space,
-        state=state,
     )
 
 
-@contextlib.contextmanager
-def reported(iterations: int, *, shown: bool) -> Iterator[Callable[[History], None]]:
-    """Yield a function that takes the history after each iteration; it draws a bar if wanted."""
-    if not shown:
-        yield lambda history: None
-        return
-    with progress_bar(iterations, unit="iterations") as update:
-        yield lambda history: update(len(history), describe(history))
-
-
-def describe(history: History) -> str:
+def _described(history: History) -> str:
     """Return the last iteration in a line."""
-    if not len(history):
-        return "compiling"
     parts = [f"loss {history.loss[-1]:.3e}", f"best {history.loss[history.best]:.3e}"]
-    if history.held_out[-1] == history.held_out[-1]:
+    if np.isfinite(history.held_out[-1]):
         parts.append(f"held out {history.held_out[-1]:.3e}")
     lost = int(history.dropped[-1] + history.held_out_dropped[-1])
     return ", ".join(parts + ([f"{lost} dropped"] if lost else []))

@@ -5,9 +5,5 @@ Not imported with the package, because it loads matplotlib.
 
 from ._animate import animate as animate
 from ._figures import hero_picture as hero_picture
-from .live import Session as Session
-from .live import export_html as export_html
-from .live import load_session as load_session
-from .live import serve as serve
-from .live import serve_batch as serve_batch
-from .live import serve_reach as serve_reach
+from .live._page import serve as serve
+from .live._playback import export_html as export_html

@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -19,14 +19,15 @@ from PIL import Image
 from .._errors import OsikValueError
 from ..robot import Robot
 from ..robot._mujoco import mujoco_frame_pose, mujoco_poses, robot_com
-from ._outline import floor_height
-from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, PlanPanel, polygon_layer
-from ._parts import RobotParts, Style, robot_parts
+from ._overlay import BLUE, INK, Canvas, ComMark, CurvePanel, polygon_layer
+from ._parts import RobotParts, floor_height, robot_parts
 from ._raycast import RayCaster
-from ._stage import Stage, frame_camera
+from ._stage import Camera, Stage, frame_camera
 
 Values = Mapping[str, Float[np.ndarray, " T"]]
 Polygons = Sequence[Float[np.ndarray, "m 2"]]
+Mark = Callable[[int], object]
+"""Function that moves what is drawn over the stage to a picture, by its number."""
 
 
 def animate(
@@ -37,7 +38,6 @@ def animate(
     dt: float,
     frames_per_second: float = 12.5,
     size: tuple[int, int] = (720, 405),
-    style: Style = "auto",
     support: Polygons | Float[np.ndarray, "m 2"] | None = None,
     trails: Sequence[str] = (),
     curves: Values | None = None,
@@ -56,11 +56,10 @@ def animate(
         dt: time between two configurations [s].
         frames_per_second: at most so many pictures a second are taken from ``q``.
         size: width and height [pixels].
-        style: ``"geoms"``, ``"sticks"``, or ``"auto"``: what its URDF shows, else geoms, else sticks.
         support: vertices of the support polygon [m], one (m, 2) for all times or one a configuration. With it, the
-            centre of mass is drawn too, and a panel shows both from above.
+            centre of mass is drawn too.
         trails: frames whose paths are drawn.
-        curves: values over time for a second panel, by name; one value a configuration. Each (T,)
+        curves: values over time for a panel, by name; one value a configuration. Each (T,)
         wanted: the same for what the controller was asked for, drawn dashed.
         curves_title: title of that panel, with the unit.
         caption: a line at the top.
@@ -78,23 +77,30 @@ def animate(
     _check_path(path)
     stride = max(1, round(1.0 / (frames_per_second * dt)))
     frames = np.arange(0, len(q), stride)
-    film = _Film(
-        robot,
-        np.asarray(q),
-        frames,
-        frames * dt,
-        size,
-        robot_parts(robot, style=style),
-        _each(support, frames),
-        trails,
-        curves,
-        wanted or {},
-        curves_title,
-        caption,
-        azimuth,
-        elevation,
+    q, time = np.asarray(q)[frames], frames * dt
+    shape, polygons = robot_parts(robot), _each(support, frames)
+    seen, com, paths = _survey(robot, q, shape, trails)
+    floor = floor_height(robot, shape, mujoco_poses(robot, q))
+    corners = np.concatenate([np.zeros((0, 2)), *(polygons or ())])
+    seen = np.concatenate([seen, np.column_stack([corners, np.full(len(corners), floor)])])
+    window = (0.04, 0.54 if curves else 0.96, 0.10 if caption else 0.04, 0.92)
+    camera, canvas = frame_camera(seen, size, azimuth, elevation, window), Canvas(size)
+    scale = size[1] / 450
+    canvas.title(16, 26 * scale, caption, fontsize=11 * scale)
+    marks = [_clock(canvas, time, scale), *(_trail(canvas, camera.project(path, size)) for path in paths)]
+    if polygons is not None:
+        mark = ComMark(canvas, camera, floor=floor)
+        marks.append(lambda frame: mark.place(com[frame]))
+    if curves:
+        values, dashed = ({name: v[frames] for name, v in group.items()} for group in (curves, wanted or {}))
+        marks.append(CurvePanel(canvas, (0.60, 0.32, 0.38, 0.29), curves_title, time, values, dashed).place)
+    stage = Stage([shape])
+    jobs = zip(
+        (stage.pose([source]) for source in mujoco_poses(robot, q)),
+        _floor_layers(polygons, camera, size, floor) if polygons is not None else [None] * len(q),
+        strict=True,
     )
-    pictures = film.pictures()
+    pictures = _pictures(RayCaster(stage, camera, size, floor=floor), jobs, canvas, marks)
     if path.suffix == ".gif":
         write_gif(path, pictures, stride * dt)
     else:
@@ -118,121 +124,67 @@ def _each(support: Polygons | Float[np.ndarray, "m 2"] | None, frames: np.ndarra
     return [np.asarray(support[min(k, len(support) - 1)]) for k in frames]
 
 
-class _Film:
-    """Data of an animation that is the same in all pictures."""
+def _survey(
+    robot: Robot, q: Float[np.ndarray, "T nq"], shape: RobotParts, trails: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Return the points [m] that the camera must see, the centres of mass and the points of each trail."""
+    points, com, paths = [], [], []
+    for data in mujoco_poses(robot, q):
+        points.append(shape.corners(data))
+        com.append(robot_com(robot, data))
+        paths.append([mujoco_frame_pose(robot, data, name)[0] for name in trails])
+    seen = np.concatenate([*points, *(place for place in paths if len(place))])
+    return seen, np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
 
-    def __init__(
-        self,
-        robot: Robot,
-        q: np.ndarray,
-        frames: np.ndarray,
-        time: np.ndarray,
-        size: tuple[int, int],
-        shape: RobotParts,
-        support: Polygons | None,
-        trails: Sequence[str],
-        curves: Values | None,
-        wanted: Values,
-        curves_title: str,
-        caption: str,
-        azimuth: float,
-        elevation: float,
-    ) -> None:
-        self._robot, self._q, self._size, self._time = robot, q[frames], size, time
-        self._shape = shape
-        self._support = support
-        points, com, paths = self._survey(trails)
-        self._com, self._paths = com, paths
-        panels = (support is not None) + bool(curves)
-        self._floor = floor_height(robot, shape, mujoco_poses(robot, self._q))
-        window = (0.04, 0.54 if panels else 0.96, 0.10 if caption else 0.04, 0.92)
-        self._camera = frame_camera(np.concatenate([points, self._on_floor()]), size, azimuth, elevation, window)
-        self._stage = Stage([self._shape])
-        self._renderer = RayCaster(self._stage, self._camera, size, floor=self._floor)
-        self._canvas = Canvas(size)
-        self._add_text(caption)
-        self._add_marks()
-        self._add_panels(curves, wanted, curves_title, frames)
-        self._under: tuple[Float[np.ndarray, "m 2"], np.ndarray] | None = None
 
-    def _survey(self, trails: Sequence[str]) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return the points [m] that the camera must see, the centres of mass and the points of each trail."""
-        points, com, paths = [], [], []
-        for data in mujoco_poses(self._robot, self._q):
-            points.append(self._shape.corners(data))
-            com.append(robot_com(self._robot, data))
-            paths.append([mujoco_frame_pose(self._robot, data, name)[0] for name in trails])
-        seen = np.concatenate([*points, *(place for place in paths if len(place))])
-        return seen, np.array(com), list(np.swapaxes(np.array(paths), 0, 1)) if trails else []
+def _clock(canvas: Canvas, time: Float[np.ndarray, " T"], scale: float) -> Mark:
+    """Add the time of the picture."""
+    clock = canvas.page.text(16, canvas.size[1] - 14 * scale, "", fontsize=9 * scale, color=INK, family="monospace")
+    canvas.moving(clock)
+    return lambda frame: clock.set_text(f"t = {time[frame]:5.2f} s")
 
-    def _on_floor(self) -> Float[np.ndarray, "points 3"]:
-        """Return the corners of the support polygons on the floor [m]."""
-        corners = np.concatenate([np.zeros((0, 2)), *(self._support or ())])
-        return np.column_stack([corners, np.full(len(corners), self._floor)])
 
-    def _add_text(self, caption: str) -> None:
-        scale = self._size[1] / 450
-        self._canvas.title(16, 26 * scale, caption, fontsize=11 * scale)
-        self._clock = self._canvas.page.text(
-            16, self._size[1] - 14 * scale, "", fontsize=9 * scale, color=INK, family="monospace"
-        )
-        self._canvas.moving(self._clock)
+def _trail(canvas: Canvas, path: Float[np.ndarray, "T 2"]) -> Mark:
+    """Add the path of a frame up to the present picture [pixels]."""
+    (line,) = canvas.page.plot([], [], color=BLUE, lw=2.0, alpha=0.85)
+    canvas.moving(line)
+    return lambda frame: line.set_data(path[: frame + 1, 0], path[: frame + 1, 1])
 
-    def _add_marks(self) -> None:
-        self._trail_lines = []
-        for path in self._paths:
-            (line,) = self._canvas.page.plot([], [], color=BLUE, lw=2.0, alpha=0.85)
-            self._canvas.moving(line)
-            self._trail_lines.append((line, self._camera.project(path, self._size)))
-        self._mark = None if self._support is None else ComMark(self._canvas, self._camera, floor=self._floor)
 
-    def _add_panels(self, curves: Values | None, wanted: Values, title: str, frames: np.ndarray) -> None:
-        self._panels: list[PlanPanel | CurvePanel] = []
-        if self._support is not None:
-            self._panels.append(PlanPanel(self._canvas, (0.60, 0.53, 0.38, 0.36), self._support, self._com))
-        if curves:
-            values, dashed = ({name: v[frames] for name, v in group.items()} for group in (curves, wanted))
-            bottom = 0.115 if self._support is not None else 0.32
-            place = (0.60, bottom, 0.38, 0.29)
-            self._panels.append(CurvePanel(self._canvas, place, title, self._time, values, dashed))
+def _floor_layers(
+    polygons: Polygons, camera: Camera, size: tuple[int, int], floor: float
+) -> Iterator[Float[np.ndarray, "height width 4"]]:
+    """Yield the support polygon painted on the floor for each picture; it is drawn anew only when it changes."""
+    drawn, layer = None, np.zeros((0, 0, 4))
+    for vertices in polygons:
+        if drawn is None or not np.array_equal(drawn, vertices):
+            drawn, layer = vertices, polygon_layer([vertices], camera, size, floor=floor)
+        yield layer
 
-    def pictures(self) -> Iterator[np.ndarray]:
-        """Yield the pictures, (height, width, 3) uint8; the stage is drawn ahead, one picture per core."""
-        stages = (self._stage.pose([source]) for source in mujoco_poses(self._robot, self._q))
-        layers = (self._floor_layer(frame) for frame in range(len(self._q)))
-        for frame, base in enumerate(self._draw(zip(stages, layers, strict=True))):
-            self._move(frame)
-            yield paint_over(base, self._canvas.picture())
 
-    def _draw(self, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
-        """Yield pictures of the stage in order."""
-        cores = os.cpu_count() or 1
-        with ThreadPoolExecutor(cores) as pool:
-            ahead: deque[Future[np.ndarray]] = deque()
-            for job in jobs:
-                ahead.append(pool.submit(self._renderer.image, *job))
-                if len(ahead) > cores:
-                    yield ahead.popleft().result()
-            while ahead:
+def _pictures(
+    renderer: RayCaster,
+    jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]],
+    canvas: Canvas,
+    marks: Sequence[Mark],
+) -> Iterator[np.ndarray]:
+    """Yield the pictures, (height, width, 3) uint8; the stage is drawn ahead, one picture per core."""
+    for frame, base in enumerate(_drawn_ahead(renderer, jobs)):
+        for place in marks:
+            place(frame)
+        yield paint_over(base, canvas.picture())
+
+
+def _drawn_ahead(renderer: RayCaster, jobs: Iterable[tuple[mujoco.MjData, np.ndarray | None]]) -> Iterator[np.ndarray]:
+    cores = os.cpu_count() or 1
+    with ThreadPoolExecutor(cores) as pool:
+        ahead: deque[Future[np.ndarray]] = deque()
+        for job in jobs:
+            ahead.append(pool.submit(renderer.image, *job))
+            if len(ahead) > cores:
                 yield ahead.popleft().result()
-
-    def _floor_layer(self, frame: int) -> np.ndarray | None:
-        """Return the support polygon painted on the floor, redrawn only when it changes."""
-        if self._support is None:
-            return None
-        vertices = self._support[frame]
-        if self._under is None or not np.array_equal(self._under[0], vertices):
-            self._under = vertices, polygon_layer([vertices], self._camera, self._size, floor=self._floor)
-        return self._under[1]
-
-    def _move(self, frame: int) -> None:
-        self._clock.set_text(f"t = {self._time[frame]:5.2f} s")
-        for line, path in self._trail_lines:
-            line.set_data(path[: frame + 1, 0], path[: frame + 1, 1])
-        if self._mark is not None:
-            self._mark.place(self._com[frame])
-        for panel in self._panels:
-            panel.place(frame)
+        while ahead:
+            yield ahead.popleft().result()
 
 
 def paint_over(base: Float[np.ndarray, "height width 3"], layer: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
@@ -94,56 +93,6 @@ class ComMark:
         self._foot.set_data([x1], [y1])
 
 
-def card(canvas: Canvas, rectangle: tuple[float, float, float, float], title: str) -> Axes:
-    """Return axes for a panel on a light card.
-
-    ``rectangle``: left, bottom, width and height as shares of the picture.
-    """
-    axes = canvas.figure.add_axes(rectangle)
-    axes.set_facecolor(_CARD)
-    axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
-    axes.tick_params(labelsize=7, colors=INK, length=2.5, width=0.7)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#9aa3ad")
-        axes.spines[side].set_linewidth(0.8)
-    return axes
-
-
-class PlanPanel:
-    """Top view of the ground, x up and y left: support polygon, path of the centre of mass, and its current place."""
-
-    def __init__(
-        self,
-        canvas: Canvas,
-        rectangle: tuple[float, float, float, float],
-        support: Sequence[Float[np.ndarray, "m 2"]],
-        com: Float[np.ndarray, "frames 3"],
-    ) -> None:
-        """Draw the static part; lengths in mm."""
-        self._com, self._support = 1e3 * com[:, :2], [1e3 * vertices for vertices in support]
-        axes = card(canvas, rectangle, "support and centre of mass from above [mm]")
-        points = np.concatenate([self._com, *self._support])
-        # space around polygon and path inside the panel
-        room = 0.06 * np.ptp(points, axis=0).max()
-        low, high = points.min(0) - room, points.max(0) + room
-        axes.set_aspect("equal", adjustable="box", anchor="W")
-        axes.set_xlim(high[1], low[1])
-        axes.set_ylim(low[0], high[0])
-        self._patch = Polygon(self._support[0][:, ::-1], facecolor=to_rgba(GREEN, 0.18), edgecolor=GREEN, lw=1.4)
-        axes.add_patch(self._patch)
-        (self._path,) = axes.plot([], [], color=ORANGE, lw=1.3, alpha=0.8)
-        (self._dot,) = axes.plot([], [], "o", ms=6.5, mfc=ORANGE, mec="white", mew=1.2)
-        canvas.moving(self._patch, self._path, self._dot)
-
-    def place(self, frame: int) -> None:
-        """Move the dot to a frame."""
-        self._patch.set_xy(self._support[min(frame, len(self._support) - 1)][:, ::-1])
-        self._path.set_data(self._com[: frame + 1, 1], self._com[: frame + 1, 0])
-        self._dot.set_data([self._com[frame, 1]], [self._com[frame, 0]])
-
-
 class CurvePanel:
     """Curves over time, drawn up to the current frame; dashed references are drawn from the start."""
 
@@ -158,7 +107,12 @@ class CurvePanel:
     ) -> None:
         """Draw the static part; each curve has one value per frame."""
         self._time, self._curves, self._lines = time, list(curves.values()), []
-        axes = card(canvas, rectangle, title)
+        axes = canvas.figure.add_axes(rectangle)
+        axes.set_facecolor(_CARD)
+        axes.set_title(title, loc="left", fontsize=8.5, color=INK, pad=4)
+        axes.tick_params(labelsize=7, colors=INK, length=2.5, width=0.7)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set(color="#9aa3ad", linewidth=0.8)
         values = np.concatenate([*curves.values(), *wanted.values()])
         room = max(np.ptp(values), _LEAST_RANGE)
         middle = 0.5 * (values.min() + values.max())

@@ -21,8 +21,6 @@ from ..robot._look import Look
 from ..robot._mujoco import home_poses, model_bodies
 from ..robot.loading._mjmodel import rotation_matrix
 
-Style = Literal["auto", "geoms", "sticks"]
-
 _GEOM = mujoco.mjtGeom
 _DRAWN = range(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_MESH) + 1)
 """Geom types that are drawn: sphere, capsule, ellipsoid, cylinder, box and mesh."""
@@ -113,28 +111,24 @@ class RobotParts:
         return data.xpos[self.bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
 
 
-def robot_parts(robot: Robot, *, style: Style = "auto") -> RobotParts:
+def robot_parts(robot: Robot) -> RobotParts:
     """Return the shapes of a robot for pictures.
 
-    Args:
-        robot: the robot.
-        style: ``"geoms"``, ``"sticks"`` (a line from each body to its parent, joints as dots), or ``"auto"``: the
-            visual shapes of its URDF, else the geoms if most moving bodies have a visible one, else sticks.
+    They are the visual shapes of its URDF, else its geoms, if most moving bodies have a visible one. Else they are
+    sticks: a line from each body to its parent, joints as dots.
     """
     model, unread = robot.mj_model, robot.holder.look
-    if unread is not None and style == "auto":
+    if unread is not None:
         look = unread.read
         bodies = [model.body(shape.link).id for shape in look.shapes]
         if _cover(model, bodies):
             return _look_parts(model, look, bodies)
-    geoms = [] if style == "sticks" else _visible_geoms(model)
-    if geoms and (style == "geoms" or _cover(model, model.geom_bodyid[geoms])):
-        turns = np.array([rotation_matrix(model.geom_quat[geom]) for geom in geoms])
-        parts = tuple(_geom_part(model, geom) for geom in geoms)
-        return RobotParts(model, "geoms", parts, model.geom_bodyid[geoms], (model.geom_pos[geoms], turns))
-    if style == "geoms":
-        raise OsikValueError("the model has no geom to draw; use style='sticks'")
-    return _sticks(robot)
+    geoms = _visible_geoms(model)
+    if not _cover(model, model.geom_bodyid[geoms]):
+        return _sticks(robot)
+    turns = np.array([rotation_matrix(model.geom_quat[geom]) for geom in geoms])
+    parts = tuple(_geom_part(model, geom) for geom in geoms)
+    return RobotParts(model, "geoms", parts, model.geom_bodyid[geoms], (model.geom_pos[geoms], turns))
 
 
 def _look_parts(model: mujoco.MjModel, look: Look, bodies: list[int]) -> RobotParts:
@@ -252,3 +246,27 @@ def _geom_type(shape: CollisionShape) -> mujoco.mjtGeom:
     """Return MuJoCo's geom type; a segment of length 0 is a sphere."""
     is_sphere = shape.kind is Kind.SEGMENT and float(shape.size[1]) == 0.0
     return _GEOM.mjGEOM_SPHERE if is_sphere else _KINDS[shape.kind]
+
+
+def lowest_points(shape: RobotParts, data: mujoco.MjData) -> Float[np.ndarray, " parts"]:
+    """Return the height of each part's lowest point in the world [m]; exact for meshes, boxes and round shapes."""
+    position, rotation = shape.poses(data)
+    down = -rotation[:, 2]  # in each part's frame
+    return position[:, 2] - np.array([part.reach(way) for part, way in zip(shape.parts, down, strict=True)])
+
+
+def base_height(shape: RobotParts, heights: Float[np.ndarray, " parts"]) -> float:
+    """Return the height of the lowest point of what is fixed to the world [m]; 0 where nothing of that is drawn."""
+    base = heights[shape.model.body_weldid[shape.bodies] == 0]
+    return float(base.min()) if len(base) else 0.0
+
+
+def floor_height(robot: Robot, shape: RobotParts, poses: Iterable[mujoco.MjData]) -> float:
+    """Return the floor's height [m]: a floating robot's lowest point in the first frame, or its base's height.
+
+    Where a robot that is bolted down reaches below its base, the floor is under the lowest point of all poses.
+    """
+    first, *others = (lowest_points(shape, data) for data in poses)
+    if robot.floating_base:
+        return float(first.min())
+    return min(base_height(shape, first), *(float(heights.min()) for heights in (first, *others)))

@@ -10,14 +10,13 @@ import pytest
 from core_checks import needs_core
 from model_files import MJCF
 from mujoco_states import mujoco_at
-from PIL import Image
 from small_files import files_of_at_most
 from urdfs import joint, tree
 
 import osik_jax as osik
 from osik_jax import cli
 from osik_jax._progress import spoken
-from osik_jax.cli._pose_file import read_pose_file
+from osik_jax.cli._inputs import read_pose_file
 
 ARM_FILE = str(MJCF / "three_joints.xml")
 
@@ -43,7 +42,7 @@ def test_help_names_commands_and_options(capsys):
     with pytest.raises(SystemExit):
         cli.main(["demo", "--help"])
     said = capsys.readouterr().out
-    for option in ("motion", "physics", "duration", "frequency", "schemes", "out"):
+    for option in ("motion", "duration", "frequency", "schemes", "out"):
         assert f"--{option}" in said
     assert "--no-animation" in said
 
@@ -68,20 +67,6 @@ def test_info_of_the_system_says_which_core_is_loaded(capsys):
     said = capsys.readouterr().out
     assert _library.core().reason in said and "jaxlib" in said and "NVRTC" in said
     assert "--system" in refused(capsys, "info")
-
-
-@pytest.mark.slow
-def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    picture = tmp_path / "spheres.png"
-    assert cli.main(["info", "ur5", "--spheres", "--png", str(picture)]) == 0
-    printed = capsys.readouterr().out
-    assert "upper_arm_link:0" in printed and "no surface is uncovered" in printed
-    pixels = np.asarray(Image.open(picture).convert("RGB"), int)
-    orange = (pixels[..., 0] > pixels[..., 2] + 60).mean(0)  # the spheres are in the right half
-    assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
-    assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
-    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
 
 
 def test_missing_and_broken_files_are_named(capsys, tmp_path):
@@ -116,9 +101,9 @@ def test_a_folder_that_cannot_be_made_is_named(capsys, tmp_path):
 
 
 def test_a_disk_that_fills_up_ends_in_one_line(capsys, tmp_path):
-    """The system refuses to write files of more than 32 kB: smaller than the comparison."""
+    """The system refuses to write files of more than 2 kB: smaller than the motion."""
     words = ["demo", "--duration", "1", "--frequency", "20", "--schemes", "weighted"]
-    with files_of_at_most(32_000):
+    with files_of_at_most(2_000):
         code = cli.main([*words, "--no-animation", "--out", str(tmp_path / "out")])
     told = capsys.readouterr().err.strip().splitlines()
     assert code == 2 and len(told) == 1

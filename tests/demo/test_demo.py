@@ -178,7 +178,7 @@ def test_single_support_reaches_its_numbers():
 def test_files_and_figures_agree_with_mujoco(short, nao):
     """Velocities integrate to the configurations, by MuJoCo's own integration."""
     folder, shown, motion, run = short
-    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz"}
+    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "motion.npz"}
     arrays = np.load(folder / "motion.npz")
     assert arrays["q_weighted"].shape == (101, nao.nq) and arrays["v_weighted"].shape == (100, nao.nv)
     assert [column.header for column in shown.columns] == ["", "Weighted QP"]

@@ -17,11 +17,11 @@ ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").rglob("*.md"))]
 TEXTS = [*PAGES, *(ROOT / name for name in ("CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff", "mkdocs.yml"))]
-PARTS = ["viewer", "tuning", "scaling", "retargeting", "reachability", "calibration", "placement", "interop"]
+PARTS = ["viewer", "tuning", "scaling", "retargeting", "reachability", "calibration", "placement"]
 PACKAGES = [*PARTS, "runtime", "solvers", "schemes", "physics", "interop.ros2"]
 PACKAGES = ("osik_jax", *(f"osik_jax.{part}" for part in PACKAGES))
 OPTIONAL = ["matplotlib", "tyro", "rich", "torch", "pinocchio", "cyclonedds", "mink", "optax"]
-OPTIONAL += [f"osik_jax.{part}" for part in (*PARTS, "demo")]
+OPTIONAL += [f"osik_jax.{part}" for part in (*PARTS, "interop", "demo")]
 
 BLOCK = re.compile(r"^```python(?: title=\"([\w-]+)\")?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 """A block's title may be one of ``LIBRARIES``; the block runs where that is installed."""

@@ -323,24 +323,6 @@ def test_a_robot_on_feet_stands_where_it_stood_at_home_and_keeps_its_feet(nao):
     np.testing.assert_allclose(end.body("l_gripper").xpos, goal, atol=5e-3)
 
 
-def test_a_clutch_moves_nothing_when_pressed_and_scales_motion(arm):
-    run = Run(Controller(arm, Settings(clutch=True, clutch_scale=0.5)))
-    pressed = lambda now: ("clutch", "hand", now, Message(data=True))  # noqa: E731
-    there = np.array([3.0, -2.0, 1.0])
-    run.tick()
-    start = run.pose("hand")[0]
-    run.tick(lambda now: target(now, "hand", there, frame_id="some device"))
-    run.tick(pressed, lambda now: target(now, "hand", there, frame_id="some device"))
-    for _ in range(50):
-        run.tick(lambda now: target(now, "hand", there, frame_id="some device"))
-    assert np.abs(np.ptp(run.positions(), axis=0)).max() < 1e-9
-    for _ in range(600):
-        run.tick(lambda now: target(now, "hand", there + np.array([0.0, 0.1, 0.0]), frame_id="some device"))
-    np.testing.assert_allclose(run.pose("hand")[0] - start, [0.0, 0.05, 0.0], atol=1e-3)
-    run.ticks(20)  # the device falls silent: its clutch opens
-    assert not run.memory.clutches["hand"].engaged
-
-
 class TestSettings:
     def test_positions_need_the_order_of_their_receiver(self, arm):
         refuses(ValueError, "has no names", Settings, commands="positions")
@@ -359,7 +341,7 @@ class TestSettings:
             ("rate = 0", "rate is 0; it is a positive number"),
             ("rate = 'fast'", "rate is 'fast'"),
             ("frames = 'hand'", "frames is 'hand'; it is a list of names"),
-            ("clutch = 1", "clutch is 1; it is true or false"),
+            ("check_stamps = 1", "check_stamps is 1; it is true or false"),
             ("commands = 'torques'", "it is 'trajectory' or 'positions'"),
             ("[topics]\nstates = '/a'", "no topic 'states'"),
             ("[names]\na = 3", "a table of names"),

@@ -11,7 +11,7 @@ from model_files import mjcf
 
 import osik_jax as osik
 from osik_jax import physics, reachability, tuning
-from osik_jax.viewer.live._session import Session
+from osik_jax.viewer.live._desk import Session
 
 SPEEDS = {"a": 1.0, "b": 2.0}
 DT = 0.01

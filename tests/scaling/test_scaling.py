@@ -28,14 +28,13 @@ tasks = {"hand": hand, "posture": osik.PostureTask(arm, priority=2, weight=1.0)}
 many = osik.batched(tasks, {"posture.gain": jnp.linspace(1.0, 3.0, 21)})
 axes = (None, 0, osik.batch_axes(tasks, "posture.gain"))
 largest = lambda a, b: max(float(abs(x - y).max()) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-compiled = lambda split: sum(program.run._cache_size() for program in split._known.values())
 found = {"devices": len(jax.devices())}
 step = lambda robot, q, tasks: osik.solve(robot, q, tasks, scheme=osik.HierarchicalQP(), limits=limits, dt=0.01)
 split = sharded(step, axes)
 a, b = split(arm, q, many), jax.jit(jax.vmap(step, axes))(arm, q, many)
 split(arm, q + 0.01, many)
 exact = largest((a.status, a.warm_start), (b.status, b.warm_start))
-found["step"] = dict(error=largest(a, b), exact=exact, lanes=len(a.velocity), compiled=compiled(split))
+found["step"] = dict(error=largest(a, b), exact=exact, lanes=len(a.velocity), compiled=split.run._cache_size())
 
 def path(gain, q):
     own = {"hand": hand.replace(gain=gain)}
@@ -112,45 +111,26 @@ def test_explicit_mesh_axes_are_refused_and_what_the_message_advises_works(arm):
 
 TWO_HOSTS = """
 import json, sys
-from pathlib import Path
 import jax, numpy as np
-port, process, folder = sys.argv[1:]
+port, process = sys.argv[1:]
 jax.distributed.initialize(f"localhost:{port}", 2, int(process))
-from jax.experimental.multihost_utils import sync_global_devices
 from osik_jax.scaling import run_in_chunks, sharded
-split = sharded(lambda x, a: {"y": a * x**2, "n": x[0] > 0.5}, (0, None))
+split = sharded(lambda x, a: a * x**2, (0, None))
 x = np.random.default_rng(0).uniform(size=(22, 3))
-job = dict(chunk=8, shared=(2.0,), out=folder, progress=False)
-first = run_in_chunks(split, x, **job)
-sync_global_devices("written")
-lost = Path(folder) / "00000001.1-of-2.npz"
-if process == "1":
-    lost.unlink()
-sync_global_devices("lost")
-missing = first.missing
-before = {path.name: path.stat().st_mtime_ns for path in Path(folder).glob("*.npz")}
-sync_global_devices("counted")
-run_in_chunks(split, x, **job)
-sync_global_devices("written again")
-kept = sum(path.stat().st_mtime_ns == before.get(path.name) for path in Path(folder).glob("*.npz"))
-uneven = split(x[:5], 2.0)["y"]
-total = float(jax.jit(lambda y: y.sum())(uneven))
-print(json.dumps([len(jax.devices()), len(jax.local_devices()), missing, kept, total]))
+total = [float(jax.jit(lambda y: y.sum())(split(some, 2.0))) for some in (x[:20], x[:5])]
+try:
+    run_in_chunks(split, x, chunk=8, shared=(2.0,))
+except ValueError as error:
+    print(json.dumps([len(jax.devices()), len(jax.local_devices()), total, str(error)]))
 """
 
 
 @pytest.mark.release
-def test_two_hosts_write_their_own_lanes(tmp_path):
-    """And again where the part of one is lost: both run that chunk, and no other."""
+def test_two_hosts_split_a_batch():
     x, port = np.random.default_rng(0).uniform(size=(22, 3)), free_port()
-    for found in map(finish, [start(TWO_HOSTS, port, i, tmp_path, devices=2) for i in range(2)]):
-        assert found[:4] == [4, 2, [1], 4]
-        assert found[4] == pytest.approx((2.0 * x[:5] ** 2).sum(), rel=1e-14)
-    parts = sorted(path.name for path in tmp_path.glob("*.npz"))
-    assert parts == [f"{k:08d}.{i}-of-2.npz" for k in range(3) for i in range(2)]
-    saved = scaling.load(tmp_path)
-    np.testing.assert_array_equal(saved[:]["y"], 2.0 * x**2)
-    np.testing.assert_array_equal(saved[7:17]["n"], x[7:17, 0] > 0.5)
+    for devices, own, total, message in map(finish, [start(TWO_HOSTS, port, i, devices=2) for i in range(2)]):
+        assert (devices, own) == (4, 2) and "works in one process" in message
+        assert total == pytest.approx([2.0 * (x[:count] ** 2).sum() for count in (20, 5)], rel=1e-14)
 
 
 def numbers(start: int, stop: int) -> dict[str, Any]:
@@ -199,27 +179,27 @@ def test_structure_of_robots_and_tasks_is_part_of_the_job():
     assert any(line.startswith("structure was") for line in differences(a, b))
 
 
-def test_slices_and_structures(tmp_path):
+def test_slices_by_name(tmp_path):
     x = np.random.default_rng(1).normal(size=(23, 2))
     double = jax.jit(jax.vmap(lambda x: (x[0], {"both": 2.0 * x, "none": None})))
     saved = scaling.run_in_chunks(double, x, chunk=5, out=tmp_path, progress=False)
-    assert (len(saved), saved.chunks, saved.missing, saved.names) == (23, 5, (), ("[0]", "[1].both"))
-    for lanes in (slice(None), slice(4, 11), slice(-3, None), slice(2, 20, 4), slice(9, 9), slice(50, None)):
-        first, rest = saved[lanes]
-        np.testing.assert_array_equal(first, x[lanes, 0])
-        np.testing.assert_array_equal(rest["both"], 2.0 * x[lanes])
-        assert rest["none"] is None
-    like = jax.eval_shape(double, x)
-    again, by_name = scaling.load(tmp_path, like=like), scaling.load(tmp_path)
-    np.testing.assert_array_equal(again[3:9][1]["both"], by_name[3:9]["[1].both"])
-    np.testing.assert_array_equal(by_name.read(["[0]"], slice(20, 23))["[0]"], x[20:, 0])
-    refuses(KeyError, r"no array 'both'; arrays: \[0\], \[1\]\.both", by_name.read, ["both"])
+    assert (len(saved), saved.chunks, saved.missing) == (23, 5, ())
+    for lanes in (slice(None), slice(4, 11), slice(-3, None), slice(9, 9), slice(50, None)):
+        found = saved[lanes]
+        assert found.keys() == {"[0]", "[1].both"}
+        np.testing.assert_array_equal(found["[0]"], x[lanes, 0])
+        np.testing.assert_array_equal(found["[1].both"], 2.0 * x[lanes])
+    first, rest = scaling.run_in_chunks(double, x, chunk=5, progress=False)
+    np.testing.assert_array_equal(first, x[:, 0])
+    np.testing.assert_array_equal(rest["both"], 2.0 * x)
+    again = scaling.load(tmp_path)
+    assert again.read(["[0]"], slice(20, 23)).keys() == {"[0]"}
+    refuses(KeyError, r"no array 'both'; arrays: \[0\], \[1\]\.both", again.read, ["both"])
     one: Any = 3
     with pytest.raises(TypeError, match=r"use \[3 : 3 \+ 1\]"):
-        by_name[one]
+        again[one]
     with pytest.raises(ValueError, match="step"):
-        by_name[::-1]
-    refuses(ValueError, r"like has the arrays a; saved are \[0\], \[1\]\.both", scaling.load, tmp_path, like={"a": 0})
+        again[::-1]
     refuses(FileNotFoundError, "no manifest", scaling.load, tmp_path / "elsewhere")
 
 
@@ -250,6 +230,7 @@ def test_mistakes_in_sharded():
         scaling.sharded(lambda x, y: x + y)(jnp.ones(3), jnp.ones(2))
     with pytest.raises(ValueError, match="in_axes splits no argument"):
         scaling.sharded(lambda x: x, None)(jnp.ones(3))
+    refuses(ValueError, "in_axes has axis -1", scaling.sharded, lambda x: x, -1)
     number: Any = 3
     refuses(TypeError, "mesh is 3", scaling.sharded, lambda x: x, mesh=number)
     refuses(TypeError, "3 is no function", scaling.sharded, number)

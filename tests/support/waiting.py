@@ -21,8 +21,8 @@ def steps_of(loop: Any) -> Iterator[list[Any]]:
     """A list that gets the snapshot after every step of a control loop."""
     steps, step = [], loop._step
 
-    def watched() -> None:
-        step()
+    def watched(own: Any) -> None:
+        step(own)
         steps.append(loop.snapshot)
 
     loop._step = watched

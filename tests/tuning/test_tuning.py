@@ -303,10 +303,9 @@ class TestLosses:
 class TestTune:
     @pytest.mark.slow
     def test_reports_what_it_returns(self, loop, scenarios):
-        seen = []
-        tuned = run(loop, scenarios[:3], held_out=scenarios[3:], iterations=6, callback=seen.append)
+        tuned = run(loop, scenarios[:3], held_out=scenarios[3:], iterations=6)
         history = tuned.history
-        assert [len(h) for h in seen] == [1, 2, 3, 4, 5, 6] and tuned.stopped == "iterations"
+        assert len(history) == 6
         assert tuned.loss == history.loss.min() < history.loss[0]
         assert tuned.held_out == history.held_out[tuned.iteration]
         assert tuned.loss == pytest.approx(float(tuning.evaluate(LOSS, tuned.loop, scenarios[:3]).loss), rel=1e-9)
@@ -318,9 +317,9 @@ class TestTune:
     @pytest.mark.slow
     def test_the_step_is_the_gradient(self, loop, scenarios):
         """Plain descent with rate 1, against central differences of the loss."""
-        tuned = run(loop, scenarios, optimizer=optax.sgd(1.0), iterations=1)
+        tuned = run(loop, scenarios, optimizer=optax.sgd(1.0), iterations=2)
         start, space = tuned.space.initial, tuned.space
-        gradient = np.asarray(start - tuned.state.vector)
+        gradient = np.subtract(*tuned.history.vectors)
         assert np.linalg.norm(gradient) == pytest.approx(tuned.history.gradient_norm[0])
         for direction in np.random.default_rng(1).normal(size=(4, len(gradient))):
             ends = [tuning.evaluate(LOSS, space.apply(loop, start + h * direction), scenarios) for h in (1e-5, -1e-5)]
@@ -346,7 +345,7 @@ class TestTune:
         clean = tuning.tune(steep, NAMES, spoiled[np.full(4, 2)], held_out=spoiled[:2], **options)
         assert got.history.dropped.tolist() == [3, 3, 3] and got.history.held_out_dropped.tolist() == [2, 2, 2]
         np.testing.assert_allclose(got.history.loss, clean.history.loss, rtol=1e-12)
-        np.testing.assert_allclose(got.state.vector, clean.state.vector, rtol=1e-9)
+        np.testing.assert_allclose(got.history.vectors, clean.history.vectors, rtol=1e-9)
         with pytest.raises(ValueError, match="no training scenario can be kept in iteration 0"):
             tuning.tune(steep, NAMES, spoiled[np.array([0, 1, 0, 1])], held_out=spoiled[:2], **options)
 
@@ -355,31 +354,23 @@ class TestTune:
         history = History.empty(2)
         for loss, dropped in ((3.0, 0), (1.0, 2), (2.0, 0), (np.nan, 4), (2.0, 0)):
             history = history.and_then(loss=loss, dropped=dropped, **rows)
-        assert history.best == 2 and history.stale(1e-3) == 2
-
-    @pytest.mark.slow
-    def test_stops_without_progress(self, loop, scenarios):
-        tuned = run(loop, scenarios, iterations=50, patience=3, improvement=0.99)
-        assert tuned.stopped == "patience" and len(tuned.history) == 4
+        assert history.best == 2
 
     def test_goes_on_where_it_was(self, loop, scenarios, tmp_path):
         whole = run(loop, scenarios, iterations=6)
         file = tmp_path / "state.npz"
-        half = run(loop, scenarios, iterations=3, save=file)
-        for source in (half, file):
-            rest = run(loop, scenarios, iterations=6, resume=source)
-            np.testing.assert_array_equal(rest.history.vectors, whole.history.vectors)
-            np.testing.assert_array_equal(rest.history.loss, whole.history.loss)
+        run(loop, scenarios, iterations=3, save=file)
+        rest = run(loop, scenarios, iterations=6, resume=file)
+        np.testing.assert_array_equal(rest.history.vectors, whole.history.vectors)
+        np.testing.assert_array_equal(rest.history.loss, whole.history.loss)
         assert [p.name for p in tmp_path.iterdir()] == ["state.npz"]
-        half.save(tmp_path / "again.npz")
-        run(loop, scenarios, iterations=3, resume=tmp_path / "again.npz")
 
     def test_refuses_another_state(self, loop, scenarios, tmp_path):
-        half = run(loop, scenarios, iterations=1, save=tmp_path / "state.npz")
-        for source, what in ((half, "another structure"), (tmp_path / "state.npz", "another optimizer")):
-            refuses(ValueError, what, run, loop, scenarios, resume=source, optimizer=optax.sgd(0.1))
-            with pytest.raises(ValueError, match="the parameters are not those"):
-                tuning.tune(LOSS, ["hand.weight"], scenarios, loop=loop, resume=source, progress=False)
+        file = tmp_path / "state.npz"
+        run(loop, scenarios, iterations=1, save=file)
+        refuses(ValueError, "another optimizer", run, loop, scenarios, resume=file, optimizer=optax.sgd(0.1))
+        with pytest.raises(ValueError, match="the parameters are not those"):
+            tuning.tune(LOSS, ["hand.weight"], scenarios, loop=loop, resume=file, progress=False)
         with pytest.raises(FileNotFoundError):
             run(loop, scenarios, resume=tmp_path / "no.npz")
 

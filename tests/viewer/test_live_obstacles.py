@@ -17,7 +17,6 @@ from osik_jax.cli._view import _keeps_off
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._obstacles import nearest_pair
 from osik_jax.viewer.live._open import default_session
-from osik_jax.viewer.live._session import RobotSource
 
 
 @needs_core
@@ -27,12 +26,12 @@ def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
     shapes = {"box": osik.CollisionShape.box([0.1, 0.1, 0.1], [0.0, 2.0, 0.5]), "ball": osik.CollisionShape.sphere(0.1)}
     shapes["post"] = osik.CollisionShape.cylinder(0.05, [-1.0, 0.0, 0.0], [-1.0, 0.0, 1.0])
     apart = osik.CollisionAvoidanceLimit(arm, scene=osik.Scene(shapes).moved("ball", ([0.0, -2.0, 0.5], np.eye(3))))
-    session = default_session(arm, source=RobotSource("ur5"))
+    session = default_session(arm, source="ur5")
     desk = Desk(dataclasses.replace(session, limits=(*session.limits, apart)))
     assert list(desk.obstacles) == ["box", "ball", "post"] and desk.obstacles["ball"].part.size[0] == 0.1
     with desk.loop as loop:
         assert loop.wait_until_ready(300.0)
-        steps = loop._steps
+        step = loop._stepper
         tool = np.asarray(osik.forward_kinematics(arm, desk.session.q).frame_pose(arm, "tool0")[0])
         place = tool * [1.1, 1.1, 1.0]  # farther out, with the tool inside
         desk.move_obstacle("box", place, np.eye(3))
@@ -45,7 +44,7 @@ def test_obstacles_of_a_scene_are_shown_and_dragged() -> None:
         near = nearest_pair(desk.session.active_limits, loop.snapshot.q)
         assert near is not None and "box" in near.names and near.kept == 0.01
         np.testing.assert_allclose(np.linalg.norm(near.points[0] - near.points[1]), near.distance, rtol=1e-6)
-        assert loop._steps is steps
+        assert loop._stepper is step
 
 
 @needs_core
@@ -57,14 +56,3 @@ def test_a_scene_of_the_command_line_is_kept_off(tmp_path: Path, capsys: pytest.
     assert list(Desk(dataclasses.replace(default_session(arm), limits=(limit,))).obstacles) == ["ball"]
     assert cli.main(["view", str(tmp_path / "motion.npz"), "--scene", "cell.xml"]) == 2
     assert "--scene goes with a robot to drag, not with a file" in capsys.readouterr().err
-
-
-def test_a_ball_of_a_limit_is_moved_with_its_numbers_alone() -> None:
-    arm = osik.load_robot("arm7")
-    ball = {"ball": osik.CollisionShape.sphere(0.05, [0.0, 2.0, 0.5])}
-    limit = osik.CollisionAvoidanceLimit(arm, shapes=ball, pairs=[("ball", "link7:0")])
-    desk = Desk(dataclasses.replace(default_session(arm), limits=(limit,)))
-    structure = desk.session.controller().structure()
-    desk.move_obstacle("ball", np.array([0.0, 1.0, 0.5]), np.eye(3))
-    np.testing.assert_allclose(desk.obstacles["ball"].position, [0.0, 1.0, 0.5])
-    assert desk.session.controller().structure() == structure

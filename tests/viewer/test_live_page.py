@@ -13,16 +13,16 @@ import mujoco
 import numpy as np
 import pytest
 from refusals import refuses
-from waiting import steps_of, until
+from waiting import until
 
 import osik_jax as osik
 from osik_jax.cli import main
 from osik_jax.retargeting._robot_motion import in_mujoco_order
-from osik_jax.viewer import export_html, serve, serve_batch
+from osik_jax.viewer import export_html, serve
 from osik_jax.viewer._parts import Part, robot_parts
-from osik_jax.viewer.live._open import default_session, sole_polygon, standing
+from osik_jax.viewer.live._open import sole_polygon, standing
+from osik_jax.viewer.live._panel import error_text
 from osik_jax.viewer.live._playback import read_motion
-from osik_jax.viewer.live._readout import error_text
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
@@ -123,42 +123,6 @@ def test_a_page_is_served_and_a_visitor_who_goes_leaves_the_robot_at_rest() -> N
         refuses(OSError, f"port {taken}", serve, ARM, tasks, port=taken)
 
 
-@pytest.mark.release
-def test_robots_side_by_side_each_with_its_own_numbers() -> None:
-    robots = {f"gain {gain}": arm_tasks(gain) for gain in (2.0, 40.0)}
-    with serve_batch(ARM, robots, port=0) as view:
-        position, rotation = robots["gain 2.0"]["hand"].target
-        target = position + np.array([-0.05, 0.08, -0.05])
-        refuses(KeyError, r"gain 40\.0", view.aim, "gain 3", "hand", (target, rotation))
-        assert view.loop.wait_until_ready(120.0)
-        view.loop.pause()
-        for name in view.names:
-            view.aim(name, "hand", (target, rotation))
-        view.loop.reset()
-        with steps_of(view.loop) as steps:
-            view.loop.resume()
-            assert until(lambda: len(steps) > 60)
-        q = np.array([np.tile(ARM.q0, (2, 1)), *(step.q for step in steps)])
-        assert q.shape[1:] == (2, ARM.nq)
-        for lane, (name, own) in enumerate(robots.items()):
-            aimed = {**own, "hand": own["hand"].replace(target=(target, rotation))}
-            alone = osik.rollout(ARM, ARM.q0, aimed, steps=40, dt=0.005)
-            np.testing.assert_allclose(q[1:41, lane], alone.q[1:41] if len(alone.q) > 40 else alone.q, atol=1e-8)
-            assert name in view._table()
-        view._dragging(0)("hand", (np.asarray(position), np.array([1.0, 0.0, 0.0, 0.0])), 7, "start")
-        second: Any = view._tasks[1]["hand"]
-        np.testing.assert_allclose(second.target[0], position, atol=1e-12)  # the handles move together
-        view._dragging(0)("hand", (np.asarray(position), np.array([1.0, 0.0, 0.0, 0.0])), 7, "end")
-        assert until(lambda: float(np.abs(view.loop.snapshot.velocity).max()) < 1e-2)
-    with pytest.raises(ValueError, match="differ in more than numbers"):
-        serve_batch(ARM, {"one": arm_tasks(1.0), "other": {"posture": osik.PostureTask(ARM)}}, port=0)
-    refuses(ValueError, "tasks is empty", serve_batch, ARM, {}, port=0)
-
-
-def arm_tasks(gain: float) -> dict[str, Any]:
-    return {"hand": osik.FrameTask(ARM, "hand", gain=gain), "posture": osik.PostureTask(ARM, weight=1e-4)}
-
-
 def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     np.savez(tmp_path / "motion.npz", q=np.zeros((3, 7)))
     (tmp_path / "broken.urdf").write_text("<robot", encoding="utf-8")
@@ -171,11 +135,15 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             (["--port", "70000"], "no port 70000"),
             (["--port", "0", "--robot", "nowhere.urdf"], "no such file: nowhere.urdf"),
             (["--port", "0", "--robot", str(tmp_path / "broken.urdf")], "broken XML"),
-            (["--port", "0", "nowhere.npz"], "no such file: nowhere.npz"),
-            (["--port", "0", str(tmp_path / "motion.npz")], "another robot"),
+            (["nowhere.npz"], "no such file: nowhere.npz"),
+            (["nowhere.txt"], "no .npz of a motion, nor .json of a controller"),
+            ([str(tmp_path / "motion.npz")], "another robot"),
             (["--port", "0", "--support", "l_soul"], "l_sole"),
             (["--html", str(tmp_path / "page.html")], "--html goes with a motion.npz"),
-            (["session.json", "--robot", "ur5", "--base", "fixed"], "--robot, --base go with a robot or a motion, not"),
+            (
+                ["controller.json", "--robot", "ur5", "--base", "fixed"],
+                "--robot, --base go with a robot or a motion, not",
+            ),
             (["motion.npz", "--support", "l_sole"], "--support goes with a robot to drag, not with a file"),
             (
                 [str(tmp_path / "motion.npz"), "--robot", "arm7", "--html", str(tmp_path / "no" / "page.html")],
@@ -187,19 +155,11 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             assert told in error and error.count("\n") == 1 and error.startswith("osik: ")
 
 
-def test_what_a_session_has_is_not_given_beside_it() -> None:
-    session = default_session(ARM)
-    parts: dict[str, Any] = dict(
-        tasks={"posture": osik.PostureTask(ARM)},
-        scheme=osik.NullSpace(),
-        limits=osik.no_limits,
-        dt=0.005,
-        q0=np.asarray(ARM.q0),
-        source="arm7",
-    )
+def test_what_a_controller_has_is_not_given_beside_it() -> None:
+    tasks = {"posture": osik.PostureTask(ARM)}
+    parts: dict[str, Any] = dict(tasks=tasks, scheme=osik.NullSpace(), limits=osik.no_limits, dt=0.005)
     for name, part in parts.items():
-        refuses(ValueError, f"its own {name}: leave out", serve, session, port=0, **{name: part})
-    refuses(ValueError, "its own tasks, scheme, limits, dt, q0, source: ", serve, session, port=0, **parts)
+        refuses(ValueError, "a controller has its own", serve, osik.Controller(ARM, tasks), port=0, **{name: part})
 
 
 def test_without_viser_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

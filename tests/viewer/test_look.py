@@ -16,8 +16,7 @@ from osik_jax import viewer
 from osik_jax.robot._mujoco import mujoco_poses
 from osik_jax.robot.loading._collada import read_collada
 from osik_jax.robot.loading._meshes import read_mesh
-from osik_jax.viewer._outline import lowest_points
-from osik_jax.viewer._parts import robot_parts
+from osik_jax.viewer._parts import lowest_points, robot_parts
 from osik_jax.viewer._stage import frame_camera
 from osik_jax.viewer.live._surfaces import part_triangles
 
@@ -116,7 +115,7 @@ def test_look_places_shapes_where_mujoco_has_their_links(tmp_path):
     np.testing.assert_allclose(high[[0, 2]], np.maximum(corners.max(0), [0.1, 0.2]), atol=1e-6)
     np.testing.assert_allclose(low[[0, 2]], np.minimum(corners.min(0), [0.0, 0.0]), atol=1e-6)
     np.testing.assert_allclose(lowest_points(shape, data), [0.0, corners[:, 1].min()], atol=1e-6)
-    assert robot_parts(robot, style="sticks").style == "sticks" and osik.load_robot("nao").holder.look is None
+    assert osik.load_robot("nao").holder.look is None
 
 
 def test_collision_shapes_stand_in_for_meshes_that_are_gone(tmp_path):

@@ -9,7 +9,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ..._errors import OsikValueError, unknown_name
-from ...control import Clutch
 from ...robot import Robot
 from ...solvers import Status
 from ._joints import JointNames, Refused, joint_names, pose_of, stamp_of
@@ -73,9 +72,6 @@ class Memory:
         measured_ns: when that was received. (n,)
         stamps_ns: last stamps, by joint (as arrays (n,)) under ``""``, and by frame.
         targets: target of each frame, world axes.
-        devices: pose of each held device, and when it was received.
-        pressed: whether the clutch of a frame is pressed.
-        clutches: of each frame.
         unknown: names that no joint has, and when each came last [ns].
         refused: number of refused messages, the time of the last one and the reason.
         phase: see ``Output``.
@@ -88,9 +84,6 @@ class Memory:
     measured_ns: np.ndarray
     stamps_ns: Mapping[str, Any]
     targets: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    devices: Mapping[str, tuple[int, Any]] = dataclasses.field(default_factory=dict)
-    pressed: Mapping[str, bool] = dataclasses.field(default_factory=dict)
-    clutches: Mapping[str, Clutch] = dataclasses.field(default_factory=dict)
     unknown: Mapping[str, int] = dataclasses.field(default_factory=dict)
     refused: tuple[int, int, str] = (0, _NEVER, "")
     phase: Phase = "waiting"
@@ -102,7 +95,7 @@ class Memory:
 
 
 class Controller:
-    """Control loop of a robot as a function of received messages, for ``osik ros2`` and replays of bags.
+    """Control loop of a robot as a function of received messages, for ``osik ros2``.
 
         memory = controller.memory()
         memory, output = controller.tick(memory, now_ns, received)
@@ -133,10 +126,9 @@ class Controller:
         self._rehearse()
 
     def _rehearse(self) -> None:
-        """Run a start and a step with a press of the clutch, so that nothing compiles while a robot moves."""
+        """Run a start and a step, so that nothing compiles while a robot moves."""
         memory = dataclasses.replace(self.memory(), measured=np.asarray(self.robot.q0)[self.joints.index])
-        devices = {frame: (0, (np.zeros(3), np.eye(3))) for frame in self.frames} if self.settings.clutch else {}
-        self._moved(dataclasses.replace(self._begun(memory), devices=devices), 0)
+        self._moved(self._begun(memory))
 
     def _order(self) -> np.ndarray:
         """Return the index of each commanded joint."""
@@ -161,10 +153,10 @@ class Controller:
             now_ns: time now, by the clock of stamps [ns].
             received: the messages since the last period, in the order in which they came. Each is a tuple of
 
-                - its kind: ``"state"``, ``"target"`` or ``"clutch"``;
-                - the frame of a target or clutch, empty for joint states;
+                - its kind: ``"state"`` or ``"target"``;
+                - the frame of a target, empty for joint states;
                 - when it was received, by the clock of stamps [ns];
-                - the JointState, PoseStamped or Bool, of any library: its attributes are read.
+                - the JointState or PoseStamped, of any library: its attributes are read.
         """
         for item in map(Received._make, received):
             try:
@@ -182,13 +174,11 @@ class Controller:
             memory = dataclasses.replace(memory, velocity=np.zeros(self.robot.nv))
             name = self.joints.names[int(behind.argmax())]
             return memory, self._output(memory, now_ns, WARN, f"joint {name} does not follow: the command waits")
-        memory, status = self._moved(memory, now_ns)
+        memory, status = self._moved(memory)
         level, text = (OK, "moving") if status == Status.SOLVED else (WARN, f"the step is {Status(status).name}")
         return memory, self._output(memory, now_ns, level, text)
 
     def _take(self, memory: Memory, item: Received) -> Memory:
-        if item.kind == "clutch":
-            return dataclasses.replace(memory, pressed={**memory.pressed, item.frame: bool(item.message.data)})
         stamp = stamp_of(item.message, item.time_ns, self.settings)
         if item.kind == "state":
             return self._take_state(memory, item, stamp)
@@ -196,8 +186,6 @@ class Controller:
             raise Refused(f"a target of {item.frame} is not newer than the last one")
         pose = pose_of(item.message)
         memory = dataclasses.replace(memory, stamps_ns={**memory.stamps_ns, item.frame: stamp})
-        if self.settings.clutch:
-            return dataclasses.replace(memory, devices={**memory.devices, item.frame: (item.time_ns, pose)})
         if memory.phase != "moving":
             raise Refused(f"a target of {item.frame} came while the robot was not moving")
         target = self._in_world(memory, item.message.header.frame_id, pose)
@@ -237,8 +225,6 @@ class Controller:
         q[self.joints.index] = memory.measured
         q, tasks, poses = self.steps.begin(q)
         targets = {frame: poses[frame] for frame in self.frames}
-        scale = self.settings.clutch_scale
-        clutches = {f: Clutch(poses[f], scale=scale) for f in self.frames} if self.settings.clutch else {}
         return dataclasses.replace(
             memory,
             phase="moving",
@@ -248,19 +234,13 @@ class Controller:
             tasks=tasks,
             poses=poses,
             targets=targets,
-            clutches=clutches,
         )
 
-    def _moved(self, memory: Memory, now_ns: int) -> tuple[Memory, int]:
+    def _moved(self, memory: Memory) -> tuple[Memory, int]:
         """Return the memory after one control step, and its status."""
-        targets, clutches = dict(memory.targets), dict(memory.clutches)
-        for frame, (time_ns, device) in memory.devices.items():
-            tracked = now_ns - time_ns <= self.settings.state_timeout * 1e9
-            pressed = memory.pressed.get(frame, False) and tracked
-            clutches[frame], targets[frame] = clutches[frame].step(pressed, device, memory.poses[frame])
-        step = self.steps.advance(memory.q, memory.velocity, memory.warm_start, memory.tasks, targets)
+        step = self.steps.advance(memory.q, memory.velocity, memory.warm_start, memory.tasks, dict(memory.targets))
         new = dict(q=step.q, velocity=step.velocity, warm_start=step.warm_start, poses=step.poses)
-        return dataclasses.replace(memory, targets=targets, clutches=clutches, **new), int(step.status)
+        return dataclasses.replace(memory, **new), int(step.status)
 
     def _output(self, memory: Memory, now_ns: int, level: int, message: str) -> Output:
         count, refused_ns, reason = memory.refused

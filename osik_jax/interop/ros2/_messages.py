@@ -17,7 +17,6 @@ _DEFINITIONS = {
     "builtin_interfaces/Time": "int32 sec, uint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec, uint32 nanosec",
     "std_msgs/Header": "builtin_interfaces/Time stamp, string frame_id",
-    "std_msgs/Bool": "bool data",
     "std_msgs/MultiArrayDimension": "string label, uint32 size, uint32 stride",
     "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim, uint32 data_offset",
     "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout, float64[] data",
@@ -81,27 +80,3 @@ def __getattr__(name: str) -> Any:
         if full.rpartition("/")[2] == name:
             return kind
     raise AttributeError(name)
-
-
-def ros_name(kind: Any) -> str:
-    """Return the name that ROS 2 has for a type, such as ``sensor_msgs/msg/JointState``."""
-    return _short_name(kind).replace("/", "/msg/")
-
-
-def definition(kind: Any) -> str:
-    """Return the ROS 2 definition of a type, followed by those of its fields' types."""
-    parts, names = [], [_short_name(kind)]
-    for name in names:  # grows
-        fields = _fields(name)
-        names += [text for text in dict.fromkeys(t.removesuffix("[]") for t, _ in fields) if _is_new(text, names)]
-        head = f"MSG: {name}\n" if parts else ""
-        parts.append(head + "".join(f"{text} {own}\n" for text, own in fields))
-    return (("=" * 80) + "\n").join(parts)
-
-
-def _is_new(name: str, names: list[str]) -> bool:
-    return name in _DEFINITIONS and name not in names
-
-
-def _short_name(kind: Any) -> str:
-    return next(name for name, own in _TYPES.items() if own is kind)

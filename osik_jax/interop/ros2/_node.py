@@ -6,9 +6,9 @@ import gc
 import os
 import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from cyclonedds.core import DDSException, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
@@ -21,15 +21,15 @@ from . import _messages as msg
 from ._controller import Command, Controller, Output, Received
 from ._settings import Settings, dds_name, topic_of_frame
 
+if TYPE_CHECKING:
+    from ...motion import Motion
+
 _BEST_EFFORT = Policy.Reliability.BestEffort
 _RELIABLE = Policy.Reliability.Reliable(max_blocking_time=duration(milliseconds=1))
 _DIAGNOSTICS_PERIOD_NS = 500_000_000
 _LOOPBACK = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
-
-Record = Callable[[str, int, Any], None]
-"""Function that is called for each message used or sent, with its topic, the time [ns] and the message."""
 
 
 class Endpoints:
@@ -79,28 +79,26 @@ class Node:
     Args:
         controller: the controller.
         endpoints: where it speaks.
-        record: told of each message with the time that the controller sees, for a bag that replays exactly.
     """
 
-    def __init__(self, controller: Controller, endpoints: Endpoints, record: Record | None = None):
-        self.controller, self.record = controller, record
+    def __init__(self, controller: Controller, endpoints: Endpoints):
+        self.controller = controller
         self._endpoints = endpoints  # readers and writers end with their participant
         settings, topics = controller.settings, controller.settings.topics
         self.periods = self.missed = self.unread = self.unsent = 0
         self._diagnostics_ns, self._told = 0, ("", -1)
-        self._sources: list[tuple[Any, str, str, DataReader]] = []
+        self._sources: list[tuple[Any, str, DataReader]] = []
         self._read("state", "", topics.joint_states, msg.JointState, reliable=False)
         for frame in controller.frames:
             name = topic_of_frame(topics.targets, frame)
             self._read("target", frame, name, msg.PoseStamped, reliable=settings.reliable_targets)
-            if settings.clutch:
-                self._read("clutch", frame, topic_of_frame(topics.clutch, frame), msg.Bool, reliable=True)
-        self.command_topic = command_topic(settings)
-        self._commands = endpoints.writer(self.command_topic, command_type(settings))
+        is_trajectory = settings.commands == "trajectory"
+        kind = msg.JointTrajectory if is_trajectory else msg.Float64MultiArray
+        self._commands = endpoints.writer(topics.trajectory if is_trajectory else topics.positions, kind)
         self._diagnostics = endpoints.writer(topics.diagnostics, msg.DiagnosticArray)
 
     def _read(self, kind: Any, frame: str, topic: str, message: Any, *, reliable: bool) -> None:
-        self._sources.append((kind, frame, topic, self._endpoints.reader(topic, message, reliable=reliable)))
+        self._sources.append((kind, frame, self._endpoints.reader(topic, message, reliable=reliable)))
 
     def run(self, stop: threading.Event) -> None:
         """Run periods at the controller's rate until ``stop`` is set.
@@ -129,14 +127,10 @@ class Node:
     def _take(self) -> list[Received]:
         """Return the received messages in order, grouped by reader."""
         received = []
-        for kind, frame, topic, reader in self._sources:
+        for kind, frame, reader in self._sources:
             for message in self._taken(reader):
-                if type(message).__name__ == "InvalidSample":  # a publisher went away
-                    continue
-                now = time.time_ns()
-                received.append(Received(kind, frame, now, message))
-                if self.record is not None:
-                    self.record(topic, now, message)
+                if type(message).__name__ != "InvalidSample":  # a publisher went away
+                    received.append(Received(kind, frame, time.time_ns(), message))
         return received
 
     def _taken(self, reader: DataReader) -> list[Any]:
@@ -156,24 +150,12 @@ class Node:
         if output.command is not None:
             message = command_message(output.command, self.controller.settings, self.controller.dt)
             self._write(self._commands, message)
-            if self.record is not None:
-                self.record(self.command_topic, now_ns, message)
         told = (output.phase, output.level)
         if told != self._told or now_ns - self._diagnostics_ns >= _DIAGNOSTICS_PERIOD_NS:
             self._told, self._diagnostics_ns = told, now_ns
             counts = {"periods": self.periods, "missed periods": self.missed}
             counts |= {"unread messages": self.unread, "unsent messages": self.unsent}
             self._write(self._diagnostics, diagnostics_message(now_ns, output, counts))
-
-
-def command_topic(settings: Settings) -> str:
-    """Return the topic of commands."""
-    return settings.topics.trajectory if settings.commands == "trajectory" else settings.topics.positions
-
-
-def command_type(settings: Settings) -> Any:
-    """Return the type of commands."""
-    return msg.JointTrajectory if settings.commands == "trajectory" else msg.Float64MultiArray
 
 
 def command_message(command: Command, settings: Settings, dt: float) -> Any:
@@ -193,3 +175,16 @@ def diagnostics_message(now_ns: int, output: Output, counts: dict[str, int]) -> 
     values = [msg.KeyValue(key, str(value)) for key, value in {**output.values, **counts}.items()]
     status = msg.DiagnosticStatus(output.level, "osik: controller", output.message, "osik", values)
     return msg.DiagnosticArray(msg.Header(msg.Time(*divmod(now_ns, 1_000_000_000))), [status])
+
+
+def joint_trajectory(motion: Motion) -> Any:
+    """Return a motion as a ``trajectory_msgs/JointTrajectory``, a point for each sample, times from the first on.
+
+    Its joints have names.
+    """
+    rows = zip(*(np.asarray(a).tolist() for a in (motion.position, motion.velocity, motion.acceleration)), strict=True)
+    nanoseconds = np.rint(1e9 * np.asarray(motion.time - motion.time[0])).astype(np.int64)
+    points = []
+    for row, due in zip(rows, nanoseconds.tolist(), strict=True):
+        points.append(msg.JointTrajectoryPoint(*row, time_from_start=msg.Duration(*divmod(due, 1_000_000_000))))
+    return msg.JointTrajectory(msg.Header(), list(motion.joints), points)

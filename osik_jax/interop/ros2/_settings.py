@@ -16,11 +16,10 @@ from ..._errors import OsikTypeError, OsikValueError, unknown_name
 
 @dataclasses.dataclass(frozen=True)
 class Topics:
-    """Names of ROS 2 topics; ``targets`` and ``clutch`` are followed by ``/`` and the frame's name."""
+    """Names of ROS 2 topics; ``targets`` is followed by ``/`` and the frame's name."""
 
     joint_states: str = "/joint_states"
     targets: str = "/osik/targets"
-    clutch: str = "/osik/clutch"
     trajectory: str = "/joint_trajectory_controller/joint_trajectory"
     positions: str = "/forward_position_controller/commands"
     diagnostics: str = "/diagnostics"
@@ -45,8 +44,6 @@ class Settings:
         check_stamps: whether stamps are looked at. False: for publishers that do not stamp, and simulated time.
         reliable_targets: whether target topics ask for reliable publishers, which those of ROS 2 are by default.
         world_frame: ``frame_id`` of targets in the robot's world frame.
-        clutch: whether targets are poses of a held device, which count while the frame's clutch topic says true.
-        clutch_scale: metres that a frame moves for each metre of the device.
         names: from ROS names of joints to the model's, where they differ.
         topics: names of topics.
     """
@@ -65,13 +62,11 @@ class Settings:
     check_stamps: bool = True
     reliable_targets: bool = True
     world_frame: str = "world"
-    clutch: bool = False
-    clutch_scale: float = 1.0
     names: Mapping[str, str] = dataclasses.field(default_factory=dict)
     topics: Topics = dataclasses.field(default_factory=Topics)
 
     def __post_init__(self) -> None:
-        for name in ("rate", "speed", "acceleration", "following_error", "state_timeout", "max_age", "clutch_scale"):
+        for name in ("rate", "speed", "acceleration", "following_error", "state_timeout", "max_age"):
             value = getattr(self, name)
             if name == "rate" and value is None:
                 continue

@@ -1,23 +1,27 @@
-"""Editable session, and the loop that runs it."""
+"""Session of a page (a controller whose parts can be switched off), its edits, and the loop that runs it."""
 
 from __future__ import annotations
 
 import dataclasses
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ... import control
 from ..._errors import OsikValueError, unknown_name
+from ...limits import Limit, no_limits, with_own_limits
+from ...robot import Robot
+from ...saving._controller import controller_text
 from ...saving._parts import decode, encode
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
 from ._loop import ControlLoop
 from ._obstacles import Obstacle, moved, obstacles_in
-from ._session import Session
 from ._step import Controller, targets_here, with_targets
 
 _DAMPING = 1e-6
@@ -29,6 +33,64 @@ SCHEMES: dict[str, Callable[[], Scheme]] = {
     "Null space": lambda: NullSpace(method="saturated"),
 }
 """Schemes to choose from; all of them keep the limits."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """Tasks and limits of a live view, each of which can be switched off, with their robot and scheme.
+
+    Attributes:
+        robot: the robot.
+        tasks: all tasks by name, switched off or not.
+        scheme: how the tasks are combined: by weights or by priorities.
+        limits: all limits, switched off or not: those given, then the robot's own that they do not replace.
+        dt: time of a step [s].
+        q: where the robot starts. (nq,)
+        off: names of the tasks that are switched off.
+        limits_off: numbers of the limits that are switched off, in the order of ``limits``.
+        source: name or file of the robot, for files; None: a file has the robot itself.
+    """
+
+    robot: Robot
+    tasks: Mapping[str, Task]
+    scheme: Scheme
+    limits: tuple[Limit, ...]
+    dt: float
+    q: Float[np.ndarray, " nq"]
+    off: frozenset[str] = frozenset()
+    limits_off: frozenset[int] = frozenset()
+    source: str | None = None
+
+    def __post_init__(self) -> None:
+        """Add the robot's own limits, so that they can be switched off too."""
+        object.__setattr__(self, "limits", with_own_limits(self.robot, self.limits))
+
+    @property
+    def active_tasks(self) -> dict[str, Task]:
+        """Return the tasks that are switched on."""
+        return {name: task for name, task in self.tasks.items() if name not in self.off}
+
+    @property
+    def active_limits(self) -> tuple[Limit, ...]:
+        """Return the limits that are switched on, in the form that ``solve`` takes."""
+        on = tuple(limit for number, limit in enumerate(self.limits) if number not in self.limits_off)
+        return (no_limits, *on) if self.limits_off else on
+
+    def controller(self) -> Controller:
+        """Return the controller of what is switched on."""
+        return Controller(self.active_tasks, self.scheme, self.active_limits)
+
+    def to_text(self) -> str:
+        """Return the content of a controller's file; its robot is at home where this session starts."""
+        robot = eqx.tree_at(lambda own: own.q0, self.robot, jnp.asarray(self.q, self.robot.q0.dtype))
+        return controller_text(
+            robot,
+            self.active_tasks,
+            scheme=self.scheme,
+            limits=self.active_limits,
+            dt=self.dt,
+            source=self.source,
+        )
 
 
 class Desk:
@@ -134,11 +196,16 @@ class Desk:
             self._session = dataclasses.replace(self._session, limits=limits)
             self.loop.place(name, position, rotation)
 
-    def load(self, session: Session) -> None:
-        """Replace the session by another one of the same robot, at the current configuration."""
-        if session.robot.tree != self._session.robot.tree:
-            raise OsikValueError("the session is of another robot: start osik view with it")
-        self.edit(**{f.name: getattr(session, f.name) for f in dataclasses.fields(session) if f.name != "robot"})
+    def load(self, controller: control.Controller) -> None:
+        """Replace the controller by one of the same robot, at the current configuration."""
+        robot, tasks, scheme, limits, dt = controller
+        own = self._session.robot
+        if robot.tree != own.tree:
+            raise OsikValueError("the controller is of another robot: start osik view with its file")
+        if dt != self._session.dt:
+            raise OsikValueError(f"the controller's step is {dt} s, this page's {self._session.dt} s")
+        limits = with_own_limits(own, limits)
+        self.edit(tasks=tasks, scheme=scheme, limits=limits, off=frozenset(), limits_off=frozenset())
 
     def task(self, name: str) -> Task:
         """Return a task by name."""

@@ -80,11 +80,6 @@ class Handles:
         return handle
 
 
-def gizmo_target(task: Task, pose: Pose) -> Any:
-    """Return the target of a task whose handle is at a pose."""
-    return task.gripped(pose[0], pose[1] / np.linalg.norm(pose[1]))
-
-
 class Gizmos(Handles):
     """Handles of a page's tasks."""
 

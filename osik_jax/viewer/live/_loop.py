@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import atexit
 import gc
+import os
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
-from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Hashable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
-import jax
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -21,9 +22,7 @@ from ..._errors import OsikValueError, unknown_name
 from ...robot import Robot
 from ...solvers import Status
 from ._obstacles import moved
-from ._snapshot import Snapshot
-from ._step import Controller, laid_out, lane_of, targets_here, with_targets
-from ._timing import CONTROL, Stopwatch, Timing, be_nice
+from ._step import Controller, laid_out, targets_here, with_targets
 
 _LATE = 5
 """Number of periods of delay after which a loop restarts its schedule instead of catching up."""
@@ -33,13 +32,75 @@ _HALF_A_MICROSECOND = 5e-7
 """Offset [s] added to the switch interval, which Python truncates to whole microseconds."""
 _loops: set[int] = set()
 """Identities of the running loops. The last one to stop unfreezes the objects of Python's garbage collector."""
+CONTROL, DRAWING = -10, 5
+"""Niceness of the control and drawing threads; other threads have 0."""
 
 
-class _Lease(NamedTuple):
-    """Owner of a task's target, and the time until which the target counts as fresh [s]."""
+@dataclass(frozen=True)
+class Timing:
+    """Percentiles over the last steps of a loop.
 
-    owner: Hashable
-    until: float
+    Attributes:
+        steps: number of steps since the start or the last pause.
+        period: time from one start to the next: median, 99th percentile and longest [s].
+        step: time spent computing a step: median, 99th percentile and longest [s].
+    """
+
+    steps: int
+    period: tuple[float, float, float]
+    step: tuple[float, float, float]
+
+
+class Stopwatch:
+    """Start times and durations of the last steps."""
+
+    def __init__(self, length: int = 2000) -> None:
+        """Take the number of steps to keep."""
+        self._steps, self._count = deque[tuple[float, float]](maxlen=length), 0
+
+    def add(self, start: float, duration: float) -> None:
+        """Record a step [s]."""
+        self._steps.append((start, duration))
+        self._count += 1
+
+    def clear(self) -> None:
+        """Discard all steps, as after a pause."""
+        self._steps.clear()
+        self._count = 0
+
+    def timing(self) -> Timing:
+        """Return percentiles of the recorded steps."""
+        starts, durations = np.array(self._steps.copy()).reshape(-1, 2).T
+        return Timing(self._count, _percentiles(np.diff(starts)), _percentiles(durations))
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """State after the last step.
+
+    Attributes:
+        time: simulated since the start or the last reset [s].
+        q: configuration. (nq,)
+        velocity: what the controller asked for. (nv,)
+        status: a ``Status`` code.
+        errors: of each task. {name: (m,)}
+        failures: steps since the start or the last reset whose answer could not be used: the robot stood still.
+        ready: whether a compiled step runs; before that, the robot stands still.
+        preparing: whether what was asked for is still being compiled.
+        paused: whether the robot stands still because it was asked to.
+        problem: why the last change could not be compiled; empty where it could.
+    """
+
+    time: float
+    q: Float[np.ndarray, " nq"]
+    velocity: Float[np.ndarray, " nv"]
+    status: int = int(Status.SOLVED)
+    errors: Mapping[str, np.ndarray] = field(default_factory=dict)
+    failures: int = 0
+    ready: bool = False
+    preparing: bool = False
+    paused: bool = False
+    problem: str = ""
 
 
 class ControlLoop:
@@ -48,10 +109,7 @@ class ControlLoop:
     All methods may be called from any thread, and take effect in the next step. The first step of another structure
     (another task, scheme, priority or limit) takes some milliseconds, or the seconds of a compilation where the core
     does not have it; the robot stands still meanwhile, as while paused and after an answer that is not finite. If the
-    owner of a target (``aim``) leaves or its timeout passes, the target becomes the robot's current pose.
-
-    Of a batch of B robots, q0 is (B, nq), and each number of the controller has a leading axis B. So have targets
-    and snapshots.
+    owner of a target (``aim``) leaves, the target becomes the robot's current pose.
 
     Attributes:
         robot: the robot.
@@ -69,18 +127,16 @@ class ControlLoop:
         if not (np.isfinite(dt) and dt > 0.0):
             raise OsikValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
         start = robot.q0 if q0 is None else q0
+        robot.check_configuration(start, "q0")
         self.robot, self.dt = robot, float(dt)
         self._start = np.asarray(start, robot.q0.dtype)
-        self._batched = self._start.ndim == 2
-        for row in self._start if self._batched else [start]:
-            robot.check_configuration(row, "q0")
-        still = np.zeros((*self._start.shape[:-1], robot.nv), self._start.dtype)
+        still = np.zeros(robot.nv, self._start.dtype)
         self._lock = threading.RLock()
         self._wanted: Controller = controller
         self._laid: Controller | None = None
         self._refused: Controller | None = None
-        self._steps: list[control.Controller] = []
-        self._leases: dict[str, _Lease] = {}
+        self._stepper: control.Controller | None = None
+        self._owners: dict[str, Hashable] = {}  # of targets, by task
         self._problem = ""
         self._orders: deque[Callable[[], None]] = deque()
         self._stopwatch = Stopwatch()
@@ -154,14 +210,13 @@ class ControlLoop:
         with self._lock:
             self._wanted, self._problem = edit(self._wanted), ""
 
-    def aim(self, name: str, target: Any, *, owner: Hashable = None, timeout: float | None = None) -> None:
+    def aim(self, name: str, target: Any, *, owner: Hashable = None) -> None:
         """Set the target of a task.
 
         Args:
             name: of the task.
             target: what ``task.replace(target=...)`` takes.
             owner: who leads it; ``release(owner)`` holds the robot where it is.
-            timeout: if no other target comes within this time, the robot is held where it is [s].
 
         Raises:
             KeyError: no such task.
@@ -169,17 +224,10 @@ class ControlLoop:
         """
         if name not in self._wanted.tasks:
             raise unknown_name("task", name, tuple(self._wanted.tasks))
-
-        def aimed(task: Any, target: Any) -> Any:
-            return task.replace(target=target).target
-
-        task = self._wanted.tasks[name]
-        new = jax.vmap(aimed)(task, target) if self._batched else aimed(task, target)
-        until = np.inf if timeout is None else time.monotonic() + timeout
+        task: Any = self._wanted.tasks[name]
+        new = task.replace(target=target).target
         with self._lock:
-            self._leases.pop(name, None)
-            if owner is not None or timeout is not None:
-                self._leases[name] = _Lease(owner, until)
+            self._owners[name] = owner
             self._wanted = with_targets(self._wanted, {name: new})
 
     def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
@@ -188,14 +236,14 @@ class ControlLoop:
             self._wanted = replace(self._wanted, limits=moved(self._wanted.limits, obstacle, position, rotation))
 
     def let_go(self, owner: Hashable) -> None:
-        """Keep the targets where their owner left them, without a timeout."""
+        """Keep the targets where their owner left them."""
         with self._lock:
-            self._leases = {name: lease for name, lease in self._leases.items() if lease.owner != owner}
+            self._owners = {name: other for name, other in self._owners.items() if other != owner}
 
     def release(self, owner: Hashable) -> None:
         """Set the targets of an owner who left to the robot's current pose."""
         with self._lock:
-            left = [name for name, lease in self._leases.items() if lease.owner == owner]
+            left = [name for name, other in self._owners.items() if other == owner]
         if left:
             self._orders.append(lambda: self._hold(left))
 
@@ -229,15 +277,14 @@ class ControlLoop:
         begin = time.perf_counter()
         while self._orders:
             self._orders.popleft()()
-        self._hold(self._abandoned())
         self._lay_out()
         self._show(problem=self._problem)
-        if self._laid is None or self._snapshot.paused:
+        if self._stepper is None or self._snapshot.paused:
             # periods across a pause would count as late
             self._stopwatch.clear()
             return
         try:
-            self._step()
+            self._step(self._stepper)
         except Exception as error:  # numbers that a step refuses, such as a gain that is too large for its time
             self._problem = " ".join(str(error).split())
             self._show(velocity=np.zeros_like(self._snapshot.velocity), failures=self._snapshot.failures + 1)
@@ -248,18 +295,16 @@ class ControlLoop:
         wanted, laid = self._wanted, self._laid
         if wanted is laid or wanted is self._refused:
             return
-        lanes = [lane_of(wanted, lane) for lane in range(len(self._start))] if self._batched else [wanted]
-        if laid is not None and wanted.structure() == laid.structure():
-            for own, new in zip(self._steps, lanes, strict=True):
-                own.tasks, own.scheme, own.limits = dict(new.tasks), new.scheme, new.limits
+        own = self._stepper
+        if laid is not None and own is not None and wanted.structure() == laid.structure():
+            own.tasks, own.scheme, own.limits = dict(wanted.tasks), wanted.scheme, wanted.limits
             self._laid = wanted
             return
         self._show(preparing=True)
         try:
-            steps = [laid_out(self.robot, new, self.dt) for new in lanes]
-            for own, q in zip(steps, self._rows(self._snapshot.q), strict=True):
-                own.step(q)  # compiles what is not the core's, and raises what a task of somebody's own raises
-                own.forget()
+            step = laid_out(self.robot, wanted, self.dt)
+            step.step(self._snapshot.q)  # compiles what is not the core's, and raises what a task of one's own raises
+            step.forget()
         except Exception as error:
             with self._lock:
                 self._refused, self._problem = wanted, " ".join(str(error).split())
@@ -267,37 +312,27 @@ class ControlLoop:
                     self._wanted = laid
             self._show(preparing=laid is None)
             return
-        self._laid, self._steps = wanted, steps
-        self._here(list(wanted.tasks))  # compiled now, so that no step waits for it
+        self._laid, self._stepper = wanted, step
+        targets_here(self.robot, self._snapshot.q, wanted.tasks, wanted.tasks)  # compiled now, so that no step waits
         # a collection over all of JAX's objects takes up to 0.1 s, several periods of the loop
         gc.freeze()
         self._show(ready=True, preparing=False)
 
-    def _rows(self, values: np.ndarray) -> np.ndarray:
-        """Return a row for each robot."""
-        return values if self._batched else values[None]
-
-    def _step(self) -> None:
-        """Run one step; a robot whose answer is unusable stands still."""
+    def _step(self, own: control.Controller) -> None:
+        """Run one step; the robot stands still where the answer is unusable."""
         before = self._snapshot
-        found = [own.step(q) for own, q in zip(self._steps, self._rows(before.q), strict=True)]
-        moved = [
-            own.integrate(at, answer.velocity)
-            for own, at, answer in zip(self._steps, self._rows(before.q), found, strict=True)
-        ]
-        one: Any = jax.tree.map(lambda *rows: np.stack(rows) if self._batched else rows[0], *found)
-        q, codes = np.stack(moved) if self._batched else moved[0], np.asarray(one.status)
-        usable = np.isfinite(q).all(-1, keepdims=True) & (codes != Status.NUMERICAL_ERROR)[..., None]
-        for own, is_usable in zip(self._steps, usable.ravel(), strict=True):
-            if not is_usable:
-                own.forget()
+        found = own.step(before.q)
+        q, status = own.integrate(before.q, found.velocity), int(found.status)
+        usable = bool(np.isfinite(q).all()) and status != Status.NUMERICAL_ERROR
+        if not usable:
+            own.forget()
         self._show(
             time=before.time + self.dt,
-            q=np.where(usable, q, before.q),
-            velocity=np.where(usable, one.velocity, 0.0),
-            status=int(codes.max()),
-            errors=one.error,
-            failures=before.failures + int(np.sum(~usable)),
+            q=q if usable else before.q,
+            velocity=found.velocity if usable else np.zeros_like(before.velocity),
+            status=status,
+            errors=found.error,
+            failures=before.failures + (not usable),
         )
 
     def _show(self, **changes: Any) -> None:
@@ -305,30 +340,27 @@ class ControlLoop:
 
     def _reset(self) -> None:
         """Move the robot to the start, at rest."""
-        for own in self._steps:
-            own.forget()
+        if self._stepper is not None:
+            self._stepper.forget()
         self._show(time=0.0, q=self._start, velocity=np.zeros_like(self._snapshot.velocity), failures=0)
-
-    def _abandoned(self) -> list[str]:
-        """Return the tasks whose target is older than allowed."""
-        now = time.monotonic()
-        return [name for name, lease in list(self._leases.items()) if lease.until < now]
 
     def _hold(self, names: list[str]) -> None:
         """Set the targets of these tasks to the robot's current pose."""
-        if not names:
-            return
-        here = self._here(names)
+        here = targets_here(self.robot, self._snapshot.q, self._wanted.tasks, names)
         with self._lock:
-            self._leases = {name: lease for name, lease in self._leases.items() if name not in names}
+            self._owners = {name: other for name, other in self._owners.items() if name not in names}
             self._wanted = with_targets(self._wanted, here)
 
-    def _here(self, names: list[str]) -> dict[str, Any]:
-        """Return the targets that tasks meet at the robot's current configuration."""
-        wanted = self._wanted.tasks
-        q, tasks = self._snapshot.q, {name: wanted[name] for name in names if name in wanted}
-        if not self._batched:
-            return targets_here(self.robot, q, tasks, names)
-        own = [jax.tree.map(lambda leaf, lane=lane: leaf[lane], tasks) for lane in range(len(q))]
-        each = [targets_here(self.robot, row, lane, names) for row, lane in zip(q, own, strict=True)]
-        return jax.tree.map(lambda *rows: np.stack(rows), *each)
+
+def _percentiles(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:
+    if not len(values):
+        return 0.0, 0.0, 0.0
+    median, late = np.percentile(values, (50.0, 99.0))
+    return float(median), float(late), float(values.max())
+
+
+def be_nice(niceness: int) -> None:
+    """Set the niceness of the calling thread on Linux, where threads have their own; below 0 needs root."""
+    if sys.platform == "linux":
+        with suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), niceness)

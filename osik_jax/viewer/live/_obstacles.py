@@ -1,4 +1,4 @@
-"""Obstacles of a page: the shapes that a ``CollisionAvoidanceLimit`` has in the world or in its scene."""
+"""Obstacles of a page: the shapes that a ``CollisionAvoidanceLimit`` has in its scene."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...collision._convex import ConvexShape, table_shapes
+from ...collision._convex import table_shapes
 from ...collision._core import core_scene, gaps_at
-from ...collision._geometry import Kind
 from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
 from .._parts import Part
@@ -49,23 +48,7 @@ class NearestPair(NamedTuple):
 
 def obstacles_in(limits: Sequence[Limit]) -> dict[str, Obstacle]:
     """Return the obstacles by name."""
-    return {one.name: one for limit in limits for one in (*_added(limit), *_in_scene(limit))}
-
-
-def _added(limit: Limit) -> Iterator[Obstacle]:
-    """Return the balls, capsules and boxes that were added to a collision limit in the world."""
-    if not isinstance(limit, CollisionAvoidanceLimit):
-        return
-    layout, own = limit.layout, len(limit.layout.geoms)
-    places = tuple(
-        np.asarray(part, float) for part in (limit.shapes.position, limit.shapes.rotation, limit.shapes.size)
-    )
-    for number, name in enumerate(layout.names[own:]):
-        position, rotation, size = (part[number] for part in places)
-        segment = ShapeKind.CAPSULE if size[1] > 0.0 else ShapeKind.SPHERE
-        kind = {Kind.SEGMENT: segment, Kind.BOX: ShapeKind.BOX}.get(layout.kinds[own + number])
-        if layout.bodies[own + number] == 0 and kind:
-            yield _obstacle(name, ConvexShape(kind, size, position, rotation))
+    return {one.name: one for limit in limits for one in _in_scene(limit)}
 
 
 def _in_scene(limit: Limit) -> Iterator[Obstacle]:
@@ -75,12 +58,9 @@ def _in_scene(limit: Limit) -> Iterator[Obstacle]:
         return
     for name, body, shape in zip(scene.names, np.asarray(scene.body), table_shapes(scene.table), strict=False):
         if shape.kind in _KINDS and body < 0:
-            yield _obstacle(name, shape)
-
-
-def _obstacle(name: str, shape: ConvexShape) -> Obstacle:
-    mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
-    return Obstacle(name, Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh), shape.position, shape.rotation)
+            mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
+            part = Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh)
+            yield Obstacle(name, part, shape.position, shape.rotation)
 
 
 @lru_cache
@@ -114,11 +94,7 @@ def moved(
     """Return the limits with an obstacle moved."""
 
     def one(limit: Limit) -> Limit:
-        if not isinstance(limit, CollisionAvoidanceLimit):
-            return limit
-        if name in limit.layout.names[len(limit.layout.geoms) :]:
-            return limit.moved(name, position=position, rotation=rotation)
-        if limit.scene is None or name not in limit.scene.names:
+        if not isinstance(limit, CollisionAvoidanceLimit) or limit.scene is None or name not in limit.scene.names:
             return limit
         return limit.replace(scene=limit.scene.moved(name, (position, rotation)))
 

@@ -1,20 +1,16 @@
-"""Pages of ``osik view`` for a robot, with its default tasks and stance, and for a map."""
+"""Page of ``osik view`` for a robot, with its default tasks and stance."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..._errors import OsikValueError, warn
-from ..._npz import open_npz
+from ..._errors import warn
 from ...kinematics import forward_kinematics
 from ...limits import Limit
-from ...reachability import load_map
 from ...robot import Robot
 from ...robot._hands import find_hands
 from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
@@ -22,11 +18,9 @@ from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
 from ...tasks._leaves import angle_scale
 from .._crouch import crouched
-from .._outline import lowest_points
-from .._parts import RobotParts, robot_parts
-from ._page import LiveView, serve
-from ._reach import ReachView, check_map, serve_reach
-from ._session import RobotSource, Session
+from .._parts import RobotParts, lowest_points, robot_parts
+from ._desk import Session
+from ._page import LiveView, serve_session
 from ._surfaces import part_triangles
 
 # gain of the default tasks [1/s]
@@ -44,7 +38,7 @@ soles.
 
 
 def open_robot(
-    robot: Robot, source: RobotSource, feet: Sequence[str], *, limits: tuple[Limit, ...] = (), host: str, port: int
+    robot: Robot, source: str, feet: Sequence[str], *, limits: tuple[Limit, ...] = (), host: str, port: int
 ) -> LiveView:
     """Open a page with a robot to drag; ``feet`` are the frames that stand on the ground."""
     for foot in feet:
@@ -54,27 +48,8 @@ def open_robot(
         warn(f"the page does without mesh files that cannot be read: {', '.join(look.read.missing[:3])}")
     q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
-    session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, source=source)
-    return serve(dataclasses.replace(session, limits=(*session.limits, *limits)), host=host, port=port)
-
-
-def is_map(path: Path) -> bool:
-    """Return whether a file is a map of ``osik reach`` rather than a motion."""
-    try:
-        with open_npz(path) as file:
-            return "reached" in file.files
-    except (OSError, ValueError):
-        return False  # what is wrong with it is told where it is read
-
-
-def open_map(path: Path, robot: Robot, *, host: str, port: int) -> ReachView:
-    """Open a page with a reachability map."""
-    found = load_map(path)
-    try:
-        check_map(robot, found)
-    except ValueError as error:
-        raise OsikValueError(f"{path}: {error}; say which with --robot") from None
-    return serve_reach(robot, found, host=host, port=port)
+    session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, limits=limits, source=source)
+    return serve_session(session, host=host, port=port)
 
 
 def default_session(
@@ -83,7 +58,8 @@ def default_session(
     q: Float[Array, " nq"] | None = None,
     feet: Sequence[str] = (),
     polygon: SupportPolygon | None = None,
-    source: RobotSource | None = None,
+    limits: tuple[Limit, ...] = (),
+    source: str | None = None,
     dt: float = 0.005,
 ) -> Session:
     """Return the default session of a robot; waist and centre of mass are offered but switched off.
@@ -112,7 +88,7 @@ def default_session(
         robot=robot,
         tasks=tasks,
         scheme=WeightedQP(),
-        limits=(),
+        limits=limits,
         dt=dt,
         q=np.asarray(start),
         off=frozenset(led),

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
+import webbrowser
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..._errors import OsikValueError
+from ..._whole_file import write_text
+from ...control import Controller
 from ...control._checks import check_setting, check_tasks, checked_limits
 from ...limits import Limits
 from ...robot import Robot
@@ -17,19 +22,21 @@ from ...robot._mujoco import mujoco_poses, robot_com
 from ...schemes import Scheme
 from ...schemes._default import scheme_for
 from ...tasks import ComTask, SupportPolygon, Task
-from .._outline import floor_height
-from .._parts import robot_parts
-from ._desk import Desk
-from ._gizmos import Gizmos, ObstacleNodes, Pose, gizmo_target
+from .._parts import floor_height, robot_parts
+from ._desk import Desk, Session
+from ._gizmos import Gizmos, ObstacleNodes, Pose
+from ._loop import DRAWING, be_nice
 from ._obstacles import NearestPair, nearest_pair
 from ._panel import Panel
-from ._robot_nodes import RobotNodes
-from ._server import FRAME, WORDS, Driving
-from ._session import RobotSource, Session
-from ._surroundings import add_surroundings
+from ._robot_nodes import RobotNodes, add_surroundings
+from ._server import close_server, open_server
 
 if TYPE_CHECKING:
     from viser import ClientHandle, SceneApi
+_FRAME = 1.0 / 30.0
+"""Time between pictures [s]."""
+_WORDS = 6
+"""Number of pictures between updates of the panel's text."""
 _IN, _OUT, _EDGE, _NEAR = (42, 157, 98), (215, 38, 61), (28, 111, 184), (231, 126, 34)
 _CLOSE, _HELD = 0.05, 1e-3
 """Distance below which the nearest pair is close; distance beyond the one that is kept where it is held off [m]."""
@@ -39,12 +46,15 @@ _TOUCHING = 1e-3
 """Distance beyond a polygon's edge up to which a point counts as inside [m]."""
 
 
-class LiveView(Driving):
+class LiveView:
     """Page that runs a session; ``serve`` says what it has."""
 
     def __init__(self, session: Session, *, host: str, port: int) -> None:
         """Start the server and the loop."""
-        super().__init__(host, port, "osik-jax")
+        self._server = open_server(host, port, "osik-jax")
+        self.url = f"http://{host}:{self._server.get_port()}"
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="osik-page", daemon=True)
         robot = session.robot
         shapes, data = robot_parts(robot), next(mujoco_poses(robot, session.q))
         self._desk = Desk(session)
@@ -66,31 +76,55 @@ class LiveView(Driving):
 
     @property
     def session(self) -> Session:
-        """Return the current session; ``session.save(path)`` writes it."""
+        """Return the current session."""
         return self._desk.session
 
-    def aim(self, task: str, target: Any, *, timeout: float | None = None) -> None:
-        """Set the target of a task; the robot stops if no further call follows within the timeout [s].
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the controller of what is switched on, as ``save_controller`` does."""
+        write_text(path, self.session.to_text())
+
+    def wait(self) -> None:
+        """Block until ``stop`` is called elsewhere, or Ctrl-C."""
+        while not self._end.wait(0.5):
+            pass
+
+    def stop(self) -> None:
+        """End all threads and the server."""
+        self._end.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=2.0)
+        self.loop.stop()
+        close_server(self._server)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def aim(self, task: str, target: Any) -> None:
+        """Set the target of a task.
 
         Raises:
             KeyError: no such task.
             TypeError, ValueError: no such target.
         """
-        self.loop.aim(task, target, timeout=timeout)
+        self.loop.aim(task, target)
 
     def _run(self) -> None:
         """Run the drawing thread."""
+        be_nice(DRAWING)
         count = 0
         while not self._end.is_set():
             begin = time.perf_counter()
             self._draw()
-            if count % WORDS == 0:
+            if count % _WORDS == 0:
                 near = nearest_pair(self._desk.session.active_limits, self.loop.snapshot.q)
                 self._panel.tell(near)
                 show_nearest(self._server.scene, near)
             count += 1
             # a pause even when drawing is late, so that the control loop gets the GIL
-            self._end.wait(max(FRAME - (time.perf_counter() - begin), 0.2 * FRAME))
+            self._end.wait(max(_FRAME - (time.perf_counter() - begin), 0.2 * _FRAME))
 
     def _draw(self) -> None:
         """Draw the current state of the robot."""
@@ -116,9 +150,12 @@ class LiveView(Driving):
     def _drag(self, name: str, pose: Pose, visitor: int, phase: str) -> None:
         """Apply a visitor's drag of a handle; a visitor who left stops the robot."""
         if phase != "end":
-            self.loop.aim(name, gizmo_target(self._desk.session.tasks[name], pose), owner=visitor)
+            target = self._desk.session.tasks[name].gripped(pose[0], pose[1] / np.linalg.norm(pose[1]))
+            self.loop.aim(name, target, owner=visitor)
+        elif visitor in self._server.get_clients():
+            self.loop.let_go(visitor)
         else:
-            self._let_go(visitor)
+            self.loop.release(visitor)
 
     def _gone(self, client: ClientHandle) -> None:
         """Release the handles and the dragged robots of a visitor who closed the page."""
@@ -128,14 +165,14 @@ class LiveView(Driving):
 
 
 def serve(
-    robot: Robot | Session,
+    robot: Robot | Controller,
     tasks: Mapping[str, Task] | None = None,
     *,
     scheme: Scheme | None = None,
     limits: Limits | None = None,
     dt: float | None = None,
     q0: Float[Array, " nq"] | None = None,
-    source: RobotSource | str | None = None,
+    source: str | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     open_browser: bool = False,
@@ -146,13 +183,13 @@ def serve(
     ``view.wait()`` keeps a program going until Ctrl-C.
 
     Args:
-        robot: the robot; or a session, alone with the page's address: it has the rest.
+        robot: the robot; or a controller, such as one of ``load_controller``, which has the next four.
         tasks: by name. Frame tasks and centres of mass that have a target get a handle to drag.
         scheme: as in ``osik_jax.solve``.
         limits: as in ``osik_jax.solve``.
         dt: time of a step, and period of the loop [s]. Default: 0.005.
         q0: configuration at the start [m, rad]; default: ``robot.q0``. (nq,)
-        source: name or file of the robot, which sessions then keep.
+        source: name or file of the robot, as in ``save_controller``.
         host: address to listen at; 127.0.0.1 is this machine alone.
         port: TCP port; 0 for any that is free.
         open_browser: whether to open the page in a browser.
@@ -161,9 +198,8 @@ def serve(
         The view.
 
         - ``url``: address of the page.
-        - ``aim(task, target, timeout=None)``: sets the target of a task, as ``replace(target=...)`` takes it; the robot
-            stops if no further call follows within the timeout [s].
-        - ``session``: the present controller. ``save(path)`` writes it for ``load_session``.
+        - ``aim(task, target)``: sets the target of a task, as ``replace(target=...)`` takes it.
+        - ``save(path)``: writes the present controller for ``load_controller``.
         - ``loop``: the control loop. ``wait_until_ready()`` returns when the controller is compiled;
             ``snapshot`` has the last step's ``q`` and ``status``, ``timing`` the loop's times.
         - ``wait()`` keeps a program going until Ctrl-C; ``stop()`` ends page and loop, as the end of ``with`` does.
@@ -171,38 +207,28 @@ def serve(
     Raises:
         ImportError: viser is not installed (the extra ``viewer``).
         OSError: the port is in use.
-        TypeError, ValueError: as in ``osik_jax.solve``; parts of a controller beside a session.
+        TypeError, ValueError: as in ``osik_jax.solve``; parts of a controller beside one.
     """
-    if isinstance(robot, Session):
-        _check_alone(tasks=tasks, scheme=scheme, limits=limits, dt=dt, q0=q0, source=source)
-        session = robot
-    else:
-        tasks = {} if tasks is None else tasks
-        start = robot.q0 if q0 is None else q0
-        robot.check_configuration(start, "q0")
-        session = Session(
-            robot=robot,
-            tasks=dict(tasks),
-            scheme=scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme,
-            limits=checked_limits(robot, limits) or (),
-            dt=0.005 if dt is None else dt,
-            q=np.asarray(start),
-            source=RobotSource(source) if isinstance(source, str) else source,
-        )
-    check_setting("serve(robot, tasks)", session.robot, session.scheme, session.dt)
-    check_tasks(session.tasks, session.robot)
-    checked_limits(session.robot, session.limits)
-    return LiveView(session, host=host, port=port).opened(open_browser)
+    if isinstance(robot, Controller):
+        if any(part is not None for part in (tasks, scheme, limits, dt)):
+            raise OsikValueError("a controller has its own tasks, scheme, limits and dt: leave out what is beside it")
+        robot, tasks, scheme, limits, dt = robot.robot, robot.tasks, robot.scheme, robot.limits, robot.dt
+    tasks, given = dict(tasks or {}), checked_limits(robot, limits) or ()
+    start, period = robot.q0 if q0 is None else q0, 0.005 if dt is None else dt
+    robot.check_configuration(start, "q0")
+    check_setting("serve(robot, tasks)", robot, scheme, period)
+    check_tasks(tasks, robot)
+    used = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+    session = Session(robot, tasks, used, given, period, np.asarray(start), source=source)
+    return serve_session(session, host=host, port=port, open_browser=open_browser)
 
 
-def _check_alone(**parts: Any) -> None:
-    """Raise ValueError if a part of a controller is given beside a session, which has all of them."""
-    given = [name for name, part in parts.items() if part is not None]
-    if given:
-        raise OsikValueError(
-            f"a session has its own {', '.join(given)}: leave out what is given beside it, or change the session by "
-            "dataclasses.replace(session, ...), where q0 is called q"
-        )
+def serve_session(session: Session, *, host: str, port: int, open_browser: bool = False) -> LiveView:
+    """Return the page of a session."""
+    view = LiveView(session, host=host, port=port)
+    if open_browser:
+        webbrowser.open(view.url)
+    return view
 
 
 def _polygon(tasks: Mapping[str, Task]) -> SupportPolygon | None:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
-from ...limits import Limit, NoLimits
-from ...tasks import AdaptiveGain
+from ...limits import NoLimits
+from ...saving._controller import read_controller
+from ...solvers import Status
+from ...tasks import AdaptiveGain, Task
 from ._desk import SCHEMES, Desk
+from ._loop import Snapshot, Timing
 from ._obstacles import NearestPair
-from ._readout import error_table, state_text, timing_text
-from ._server import show_texts
-from ._session import session_from_json
 
 if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
 
-_LIMIT_WORDS = {
-    "ConfigurationLimit": "joint ranges",
-    "VelocityLimit": "joint speeds",
-    "AccelerationLimit": "joint accelerations",
-    "CollisionAvoidanceLimit": "collisions",
-}
+_VISIBLE = 5e-4
+"""Distance [m or rad] outside of bounds below which an error counts as inside: it would read as 0 mm outside."""
 _WEIGHTS, _GAINS, _PRIORITIES = (-4.0, 6.0), (0.0, 60.0), (1, 6)
 
 
@@ -42,8 +39,8 @@ class Panel:
             self._add_tasks()
         with tabs.add_tab("Limits"):
             self._add_limits()
-        with tabs.add_tab("Session"):
-            self._add_session()
+        with tabs.add_tab("File"):
+            self._add_file()
         self.refill()
 
     def tell(self, near: NearestPair | None) -> None:
@@ -55,10 +52,12 @@ class Panel:
             (self._errors, error_table(session.tasks, session.off, snapshot.errors)),
             (self._near, f"{near.names[0]} and {near.names[1]}: {1e3 * near.distance:.0f} mm" if near else ""),
         )
-        show_texts(texts)
+        for handle, text in texts:
+            if handle.content != text:  # what is shown already is not sent again
+                handle.content = text
 
     def refill(self) -> None:
-        """Show the session after tasks changed or another session was loaded."""
+        """Show the session after tasks changed or another controller was loaded."""
         session = self._desk.session
         for box in self._boxes.values():
             box.remove()
@@ -124,7 +123,7 @@ class Panel:
             for number, limit in enumerate(session.limits):
                 if isinstance(limit, NoLimits):
                     continue
-                self._switch_limit(_words(limit), number not in session.limits_off, number)
+                self._switch_limit(type(limit).__name__, number not in session.limits_off, number)
 
     def _switch_limit(self, words: str, on: bool, number: int) -> None:
         """Add a switch for a limit."""
@@ -132,21 +131,21 @@ class Panel:
         box.on_update(self._guarded(lambda event: self._desk.switch_limit(number, event.target.value)))
         self._limit_boxes.append(box)
 
-    def _add_session(self) -> None:
+    def _add_file(self) -> None:
         gui = self._server.gui
-        save = gui.add_button("Download session.json")
-        load = gui.add_upload_button("Load a session", mime_type="application/json")
+        save = gui.add_button("Download controller.json")
+        load = gui.add_upload_button("Load a controller", mime_type="application/json")
         save.on_click(self._guarded(self._send))
         load.on_upload(self._guarded(lambda event: self._load(event.target.value.content)))
 
     def _load(self, content: bytes) -> None:
-        self._desk.load(session_from_json(content.decode("utf-8", errors="replace"), "the file"))
+        self._desk.load(read_controller(content, "the file"))
         self.refill()
 
     def _send(self, event: Any) -> None:
-        """Send the session to the visitor who asked for it."""
-        content = self._desk.session.to_json().encode()
-        event.client.send_file_download("session.json", content, save_immediately=True)
+        """Send the controller of what is switched on to the visitor who asked for it."""
+        content = self._desk.session.to_text().encode()
+        event.client.send_file_download("controller.json", content, save_immediately=True)
 
     @property
     def _name(self) -> str:
@@ -191,7 +190,52 @@ class Panel:
         return answer
 
 
-def _words(limit: Limit) -> str:
-    """Return the label of a limit's switch."""
-    kind = type(limit).__name__
-    return _LIMIT_WORDS.get(kind, kind)
+def state_text(snapshot: Snapshot) -> str:
+    """Return one line on whether the loop runs, and how well."""
+    if snapshot.problem:
+        return f"**refused:** {snapshot.problem}"
+    if not snapshot.ready:
+        return "**compiling the first step …**"
+    doing = "**paused**" if snapshot.paused else "**running**"
+    if snapshot.preparing:
+        doing += " · compiling the change …"
+    return doing
+
+
+def timing_text(snapshot: Snapshot, timing: Timing) -> str:
+    """Return status and time of the last step, and the rate of the loop, as text."""
+    status = Status(snapshot.status).name.lower().replace("_", " ")
+    if not timing.steps:
+        return status
+    rate = 1.0 / timing.period[0] if timing.period[0] > 0.0 else 0.0
+    return f"{status} · step {1e3 * timing.step[0]:.2f} ms · {rate:.0f} Hz, period p99 {1e3 * timing.period[1]:.1f} ms"
+
+
+def error_table(tasks: Mapping[str, Task], off: frozenset[str], errors: Mapping[str, np.ndarray]) -> str:
+    """Return a table of the errors of the active tasks."""
+    rows = [f"| {name} | {error_text(task, errors.get(name))} |" for name, task in tasks.items() if name not in off]
+    return "\n".join(["| task | error |", "|:--|--:|", *rows])
+
+
+def error_text(task: Task, error: Float[np.ndarray, " m"] | None) -> str:
+    """Return an error with its unit; for an inequality, its violation."""
+    if error is None:
+        return "…"
+    bounds = task.error_bounds()
+    if bounds is None:
+        return _length_text(task, error)
+    lower, upper = (np.asarray(bound) for bound in bounds)
+    outside = np.maximum(lower - error, error - upper)
+    if outside.max() > _VISIBLE:
+        return f"{_length_text(task, np.maximum(outside, 0.0))} outside"
+    return f"{-1e3 * outside.max():.0f} mm inside" if task.unit_of("error") == "m" else "inside"
+
+
+def _length_text(task: Task, error: Float[np.ndarray, " m"]) -> str:
+    """Return the length of an error: of rows in metres in mm, of rows in radians in degrees, of others as a number."""
+    unit = task.unit_of("error")
+    if unit not in ("m", "rad", "m or rad"):
+        return f"{np.linalg.norm(error):.3g}"
+    lengths = task.are_lengths(len(error))
+    parts = [f"{1e3 * np.linalg.norm(error[lengths]):.1f} mm"] if lengths.any() else []
+    return ", ".join([*parts, *([] if lengths.all() else [f"{np.rad2deg(np.linalg.norm(error[~lengths])):.1f}°"])])

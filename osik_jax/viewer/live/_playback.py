@@ -1,28 +1,30 @@
-"""Player of motions: time slider, speed, and one robot per run side by side."""
+"""Motions, their files, and pages that play them without a server: one robot per run, side by side."""
 
 from __future__ import annotations
 
 import dataclasses
+import html
 import os
-import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ..._errors import OsikValueError
 from ..._npz import open_npz
+from ...control import Trajectory
 from ...robot import Robot
 from ...robot._mujoco import mujoco_poses
-from .._outline import floor_height
-from .._parts import robot_parts
-from ._robot_nodes import RobotNodes, add_label, side_by_side
-from ._server import FRAME, Served
+from .._parts import floor_height, robot_parts
+from ._robot_nodes import RobotNodes, add_label, add_surroundings, side_by_side
+from ._server import close_server, open_server
 from ._stick_figure import StickFigure, StickNodes
-from ._surroundings import add_surroundings
 
-_SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+_PICTURES = 30.0
+"""Number of pictures kept per second."""
 _RATE = 200.0
 """Sample rate of an array without times [Hz]."""
 
@@ -118,8 +120,8 @@ def _times(name: str, count: int, arrays: Mapping[str, np.ndarray]) -> Float[np.
 class Cast:
     """Robots of a motion, side by side in one scene, and on their left the person, as large as a robot."""
 
-    def __init__(self, server: Any, robot: Robot, motion: Motion, *, panel: bool) -> None:
-        """Add a robot per run, the floor and a camera, optionally with room for a panel."""
+    def __init__(self, server: Any, robot: Robot, motion: Motion) -> None:
+        """Add a robot per run, the floor and a camera."""
         shapes, self._robot, self._motion = robot_parts(robot), robot, motion
         spans = np.concatenate([_span(robot, shapes, q) for q in motion.runs.values()])
         first = next(iter(motion.runs.values()))
@@ -131,7 +133,7 @@ class Cast:
             spans = np.concatenate([spans, person.points.reshape(-1, 3)])
         offsets = side_by_side(spans, len(motion.runs) + (person is not None))
         seen = np.concatenate([spans + offset for offset in offsets])
-        add_surroundings(server, seen, floor, panel=panel)
+        add_surroundings(server, seen, floor, panel=False)
         if person is not None:
             self._person = StickNodes(server.scene, person, offsets[0])
             add_label(server.scene, "person", person.points.reshape(-1, 3) + offsets.pop(0))
@@ -155,26 +157,67 @@ def _span(robot: Robot, shapes: Any, q: Float[np.ndarray, "T nq"]) -> Float[np.n
     return np.concatenate([shapes.corners(data) for data in mujoco_poses(robot, chosen)])
 
 
-class Player(Served):
-    """Page that plays a motion in a loop."""
+def export_html(
+    robot: Robot,
+    trajectory: Trajectory | ArrayLike | Mapping[str, ArrayLike],
+    path: str | os.PathLike[str],
+    *,
+    dt: float | None = None,
+    title: str = "osik-jax",
+) -> Path:
+    """Write a motion as one self-contained page with time slider, speeds and a mouse-controlled camera.
 
-    def __init__(self, robot: Robot, motion: Motion, *, host: str, port: int, title: str) -> None:
-        """Start the server and the playback."""
-        super().__init__(host, port, title)
-        self._cast, self._motion = Cast(self._server, robot, motion, panel=True), motion
-        gui = self._server.gui
-        self._time = gui.add_slider("Time [s]", 0.0, max(motion.duration, 1e-3), step=1e-3, initial_value=0.0)
-        self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
-        self._play = gui.add_checkbox("Play", initial_value=True)
-        self._thread.start()
+    Everything is in the file, which any browser with WebGL plays offline; it is about 1 MB and what the robot's meshes
+    take.
 
-    def _run(self) -> None:
-        before = time.perf_counter()
-        while not self._end.wait(FRAME):
-            now = time.perf_counter()
-            if self._play.value:
-                ahead = self._time.value + (now - before) * float(self._speed.value)
-                self._time.value = round(ahead, 3) if ahead <= self._motion.duration else 0.0
-            before = now
-            with self._server.atomic():
-                self._cast.show(float(self._time.value))
+    Args:
+        robot: the robot.
+        trajectory: of ``rollout``, or configurations (T, nq), or several of them by name, side by side.
+        path: of the page.
+        dt: time between configurations [s]; default: that of the trajectory, or 0.005.
+        title: of the page.
+
+    Returns:
+        The path.
+
+    Raises:
+        ImportError: viser is not installed (the extra ``viewer``).
+        ValueError: configurations of another robot, or none.
+    """
+    return write_page(robot, _motion(robot, trajectory, dt), Path(path), title=title)
+
+
+def write_page(robot: Robot, motion: Motion, out: Path, *, title: str) -> Path:
+    """Write the page of an already loaded motion."""
+    server = open_server("127.0.0.1", 0, title)
+    try:
+        cast = Cast(server, robot, motion)
+        serializer = server.get_scene_serializer()
+        count = max(int(np.ceil(motion.duration * _PICTURES)), 1)
+        for now in np.linspace(0.0, motion.duration, count + 1):
+            cast.show(float(now))
+            serializer.insert_sleep(motion.duration / count)
+        page = serializer.as_html()
+    finally:
+        close_server(server)
+    page = page.replace("<title>Viser</title>", f"<title>{html.escape(title, quote=False)}</title>", 1)
+    out.write_text(page, encoding="utf-8")
+    return out
+
+
+def _motion(robot: Robot, trajectory: Any, dt: float | None) -> Motion:
+    """Return the checked runs with their times."""
+    if isinstance(trajectory, Trajectory):
+        period = float(trajectory.time[1] - trajectory.time[0]) if len(trajectory.time) > 1 else 0.005
+        trajectory, dt = trajectory.q, period if dt is None else dt
+    given = trajectory if isinstance(trajectory, Mapping) else {"motion": trajectory}
+    runs = {str(name): np.asarray(q, float) for name, q in given.items()}
+    for name, q in runs.items():
+        if q.ndim != 2 or len(q) == 0 or q.shape[1] != robot.nq or not np.isfinite(q).all():
+            raise OsikValueError(f"run {name!r} has shape {q.shape}; it is configurations (T, {robot.nq}), all finite")
+    period = 0.005 if dt is None else float(dt)
+    if not (runs and np.isfinite(period) and period > 0.0):
+        raise OsikValueError(
+            f"there are {len(runs)} runs and dt is {period}; it takes one at least, and a positive time"
+        )
+    return Motion(runs, {name: np.arange(len(q)) * period for name, q in runs.items()})

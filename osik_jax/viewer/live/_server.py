@@ -1,105 +1,27 @@
-"""Web server of a page, on exactly the requested port."""
+"""Web server of a page, on exactly the requested port, and which other pages may connect to it."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import io
+import ipaddress
 import socket
-import threading
-import webbrowser
-from abc import ABC, abstractmethod
-from collections.abc import Iterable
+import sys
 from types import ModuleType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from ..._errors import missing_extra
-from ._loop import ControlLoop
-from ._timing import DRAWING, be_nice
-from ._visitors import guard
 
 if TYPE_CHECKING:
-    from viser import GuiMarkdownHandle, ViserServer
+    from viser import ViserServer
 
-FRAME = 1.0 / 30.0
-"""Time between pictures [s]."""
-WORDS = 6
-"""Number of pictures between updates of the panel's text."""
 _BLUE = (28, 111, 184)
-
-
-class Served(ABC):
-    """Base class of a page with a thread that runs ``_run`` until ``_end`` is set.
-
-    Attributes:
-        url: address of the page.
-    """
-
-    def __init__(self, host: str, port: int, title: str) -> None:
-        """Start the server."""
-        self._server = open_server(host, port, title)
-        self.url = f"http://{host}:{self._server.get_port()}"
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._draw_all, name="osik-page", daemon=True)
-
-    def opened(self, browser: bool) -> Self:
-        """Return the page, after opening it in a browser if that is wanted."""
-        if browser:
-            webbrowser.open(self.url)
-        return self
-
-    def wait(self) -> None:
-        """Block until ``stop`` is called elsewhere, or Ctrl-C."""
-        while not self._end.wait(0.5):
-            pass
-
-    def stop(self) -> None:
-        """End all threads and the server."""
-        self._end.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout=2.0)
-        self._close()
-        close_server(self._server)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def _draw_all(self) -> None:
-        be_nice(DRAWING)
-        self._run()
-
-    @abstractmethod
-    def _run(self) -> None:
-        """Draw in a thread of its own until ``_end`` is set."""
-
-    def _close(self) -> None:  # noqa: B027 (a page that plays a file runs nothing)
-        """End everything that runs beside the page."""
-
-
-class Driving(Served):
-    """Base class of a page that runs a control loop, whose handles several visitors may drag."""
-
-    loop: ControlLoop
-
-    def _let_go(self, visitor: int) -> None:
-        """Keep the targets of a visitor who let go of a handle; stop the robot of a visitor who has left."""
-        if visitor in self._server.get_clients():
-            self.loop.let_go(visitor)
-        else:
-            self.loop.release(visitor)
-
-    def _close(self) -> None:
-        self.loop.stop()
-
-
-def show_texts(texts: Iterable[tuple[GuiMarkdownHandle, str]]) -> None:
-    """Show each text by its handle; one that is shown already is not sent again."""
-    for handle, text in texts:
-        if handle.content != text:
-            handle.content = text
+POLICY_VIOLATION = 1008
+"""Close code of a websocket (RFC 6455, 7.4.1)."""
+_LONGEST = 120
+"""Characters of a reason that are printed."""
 
 
 def import_viser() -> ModuleType:
@@ -145,3 +67,60 @@ def check_port(host: str, port: int) -> int:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise OSError(f"cannot listen at {host}, port {port}: {reason}") from error
+
+
+def guard(server: Any) -> None:
+    """Refuse connections of pages of other sites, with one line on stderr each.
+
+    viser has no option for it. Its websocket server awaits this callback before it reads the first message.
+    """
+    sockets = server._websock_server
+
+    async def admit(client: Any) -> None:
+        connection = sockets._live_connections[client.client_id]
+        headers = connection.request.headers
+        if not is_own_page(headers.get("Origin"), headers.get("Host", ""), sockets._host):
+            _tell(f"refused a connection from a page of {headers.get('Origin')}: open {server_url(server)}")
+            connection.recv = _nothing_of(connection)
+            await connection.close(POLICY_VIOLATION, "a page of another site")
+
+    sockets.on_client_connect(admit)
+
+
+def server_url(server: Any) -> str:
+    """Return the address of a server's page."""
+    return f"http://{server.get_host()}:{server.get_port()}"
+
+
+def is_own_page(origin: str | None, host: str, listens_at: str) -> bool:
+    """Return whether a connection comes from the server's own page, or from a program that is no browser.
+
+    ``origin`` and ``host`` are headers of the request: browsers always send the first, the second is the address that
+    was opened. A server that listens at this machine alone is opened by no other name, so that a foreign name that
+    resolves to this machine (DNS rebinding) is refused.
+    """
+    if origin is None:
+        return True
+    page, opened = urlsplit(origin), urlsplit(f"//{host}")
+    return page.netloc.lower() == host.lower() and (not _is_loopback(listens_at) or _is_loopback(opened.hostname or ""))
+
+
+def _is_loopback(name: str) -> bool:
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return name.lower() == "localhost"
+
+
+def _nothing_of(connection: Any) -> Any:
+    """Return a function that ends a closed connection's reader; ``recv`` would first hand out what had arrived."""
+
+    async def end() -> bytes:
+        await connection.wait_closed()
+        raise connection.protocol.close_exc
+
+    return end
+
+
+def _tell(text: str) -> None:
+    print(f"osik view: {' '.join(text.split())[:_LONGEST]}", file=sys.stderr, flush=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ... import control
-from ..._errors import OsikTypeError, OsikValueError, OsikWarning
+from ..._errors import OsikTypeError, OsikWarning
 from ...kinematics import forward_kinematics
 from ...limits import Limit
 from ...robot import Robot
@@ -76,18 +76,3 @@ def laid_out(robot: Robot, controller: Controller, dt: float) -> control.Control
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", OsikWarning)
         return control.Controller(robot, controller.tasks, scheme=controller.scheme, limits=controller.limits, dt=dt)
-
-
-def lane_of(controller: Controller, lane: int) -> Controller:
-    """Return the controller of one robot of a batch."""
-    return jax.tree.map(lambda leaf: leaf[lane], controller)
-
-
-def stacked(controllers: Sequence[Controller]) -> Controller:
-    """Return one controller for a batch; each number has a leading axis."""
-    first = controllers[0]
-    if any(one.structure() != first.structure() for one in controllers):
-        raise OsikValueError(
-            "the robots of a batch differ in more than numbers: they need tasks of the same names and kinds"
-        )
-    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *controllers)

@@ -1,4 +1,7 @@
-"""Motions of NAO with full dynamics."""
+"""The motions of ``osik demo`` in MuJoCo, fed back from what is sensed: ``python -m benchmarks.nao_physics``.
+
+Prints how far the base is off the kinematic motion, how far standing feet slip, and what the servos use.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,14 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ..physics import Servo, Simulation, build_world, simulate
-from ..physics._loop import Recording
-from ..tasks import PostureTask, Task
-from ._motion import Motion
-from ._observed import observe
-from ._run import Run, make_scheme, run_scheme
+from osik_jax.demo._motion import Motion
+from osik_jax.demo._nao import double_support, single_support
+from osik_jax.demo._observed import observe
+from osik_jax.demo._run import TITLES, Run, make_scheme, run_scheme
+from osik_jax.physics import Servo, Simulation, build_world, simulate
+from osik_jax.physics._loop import Recording
+from osik_jax.runtime import configure_cpu
+from osik_jax.tasks import PostureTask, Task
 
 _LEGS: dict[str, Servo] = dict.fromkeys(("*Hip*", "*Knee*", "*Ankle*"), Servo(stiffness=150.0, damping=5.0))
 """Position servos of NAO's legs at the torque limits of its motors; other servos are those of its model."""
@@ -79,3 +84,23 @@ def _angle(a: Float[np.ndarray, "T 4"], b: Float[np.ndarray, "T 4"]) -> Float[np
     """Return the angle between unit quaternions [rad], by the chord between them, which is accurate for small ones."""
     chord = np.minimum(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return 4.0 * np.arcsin(0.5 * chord)
+
+
+def main() -> None:
+    """Runs both motions with each scheme."""
+    for motion in (double_support(), single_support()):
+        for scheme in TITLES:
+            run = run_physics(motion, scheme, dt=0.005)
+            height, tilt, effort = (a.max() for a in (run.height_error, run.tilt_error, run.effort_used))
+            drift, inside = np.nanmax(run.seen.drift), run.seen.com_inside.min()
+            print(
+                f"{motion.name}, {scheme}: fell {run.recording.fell}; base at most {1e3 * height:.2f} mm and "
+                f"{np.degrees(tilt):.2f} deg off the plan; feet {1e3 * drift:.2f} mm off their place; mass inside by "
+                f"{1e3 * inside:.0f} mm; effort {effort:.2f} of the greatest"
+            )
+
+
+if __name__ == "__main__":
+    configure_cpu()
+    jax.config.update("jax_enable_x64", True)
+    main()
