@@ -28,7 +28,6 @@ from osik_jax.retargeting import (
     Retargeter,
     RobotMotion,
     _plan,
-    fit,
     guess_profile,
     load_motion,
     load_profile,
@@ -42,7 +41,6 @@ from osik_jax.retargeting._body import Build, pairs_apart
 from osik_jax.retargeting._contact import find_contact, find_ground
 from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
-from osik_jax.retargeting._fit import LOSS, _Setting
 from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._link_shapes import shrunk
 from osik_jax.retargeting._notes import notes
@@ -612,7 +610,7 @@ def test_a_g1_is_guessed_from_its_urdf():
     assert (guess.pelvis, guess.torso) == ("pelvis", "torso_link")
     for role in ("left_knee", "right_elbow", "left_wrist", "right_shoulder"):
         assert guess.keypoints[role][0] == own.keypoints[role][0]
-        np.testing.assert_allclose(own.keypoints[role][1], guess.keypoints[role][1], atol=0.02)  # a fit moves it
+        np.testing.assert_allclose(own.keypoints[role][1], guess.keypoints[role][1], atol=0.02)
 
 
 @pytest.mark.variants(release=["romeo_description/urdf/romeo.urdf-l_wrist"])
@@ -642,7 +640,7 @@ def test_talos_comes_with_a_profile_whose_soles_are_those_of_its_urdf():
         np.testing.assert_allclose(corners, 0.5 * signs * [length, width, 0.0])
     made, guessed = (Build.of(talos, profile).points for profile in (own, guess_profile(talos)))
     for role in NEEDED:
-        np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))  # what a fit may move it by
+        np.testing.assert_allclose(made[role], guessed[role], atol=0.02 * np.sqrt(3.0))
 
 
 @pytest.mark.release
@@ -836,15 +834,6 @@ def test_profiles_come_back_and_say_what_is_wrong(nao, tmp_path):
             load_profile(tmp_path / "broken.toml")
 
 
-def test_a_fit_needs_clips_and_steps(nao, dance):
-    with pytest.raises(ValueError, match="no clips to learn from"):
-        fit(nao, [])
-    with pytest.raises(ValueError, match="steps is 0"):
-        fit(nao, [load_motion(dance)], steps=0)
-    with pytest.raises(KeyError, match="no loss term 'slop'; did you mean 'slip'"):
-        fit(nao, [load_motion(dance)], loss={"slop": 1.0})
-
-
 def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
     motion = load_motion(dance)
     short = dataclasses.replace(motion, positions=motion.positions[:2], rotations=None)
@@ -852,38 +841,3 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
         retarget(nao, short)
     with pytest.raises(ValueError, match="has no left_hip"):
         retarget(nao, HumanMotion("clip", 30.0, ("Hips",), np.zeros((5, 1, 3))))
-
-
-@pytest.mark.release
-def test_the_gradient_of_a_fit_is_the_slope_of_its_loss(nao, dance):
-    """By central differences, over plans that go on from the same one; what the gradient leaves out is small here."""
-    own = load_profile("nao")
-    own = dataclasses.replace(own, weights=dataclasses.replace(own.weights, smooth=2.0))
-    setting = _Setting(Retargeter(nao, profile=own), LOSS)
-    (problem,), _ = setting.problems([load_motion(dance)], [], None)
-    here, step = setting.origin(), 0.05
-    _, slope, plan = setting.slope(here, problem, setting.plan(here, problem))
-
-    def loss_at(move):
-        moved = here._replace(weights={**here.weights, "smooth": here.weights["smooth"] + move})
-        return setting.slope(moved, problem, plan)[0]
-
-    assert float(slope.weights["smooth"]) == pytest.approx((loss_at(step) - loss_at(-step)) / (2.0 * step), rel=0.02)
-
-
-@pytest.mark.release
-def test_a_fit_lowers_the_loss_of_what_it_learns_from_and_of_what_it_does_not(nao, dance, tmp_path, capsys):
-    """From a profile that smooths too much; the file is what the command writes."""
-    start = load_profile("nao")
-    start = dataclasses.replace(start, weights=dataclasses.replace(start.weights, smooth=2.0))
-    motion = load_motion(dance)
-    assert motion.rotations is not None
-    backwards = dataclasses.replace(motion, positions=motion.positions[::-1], rotations=motion.rotations[::-1])
-    found = fit(nao, [motion], profile=start, held_out=[backwards], steps=6)
-    assert found.losses[0] == pytest.approx(1.0) and found.held_out[0] == pytest.approx(1.0)
-    assert found.step > 0
-    assert found.losses[found.step] < 0.95
-    assert found.held_out[found.step] == found.held_out.min() < 0.95
-    assert float(found.profile.weights.smooth) < 2.0
-    save_profile(found.profile, tmp_path / "robot.toml")
-    assert load_profile(tmp_path / "robot.toml") == found.profile
