@@ -41,7 +41,7 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH file, keypoints as .npz or .csv, or a folder of such files."""
+    """A BVH file, keypoints as .npz, or a folder of such files."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"

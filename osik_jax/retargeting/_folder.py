@@ -63,7 +63,7 @@ def retarget_folder(
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
-    """Retarget every ``.bvh``, ``.npz`` and ``.csv`` file directly inside a folder.
+    """Retarget every ``.bvh`` and ``.npz`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
     also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with

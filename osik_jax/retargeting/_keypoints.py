@@ -1,4 +1,4 @@
-"""Reader of keypoint files: joint positions as arrays (.npz) or as a table (.csv)."""
+"""Reader of keypoint files: joint positions as arrays (.npz)."""
 
 from __future__ import annotations
 
@@ -10,32 +10,26 @@ import numpy as np
 
 from .._errors import OsikValueError
 from .._npz import open_npz
-from ..numerics._columns import read_columns
-from ._motion import CONTACT_POINTS, HumanMotion
+from ._motion import HumanMotion
 from ._rotations import continuous
 from ._smpl import arrays_to_read, is_smpl, read_smpl
 from ._up import Up, checked_up, find_rest_up, standing_up
 
-_AXES = ("x", "y", "z")
-
 
 def read_keypoints(path: str | os.PathLike[str], *, up: Up | None = None) -> HumanMotion:
-    """Read ``.npz`` or ``.csv`` keypoints [m], z up.
+    """Read ``.npz`` keypoints [m], z up.
 
-    ``.npz``: ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
+    The arrays are ``fps``, ``positions`` (F, J, 3), ``joint_names`` (J,); optional ``rotations`` (F, J, 4; w x y z),
     ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or F, 2; left, right),
     ``ground``, ``object.NAME`` (F, 7; position and w x y z) and ``touch.ROLE.NAME`` (F,). Nothing is
     unpickled.
 
-    ``.csv``: a header line with ``time`` and ``NAME.x``, ``NAME.y``, ``NAME.z`` of each joint, optionally
-    ``contact.left_heel`` and so on (0 or 1); then one line per frame at a constant rate.
-
-    A ``.npz`` with ``poses`` and ``trans`` is read as in AMASS (SMPL, SMPL-H or SMPL-X).
+    A file with ``poses`` and ``trans`` is read as in AMASS (SMPL, SMPL-H or SMPL-X).
 
     ``up`` and errors are those of ``load_motion``.
     """
     up, source = checked_up(up), Path(path)
-    motion = _from_csv(source) if str(path).lower().endswith(".csv") else _from_npz(source)
+    motion = _from_npz(source)
     return standing_up(str(path), motion, up, "z", find_rest_up(motion))
 
 
@@ -96,41 +90,3 @@ def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
     if values.size != 1:
         raise OsikValueError(f"{path}: {name} is one number, not {values.size}")
     return float(values[0])
-
-
-def _from_csv(path: Path) -> HumanMotion:
-    """Return the motion in a CSV table."""
-    columns = read_columns(path)
-    time = columns.pop("time", None)
-    if time is None:
-        raise OsikValueError(f"{path}, line 1: no column is called time; columns: {', '.join(columns)}")
-    flags = [columns.pop(name) for name in [f"contact.{point}" for point in CONTACT_POINTS] if name in columns]
-    names = tuple(dict.fromkeys(name.rpartition(".")[0] for name in columns))
-    wrong = sorted({f"{name}.{axis}" for name in names for axis in _AXES}.symmetric_difference(columns))
-    if wrong or not names:
-        raise OsikValueError(
-            f"{path}, line 1: a joint has the three columns NAME.x, NAME.y and NAME.z; missing or of no joint: "
-            f"{', '.join(wrong) or 'all'}"
-        )
-    return HumanMotion(
-        name=path.stem,
-        fps=_rate(path, time),
-        joint_names=names,
-        positions=np.stack([np.stack([columns[f"{name}.{axis}"] for axis in _AXES], -1) for name in names], 1),
-        contact=np.stack(flags, -1) > 0.5 if len(flags) == len(CONTACT_POINTS) else None,
-    )
-
-
-def _rate(path: Path, time: np.ndarray) -> float:
-    """Return the frame rate [1/s]; raise ValueError unless the times are evenly spaced to a tenth of a step."""
-    if len(time) < 2:
-        raise OsikValueError(f"{path} has one frame; it needs two, whose times say the rate")
-    steps = np.diff(time)
-    step = np.median(steps)
-    # files round their times, so a tenth of a step is allowed; more is a gap
-    uneven = np.flatnonzero((np.abs(steps - step) > 0.1 * abs(step)) | (steps <= 0.0))
-    if uneven.size:
-        raise OsikValueError(
-            f"{path}, frame {uneven[0] + 1}: the time steps by {steps[uneven[0]]:.4g} s, elsewhere by {step:.4g} s"
-        )
-    return float(len(steps) / (time[-1] - time[0]))

@@ -12,13 +12,13 @@ from ._keypoints import read_keypoints
 from ._motion import HumanMotion
 from ._up import Up
 
-ENDINGS = (".bvh", ".npz", ".csv")
+ENDINGS = (".bvh", ".npz")
 
 
 def load_motion(
     path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
 ) -> HumanMotion:
-    """Read a person's motion: BVH, ``.npz`` or ``.csv``, told apart by the ending.
+    """Read a person's motion: BVH or ``.npz``, told apart by the ending.
 
     Args:
         path: the file.
