@@ -13,5 +13,4 @@ from ._report import report as report
 from ._retarget import Retargeter as Retargeter
 from ._retarget import retarget as retarget
 from ._retargeted import Retargeted as Retargeted
-from ._robot_motion import RobotMotion as RobotMotion
-from ._source_motion import SourceMotion as SourceMotion
+from ._retargeted import RobotMotion as RobotMotion

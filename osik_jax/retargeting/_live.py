@@ -149,7 +149,7 @@ class LiveRetargeter(OnRobot):
         self.budget = min(_SHARE * self._dt, _BUDGET) if budget is None else float(budget)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
-        self._measures = measure(standing, self.roles, self.profile.standing)
+        self._measures = measure(standing, self.roles)
         self._window_bounds = self._bounds(self._dt)
         self._iteration_seconds = 0.0
         self.reset()
@@ -242,7 +242,7 @@ class LiveRetargeter(OnRobot):
             _filled(seen, self._known),
             contact=contact,
         )
-        own = read_person(motion, self.roles, self._measures, self.profile.standing)
+        own = read_person(motion, self.roles, self._measures)
         person, now = self._build.seen(own), self._history
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
         goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person, firm=False))

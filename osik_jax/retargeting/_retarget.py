@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -23,11 +22,9 @@ from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
 from ._person import read_person, with_path
 from ._profile import Limb, Profile
-from ._retargeted import Retargeted, as_retargeted
-from ._source_motion import SourceMotion
+from ._retargeted import Retargeted
 
-Source = HumanMotion | SourceMotion
-_Checked = tuple[Source, Mapping[str, str]]
+_Checked = tuple[HumanMotion, Mapping[str, str]]
 
 
 class Retargeter(OnRobot):
@@ -65,7 +62,7 @@ class Retargeter(OnRobot):
         self.max_iterations = max_iterations
 
     def retarget(
-        self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
+        self, motion: HumanMotion, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """Retarget one clip; see the function ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
@@ -73,7 +70,7 @@ class Retargeter(OnRobot):
 
     def retarget_all(
         self,
-        motions: Sequence[Source],
+        motions: Sequence[HumanMotion],
         *,
         mapping: Mapping[str, str] | None = None,
         fps: float | None = None,
@@ -137,30 +134,26 @@ class Retargeter(OnRobot):
         for (length, _), clips in waiting.items():
             yield from starmap(finish, self._solved(clips, length, lanes))
 
-    def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
+    def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """Return a clip as arrays for planning, after checking it."""
         return self._read(*self._checked(motion, mapping, fps))
 
-    def _checked(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    def _checked(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
         """Return a clip at the requested rate and its joints by role; raise ValueError if it cannot be retargeted."""
         motion = motion if fps is None else motion.resampled(fps)
         if motion.frames < 3:
             raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
         return motion, self._roles(motion, mapping)
 
-    def _checked_by_name(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    def _checked_by_name(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
         try:
             return self._checked(motion, mapping, fps)
         except (ValueError, KeyError) as error:
             raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
-    def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
+    def _read(self, motion: HumanMotion, roles: Mapping[str, str]) -> Clip:
         """Return a checked clip as arrays for planning; ``roles`` maps roles to the clip's joint names."""
-        if isinstance(motion, SourceMotion):
-            own = motion.person()
-        else:
-            own = read_person(with_path(motion, roles), roles, standing=self.profile.standing)
-        person = self._build.seen(own)
+        person = self._build.seen(read_person(with_path(motion, roles), roles))
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
@@ -200,11 +193,9 @@ class Retargeter(OnRobot):
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
         cost = float(solved.cost[0]), float(solved.cost[1])
-        made = as_retargeted(self.robot, self.profile, clip.person, q, off)
         objects = self._build.objects(clip.person) if clip.person.objects else {}
-        return dataclasses.replace(
-            made, iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches
-        )
+        more: dict[str, Any] = dict(iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches)
+        return Retargeted.of(self.robot, self.profile, clip.person, q, off, **more)
 
 
 def _raise(error: Exception) -> NoReturn:
@@ -213,7 +204,7 @@ def _raise(error: Exception) -> NoReturn:
 
 def retarget(
     robot: Robot,
-    motion: Source,
+    motion: HumanMotion,
     *,
     profile: Profile | None = None,
     mapping: Mapping[str, str] | None = None,
@@ -233,8 +224,8 @@ def retarget(
 
     Args:
         robot: robot with limbs of a person (``guess_profile``), z up at home.
-        motion: clip of a person, or of another robot (``SourceMotion``).
-        mapping: role to joint name of a person's clip. None: by common names.
+        motion: clip of a person.
+        mapping: role to joint name of the clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
         profile: as in ``Retargeter``.
         acceleration: as in ``Retargeter``.
@@ -243,8 +234,7 @@ def retarget(
         max_iterations: as in ``Retargeter``.
 
     Raises:
-        ValueError: the clip has fewer than three frames or lacks a needed joint, the robot has no limbs of a person,
-            or ``mapping`` comes with a robot's motion.
+        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot has no limbs of a person.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(
