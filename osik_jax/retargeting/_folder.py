@@ -36,7 +36,7 @@ def write_folder(result: Retargeted, name: str, out: Path) -> dict[str, Any]:
 
 
 def _write_motion(result: Retargeted, about: dict[str, Any], out: Path) -> dict[str, Any]:
-    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder; return the report."""
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to a folder; return the report."""
     figures = {**about, **report(result)}
     result.save(out / "motion.npz")
     result.motion.save_csv(out / "motion.csv")
@@ -65,8 +65,9 @@ def retarget_folder(
     """Retarget every ``.bvh`` and ``.npz`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
-    also holds ``profile.toml``, ``job.json`` (the job's options) and the summary ``report.json``. Finished clips of the same file and options are kept. A clip that cannot be
-    read is listed in the summary with its error, and tried again in the next run.
+    also holds ``profile.toml``, ``job.json`` (the job's options) and the summary ``report.json``. Finished clips of the
+    same file and options are kept. A clip that cannot be read is listed in the summary with its error, and tried again
+    in the next run.
 
     Args:
         retargeter: the retargeter of the robot.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -12,8 +11,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..limits import Limit
-from ..scaling import sharded
-from ..scaling._sharded import ShardedFunction
 from ._body import TouchGoal
 from ._finish import follow
 from ._goals import Goals, Weights
@@ -68,14 +65,6 @@ def shared_length(clip: Clip) -> int:
 _Lane = tuple[Goals, Array, Bounds, Array]
 
 
-def solve_side_by_side(lanes: _Lane, *shared: Any) -> Solved:
-    """Solve all lanes in one program split over all devices.
-
-    ``shared``: the arguments of ``solve_lane`` after the lane.
-    """
-    return _over_devices(len(shared))(lanes, *shared) if len(jax.devices()) > 1 else solve_lanes(lanes, *shared)
-
-
 @jax.jit
 def solve_lane(
     lane: _Lane,
@@ -93,13 +82,8 @@ def solve_lane(
 
 @jax.jit
 def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
+    """Solve all lanes in one program; ``shared`` are the arguments of ``solve_lane`` after the lane."""
     return jax.vmap(lambda lane: solve_lane(lane, *shared))(lanes)
-
-
-@cache
-def _over_devices(shared: int) -> ShardedFunction:
-    """Return ``solve_lane`` with its lanes split over all devices and ``shared`` replicated arguments."""
-    return sharded(solve_lane, (0, *[None] * shared))
 
 
 def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:

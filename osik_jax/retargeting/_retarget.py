@@ -17,7 +17,7 @@ from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
 from ..numerics._arguments import check_count
 from ..robot import Robot
-from ._lanes import LENGTHS, Clip, Solved, as_lane, padded, shared_length, solve_lane, solve_side_by_side
+from ._lanes import LENGTHS, Clip, Solved, as_lane, padded, shared_length, solve_lane, solve_lanes
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
 from ._person import read_person, with_path
@@ -170,7 +170,7 @@ class Retargeter(OnRobot):
         batch = [as_lane(clip, length) for _, clip in clips]
         batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
-        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0][1].touching)))
+        results = jax.tree.map(np.asarray, solve_lanes(stacked, *self._shared(clips[0][1].touching)))
         for lane, (number, clip) in enumerate(clips):
             own = jax.tree.map(lambda leaf, lane=lane: leaf[lane], results)
             yield number, partial(self._finished, clip, own)

@@ -12,7 +12,6 @@ import mujoco
 import numpy as np
 import pytest
 from motion_files import bent_forward, dancer, sliding, with_first, write_bvh
-from other_processes import finish, start
 from products import HIGHEST, products_of
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -261,33 +260,6 @@ def test_many_clips_give_what_each_gives_alone(nao, dance, danced, monkeypatch):
         own.retarget_all([motion], chunk=0, progress=False)
     with pytest.raises(ValueError, match="short: .*it takes three"):
         own.retarget_all([motion, dataclasses.replace(short, positions=short.positions[:2])], progress=False)
-
-
-SPLIT = """
-import dataclasses, json, sys
-import jax, numpy as np
-import osik_jax as osik
-from osik_jax.retargeting import Retargeter, _lanes, _retarget, load_motion
-
-motion, own = load_motion(sys.argv[1]), Retargeter(osik.load_robot("nao"), max_iterations=3)
-motions = [motion, dataclasses.replace(motion, positions=motion.positions[::-1], rotations=None), motion]
-alone = [own.retarget(clip) for clip in motions]
-_retarget.cpu_is_default = lambda: False  # as where there are GPUs
-over = []
-solve = _lanes._over_devices(5)
-_lanes._over_devices = lambda shared: lambda *args: over.append(solve(*args)) or over[-1]
-together = own.retarget_all(motions, chunk=2, progress=False)
-print(json.dumps({
-    "devices": [len(found.q.sharding.device_set) for found in over if hasattr(found.q, "sharding")],
-    "off": max(float(np.abs(a.q - b.q).max()) for a, b in zip(alone, together)),
-}))
-"""
-
-
-@pytest.mark.release
-def test_a_batch_is_split_over_devices(dance):
-    found = finish(start(SPLIT, dance, devices=2))
-    assert 2 in found["devices"] and found["off"] < 1e-6
 
 
 def test_more_smoothness_is_less_acceleration_and_feet_stay(nao, dance, danced, monkeypatch):
