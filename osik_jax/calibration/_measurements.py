@@ -30,11 +30,23 @@ class Measurement(eqx.Module):
         frame: name of the frame that is measured: of the robot, or a fixed frame (static).
         q: configuration of each reading, as the encoders read it. (n, nq)
         sigma: standard deviation of the noise of each reading. (n,)
+
+    Raises:
+        ValueError: wrong shapes, not finite, a sigma that is not positive.
     """
 
     frame: str = eqx.field(static=True)
     q: Float[Array, "n nq"]
     sigma: Float[Array, " n"]
+
+    rows = 1
+    """Rows of one reading."""
+    unit = "m"
+    """Unit of the rows."""
+    shared = ()
+    """Names of the arrays that all readings share."""
+    also = ""
+    """Name of the field that names a second frame."""
 
     def _common(self, frame: str, q: Any, sigma: Any, readings: int) -> None:
         self.frame, self.q = frame, _array(q, "q", (readings, None))
@@ -43,7 +55,7 @@ class Measurement(eqx.Module):
     @property
     def frames(self) -> tuple[str, ...]:
         """Return the names of all frames that are needed."""
-        return (self.frame,)
+        return (self.frame, getattr(self, self.also)) if self.also else (self.frame,)
 
     @property
     @abc.abstractmethod
@@ -61,13 +73,6 @@ class Measurement(eqx.Module):
     def deviations(self) -> Float[Array, "n k"]:
         """Return the standard deviation of each row of the differences."""
         return jnp.broadcast_to(self.sigma[:, None], (len(self.q), self.rows))
-
-    rows = 1
-    """Rows of one reading."""
-    unit = "m"
-    """Unit of the rows."""
-    shared = ()
-    """Arrays that all readings share."""
 
 
 class Points(Measurement):
@@ -92,11 +97,7 @@ class Points(Measurement):
         sigma: Sigma = 1e-3,
         point: Num[ArrayLike, "3"] | Sequence[float] = (0.0, 0.0, 0.0),
     ):
-        """Record positions.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record positions."""
         self.position, self.point = _array(position, "position", (None, 3)), _array(point, "point", (3,))
         self._common(frame, q, sigma, len(self.position))
 
@@ -136,11 +137,7 @@ class Poses(Measurement):
         sigma: Sigma = 1e-3,
         sigma_rotation: Sigma = 1e-3,
     ):
-        """Record poses.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record poses."""
         self.position = _array(position, "position", (None, 3))
         self.rotation = _array(rotation, "rotation", (len(self.position), 3, 3))
         self.sigma_rotation = _sigma(sigma_rotation, "sigma_rotation", len(self.position))
@@ -177,6 +174,7 @@ class Distances(Measurement):
     other: str = eqx.field(static=True)
     distance: Float[Array, " n"]
     other_q: Float[Array, "n nq"]
+    also = "other"
 
     def __init__(
         self,
@@ -188,19 +186,10 @@ class Distances(Measurement):
         other_q: Num[ArrayLike, "n nq"] | None = None,
         sigma: Sigma = 1e-3,
     ):
-        """Record distances.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record distances."""
         self.other, self.distance = other, _array(distance, "distance", (None,))
         self._common(frame, q, sigma, len(self.distance))
         self.other_q = self.q if other_q is None else _array(other_q, "other_q", self.q.shape)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of both frames."""
-        return self.frame, self.other
 
     @property
     def readings(self) -> Array:
@@ -223,6 +212,7 @@ class PlaneContacts(Measurement):
 
     plane: str = eqx.field(static=True)
     height: Float[Array, " n"]
+    also = "plane"
 
     def __init__(
         self,
@@ -233,19 +223,10 @@ class PlaneContacts(Measurement):
         height: Num[ArrayLike, " n"] | float = 0.0,
         sigma: Sigma = 1e-3,
     ):
-        """Record contacts.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record contacts."""
         readings = len(_array(q, "q", (None, None)))
         self.plane, self.height = plane, jnp.broadcast_to(as_array(height, "height", float), (readings,))
         self._common(frame, q, sigma, readings)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of the frame and of the plane."""
-        return self.frame, self.plane
 
     @property
     def readings(self) -> Array:
@@ -275,6 +256,7 @@ class Pixels(Measurement):
     rows = 2
     unit = "pixels"
     shared = ("intrinsics",)
+    also = "camera"
 
     def __init__(
         self,
@@ -297,20 +279,12 @@ class Pixels(Measurement):
             intrinsics: fx, fy, cx, cy.
             point: one point (3,), or one for each reading (n, 3) [m].
             sigma: standard deviation [pixels].
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
         """
         self.camera, self.pixel = camera, _array(pixel, "pixel", (None, 2))
         self.intrinsics = _array(intrinsics, "intrinsics", (4,))
         points = jnp.asarray(point, self.pixel.dtype)
         self.point = _array(jnp.broadcast_to(points, (len(self.pixel), 3)), "point", (None, 3))
         self._common(frame, q, sigma, len(self.pixel))
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of the marker's and of the camera's frame."""
-        return self.frame, self.camera
 
     @property
     def readings(self) -> Array:

@@ -84,34 +84,22 @@ def picked(figures: Any) -> dict[str, float | None]:
     return {name: functools.reduce(operator.getitem, path, figures) for name, path in FIGURES.items()}
 
 
-def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions of the named joints, their ranges and speed limits. (F, joints), then (joints,) each."""
-    robot, names = result.robot, result.robot.joint_names
+def _joints(result: Retargeted) -> dict[str, Any]:
+    robot, names, fps = result.robot, result.robot.joint_names, result.motion.fps
     dofs = [robot.joint_dof_index(name) for name in names]
     low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
-    return result.q[:, [robot.joint_qpos_index(name) for name in names]], low, high, fast
-
-
-def at_ends(result: Retargeted) -> Bool[np.ndarray, "F joints"]:
-    """Return whether each named joint is at an end of its range. (F, joints)."""
-    q, low, high, _ = joint_tracks(result)
+    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
     room = np.where(np.isfinite(high - low), AT_END * (high - low), 0.0)
-    return ((q <= low + room) | (q >= high - room)) & (high > low)
-
-
-def _joints(result: Retargeted) -> dict[str, Any]:
-    (q, low, high, fast), fps = joint_tracks(result), result.motion.fps
-    names = result.robot.joint_names
+    at_end = (((q <= low + room) | (q >= high - room)) & (high > low)).mean(0)
     speed = np.diff(q, axis=0) * fps
     change = np.abs(np.diff(speed, axis=0))
-    worst = int(np.argmax(change.max(0)))
     return {
         "beyond_range_max": float(max(0.0, (low - q).max(), (q - high).max())),
         "speed_over_limit_max": float((np.abs(speed) / fast).max()),
         "at_speed_limit_share": float((np.abs(speed) > AT_SPEED * fast).any(1).mean()),
-        "at_end_share": {name: float(own) for name, own in zip(names, at_ends(result).mean(0), strict=True) if own},
+        "at_end_share": {name: float(own) for name, own in zip(names, at_end, strict=True) if own},
         "acceleration_max": float(change.max() * fps),
-        "acceleration_max_joint": names[worst],
+        "acceleration_max_joint": names[int(np.argmax(change.max(0)))],
         "acceleration_rms": _rms(change) * fps,
         "jerk_rms": _rms(np.diff(speed, 2, axis=0)) * fps**2,
         "jump_frames": int((change > JUMP).any(1).sum()),

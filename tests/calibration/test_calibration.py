@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import jax
@@ -9,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy
-import yaml
 from compilations import Compilations
 from refusals import refuses
 
@@ -245,7 +245,7 @@ def test_files_and_command(ur5: osik.Robot, tmp_path, capsys: pytest.CaptureFixt
     options = ["--robot", "ur5", "--measurements", str(table), "--frame", "tool0", "--out", str(tmp_path / "out")]
     assert main(["calibrate", *options, "--sigma", "1e-4", "--unknowns", "joint_offset:elbow_joint"]) == 0
     assert "joint_offset[elbow_joint]: +10.0000" in capsys.readouterr().out
-    saved = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())
+    saved = json.loads((tmp_path / "out" / "calibration.json").read_text())
     assert saved["unknowns"]["joint_offset[elbow_joint]"]["change"] == pytest.approx(0.01, abs=1e-9)
     assert saved["undetermined"] == [] and saved["frames"]["base"]["parent"] is None
     fitted = osik.Robot.from_urdf(tmp_path / "out" / "robot.urdf")
