@@ -52,9 +52,7 @@ class _Joint:
     is_end: bool
 
 
-def read_bvh(
-    path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
-) -> HumanMotion:
+def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
     """Read a BVH file.
 
     A joint's rotation is the product of its channels in the order in which the file lists them. Ends of chains
@@ -62,7 +60,7 @@ def read_bvh(
     rotations 0 and the root at the origin; None if nobody stands in it, as in files with all bones along one axis.
     Facing z with y up becomes facing x with z up.
 
-    ``unit``, ``up``, ``trim`` and errors are those of ``load_motion``. If nobody stands in the rest pose, the
+    ``unit``, ``up`` and errors are those of ``load_motion``. If nobody stands in the rest pose, the
     length of the joints from a foot to the head gives the unit.
     """
     source, up = str(path), checked_up(up)
@@ -92,10 +90,10 @@ def read_bvh(
         rest_positions=scale * rest[kept] if stands else None,
     )
     motion = standing_up(source, motion, up, rest_up or find_up(motion, "y"), rest_up)
-    count = _rest_frames(motion) if trim else 0
+    count = _rest_frames(motion)
     if not count:
         return motion
-    warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out; trim=False keeps it")
+    warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out")
     turns = motion.rotations
     return dataclasses.replace(
         motion, positions=motion.positions[count:], rotations=None if turns is None else continuous(turns[count:])

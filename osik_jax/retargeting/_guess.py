@@ -129,11 +129,11 @@ def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:
     """Return the robot turned to face x, its home kinematics, and its feet by side (empty: none).
 
     Raises:
-        ValueError: frames that look like feet are not two.
+        ValueError: frames that look like feet are not two, and the base is free.
     """
     tree, kinematics = robot.tree, home_kinematics(robot)
     names = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
-    if not names:
+    if not names or (len(names) != 2 and not robot.floating_base):
         return robot, kinematics, {}
     if len(names) != 2:
         raise OsikValueError(f"two feet are needed, and {len(names)} frames look like some: {', '.join(names)}")

@@ -160,9 +160,7 @@ class LiveRetargeter(OnRobot):
 
             - ``q``: configuration. (nq,)
             - ``contact``: whether left heel, left toe, right heel and right toe stand. (4,)
-            - ``status``: an ``IntEnum``. ``FOLLOWED`` (0): the robot follows the plan. ``HELD_BACK`` (1): a limit keeps
-                it off the plan. ``FILLED`` (2): missing joints are interpolated. ``LOST`` (3): the person is missing
-                from here on, and the robot comes to rest. ``FEET_OFF`` (4): limits do not let the feet hold.
+            - ``status``: a ``LiveStatus``: ``FOLLOWED``, ``HELD_BACK``, ``FILLED``, ``LOST`` or ``FEET_OFF``.
             - ``off_plan``: largest distance of a joint from the plan because of a limit [rad or m].
             - ``feet_off``: largest distance of a contact point from its landing place or the floor, or of a sole below
                 the floor [m].

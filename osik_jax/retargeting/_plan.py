@@ -210,18 +210,18 @@ def _descended_plain(
     clip: _Clip,
     q: Float[Array, "F nq"],
     most: Int[Array, ""],
-    damping: Float[Array, ""],
+    damping: Float[Array, ""] | float | None = None,
     *,
     until: _Ending,
 ) -> Plan:
     """Run the iterations of a plan in plain JAX."""
-    stiffness, _, little = _START[until]
+    stiffness, usual, little = _START[until]
 
     def goes_on(state: _State) -> Bool[Array, ""]:
         over = state.ready if until == "ready" else state.settled >= _SETTLED
         return ~over & (state.iterations < most)
 
-    first = _State.at(clip, q, stiffness, damping)
+    first = _State.at(clip, q, stiffness, usual if damping is None else damping)
     last = jax.lax.while_loop(goes_on, partial(_improved, clip, little=little), first)
     return Plan(last.q, jnp.stack(last.here.costs), last.iterations)
 

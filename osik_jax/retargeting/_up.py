@@ -17,15 +17,6 @@ from ._skeletons import find_roles
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 UPS: tuple[Up, ...] = get_args(Up)
-_TO_Z_UP = {
-    "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
-    "y": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "-x": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
-    "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
-    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-}
-"""Rotations that turn each axis up; facing z with y up becomes facing x with z up."""
 _NEAR_FLOOR, _LOW_SHARE, _FLOOR_WEIGHT = 0.05, 10.0, 1.5
 """Largest height of the lowest point in a frame that stands on the floor [m], percentile of lowest points that defines
 the floor, and weight of the share of such frames relative to how upright the person is.
@@ -105,13 +96,19 @@ def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
     return [i for i, name in enumerate(joint_names) if any(word in name.lower() for word in words)]
 
 
+def _to_z_up(up: Up) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that turns an axis up; facing z with y up becomes facing x with z up."""
+    turn = np.roll(np.eye(3), -1 - "xyz".index(up[-1]), 0)
+    return np.diag([1.0, -1.0, -1.0]) @ turn if up[0] == "-" else turn
+
+
 def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMotion:
     """Return a motion rotated so that ``up`` becomes z.
 
     Rotations are relative to the rest pose, which is rotated separately if it stands along another axis, ``rest_up``.
     """
     rest_up = up if rest_up is None else rest_up
-    turn, rest_turn = np.array(_TO_Z_UP[up], float), np.array(_TO_Z_UP[rest_up], float)
+    turn, rest_turn = _to_z_up(up), _to_z_up(rest_up)
     rotations, rest = motion.rotations, motion.rest_positions
     if rotations is not None:
         rotations = np.concatenate([rotations[..., :1], rotations[..., 1:] @ turn.T], -1)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from motion_files import bent_forward, dancer, sliding, with_first, write_bvh
+from motion_files import bent_forward, dancer, sliding, write_bvh
 from products import HIGHEST, products_of
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -405,13 +405,6 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     table, qpos = np.loadtxt(out / "motion.csv", delimiter=","), np.load(out / "motion.npz")["qpos"]
     np.testing.assert_allclose(table, qpos[:, [0, 1, 2, 4, 5, 6, 3, *range(7, qpos.shape[1])]], atol=1e-8)
     assert load_profile(out / "profile.toml").keypoints == load_profile("nao").keypoints
-
-
-def test_the_command_keeps_a_rest_pose_where_asked(tmp_path):
-    clip = write_bvh(tmp_path / "clip.bvh", with_first(2, dancer(30)))
-    out = tmp_path / "out"
-    assert cli.main(["retarget", str(clip), "--no-trim", "--out", str(out)]) == 0
-    assert len(np.load(out / "motion.npz")["qpos"]) == 32
 
 
 @pytest.mark.parametrize(
