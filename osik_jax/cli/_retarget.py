@@ -72,8 +72,7 @@ class Retarget:
             return _retarget_folder(self)
         from ..retargeting import load_motion
         from ..retargeting._folder import write_folder
-        from ..retargeting._notes import notes
-        from ..retargeting._report import picked
+        from ..retargeting._report import notes, picked
 
         with told():
             motion = load_motion(self.clip, **_reading(self))

@@ -18,11 +18,10 @@ from .._progress import Progress, reported
 from .._whole_file import write_text
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
-from ._lanes import Clip
 from ._load import ENDINGS, load_motion
 from ._profile_file import profile_text, save_profile
 from ._report import FIGURES, picked, report
-from ._retarget import Retargeter
+from ._retarget import Clip, Retargeter
 from ._retargeted import Retargeted
 from ._skeletons import shortened
 from ._up import Up

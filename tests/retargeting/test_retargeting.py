@@ -41,10 +41,10 @@ from osik_jax.retargeting._facing import by_name
 from osik_jax.retargeting._finish import follow
 from osik_jax.retargeting._folder import retarget_folder
 from osik_jax.retargeting._link_shapes import shrunk
-from osik_jax.retargeting._notes import notes
 from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _improved, _State, make_plan
 from osik_jax.retargeting._profile_file import find_profile
+from osik_jax.retargeting._report import notes
 from osik_jax.retargeting._roles import NEEDED, SIDES
 from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._terms import Body, frame_rows
