@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -45,6 +45,8 @@ class Measurement(eqx.Module):
     """Unit of the rows."""
     shared = ()
     """Names of the arrays that all readings share."""
+    read: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields with what was read."""
     also = ""
     """Name of the field that names a second frame."""
 
@@ -58,9 +60,10 @@ class Measurement(eqx.Module):
         return (self.frame, getattr(self, self.also)) if self.also else (self.frame,)
 
     @property
-    @abc.abstractmethod
     def readings(self) -> Any:
-        """Return what was read: a pytree of arrays (n, ...)."""
+        """Return what was read: an array (n, ...), or several."""
+        values = tuple(getattr(self, name) for name in self.read)
+        return values[0] if len(values) == 1 else values
 
     @abc.abstractmethod
     def predicted(self, setup: Setup) -> Any:
@@ -87,6 +90,7 @@ class Points(Measurement):
     point: Float[Array, "3"]
     rows = 3
     shared = ("point",)
+    read = ("position",)
 
     def __init__(
         self,
@@ -100,11 +104,6 @@ class Points(Measurement):
         """Record positions."""
         self.position, self.point = _array(position, "position", (None, 3)), _array(point, "point", (3,))
         self._common(frame, q, sigma, len(self.position))
-
-    @property
-    def readings(self) -> Array:
-        """Return the positions. (n, 3)."""
-        return self.position
 
     def predicted(self, setup: Setup) -> Array:
         """Return the positions of the point. (n, 3)."""
@@ -125,6 +124,7 @@ class Poses(Measurement):
     rotation: Float[Array, "n 3 3"]
     sigma_rotation: Float[Array, " n"]
     rows = 6
+    read = ("position", "rotation")
     unit = "m, rad"
 
     def __init__(
@@ -142,11 +142,6 @@ class Poses(Measurement):
         self.rotation = _array(rotation, "rotation", (len(self.position), 3, 3))
         self.sigma_rotation = _sigma(sigma_rotation, "sigma_rotation", len(self.position))
         self._common(frame, q, sigma, len(self.position))
-
-    @property
-    def readings(self) -> tuple[Array, Array]:
-        """Return positions (n, 3) and rotations (n, 3, 3)."""
-        return self.position, self.rotation
 
     def predicted(self, setup: Setup) -> tuple[Array, Array]:
         """Return the poses of the frame."""
@@ -175,6 +170,7 @@ class Distances(Measurement):
     distance: Float[Array, " n"]
     other_q: Float[Array, "n nq"]
     also = "other"
+    read = ("distance",)
 
     def __init__(
         self,
@@ -190,11 +186,6 @@ class Distances(Measurement):
         self.other, self.distance = other, _array(distance, "distance", (None,))
         self._common(frame, q, sigma, len(self.distance))
         self.other_q = self.q if other_q is None else _array(other_q, "other_q", self.q.shape)
-
-    @property
-    def readings(self) -> Array:
-        """Return the distances. (n,)."""
-        return self.distance
 
     def predicted(self, setup: Setup) -> Array:
         """Return the distances [m]. (n,)."""
@@ -213,6 +204,7 @@ class PlaneContacts(Measurement):
     plane: str = eqx.field(static=True)
     height: Float[Array, " n"]
     also = "plane"
+    read = ("height",)
 
     def __init__(
         self,
@@ -227,11 +219,6 @@ class PlaneContacts(Measurement):
         readings = len(_array(q, "q", (None, None)))
         self.plane, self.height = plane, jnp.broadcast_to(as_array(height, "height", float), (readings,))
         self._common(frame, q, sigma, readings)
-
-    @property
-    def readings(self) -> Array:
-        """Return the heights. (n,)."""
-        return self.height
 
     def predicted(self, setup: Setup) -> Array:
         """Return the heights over the plane [m]. (n,)."""
@@ -257,6 +244,7 @@ class Pixels(Measurement):
     unit = "pixels"
     shared = ("intrinsics",)
     also = "camera"
+    read = ("pixel",)
 
     def __init__(
         self,
@@ -285,11 +273,6 @@ class Pixels(Measurement):
         points = jnp.asarray(point, self.pixel.dtype)
         self.point = _array(jnp.broadcast_to(points, (len(self.pixel), 3)), "point", (None, 3))
         self._common(frame, q, sigma, len(self.pixel))
-
-    @property
-    def readings(self) -> Array:
-        """Return the pixels. (n, 2)."""
-        return self.pixel
 
     def predicted(self, setup: Setup) -> Array:
         """Return the pixels (n, 2); a marker behind the camera is mirrored to its front, far out."""
