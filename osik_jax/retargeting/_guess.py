@@ -185,9 +185,10 @@ def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Li
 
     A foot that no joint moves beside the shank is a point.
     """
-    if limb.end == (frame, ORIGIN):
-        return _ball(robot, kinematics, frame)
     corners = _corners(robot, kinematics, frame)
+    if limb.end == (frame, ORIGIN):
+        point = _pair(np.tile(min([*corners], key=np.linalg.norm, default=np.zeros(3)), (2, 1)))
+        return Foot(frame, point, point)
     if len(corners) >= 4:
         ordered = corners[np.argsort(corners[:, 0])]
         heel, toe = (_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:]))
@@ -200,37 +201,19 @@ def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Li
     return Foot(frame, heel, toe)
 
 
-def _ball(robot: Robot, kinematics: Kinematics, frame: str) -> Foot:
-    """Return a foot that is a point: the lowest of the sphere nearest to a frame on its body, or the frame."""
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    found = [(float(np.linalg.norm(at - position)), at, radius) for at, radius in _spheres(robot, kinematics, frame)]
-    distance, at, radius = min(found, key=lambda ball: ball[0], default=(0.0, position, 0.0))
-    lowest = at - [0.0, 0.0, radius] if distance <= 2.0 * radius else position
-    point = _pair(np.tile((lowest - position) @ rotation, (2, 1)))
-    return Foot(frame, point, point)
-
-
-def _spheres(robot: Robot, kinematics: Kinematics, frame: str) -> list[tuple[np.ndarray, float]]:
-    """Return the centres [m] in the world and the radii [m] of the spheres of a frame's body."""
-    tree, model = robot.tree, robot.mj_model
-    body = tree.frame_bodies[tree.frame(frame)]
-    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
-    return [
-        (origin + turn @ np.asarray(robot.geom_position[geom]), float(robot.geom_size[geom, 0]))
-        for geom in range(model.ngeom)
-        if tree.geom_bodies[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
-    ]
-
-
 def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
     """Return corner frames, else lower corners of boxes, else lowest points of spheres, in the frame [m]. (k, 3)."""
     for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
         if len(corners):
             return corners
-    balls = _spheres(robot, kinematics, frame)
+    tree, body = robot.tree, robot.tree.frame_bodies[robot.tree.frame(frame)]
+    is_ball = np.asarray(robot.mj_model.geom_type) == mujoco.mjtGeom.mjGEOM_SPHERE
+    balls = np.flatnonzero((np.asarray(tree.geom_bodies)[: len(is_ball)] == body) & is_ball)
+    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
+    lowest = origin + np.asarray(robot.geom_position)[balls] @ turn.T
+    lowest[:, 2] -= np.asarray(robot.geom_size)[balls, 0]
     position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    points = np.array([at - [0.0, 0.0, radius] for at, radius in balls]).reshape(-1, 3)
-    return (points - position) @ rotation
+    return (lowest - position) @ rotation
 
 
 def _pair(points: np.ndarray) -> tuple[Point, Point]:
