@@ -83,7 +83,7 @@ class Retargeted:
         return cls(
             robot=robot,
             profile=profile,
-            motion=_in_mujoco_order(robot, q, person.fps),
+            motion=in_mujoco_order(robot, q, person.fps),
             q=q,
             human=np.stack([*person.points.values(), person.root], 1),
             human_names=(*person.points, "root"),
@@ -119,7 +119,7 @@ class Retargeted:
         )
 
 
-def _in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
+def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
     """Return a motion with all joints of the robot's model, locked and coupled joints included."""
     tree, qpos = robot.tree, model_qpos(robot, q)
     joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
