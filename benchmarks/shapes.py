@@ -1,11 +1,12 @@
 """Clips retargeted to robots of all shapes, and judged from their files: python -m benchmarks.shapes CLIP... [--help].
 
-    python -m benchmarks.shapes clips/*.bvh --robots g1 nao talos h1.urdf baxter:fixed
+    python -m benchmarks.shapes clips/*.bvh --dogs dogs/*.npz --robots g1 nao talos h1.urdf baxter:fixed go2
 
 A robot is a name of ``load_robot`` or ``robots_table``, or a file; ``:fixed`` behind it fixes its base. Profiles are
-bundled or guessed. The judge reads the motion that was written: ranges and speeds from the text of the URDF, poses from
-MuJoCo C's kinematics of that file, overlaps of the profile's capsules from MuJoCo's collision detection. The kinematics
-of this library take no part. The exit code is 1 if a bar of ``FIGURES`` is not met.
+bundled or guessed. Each robot takes the clips of people (robots on four feet those of ``--dogs``). The judge reads the
+motion that was written: ranges and speeds from the text of the URDF, poses from MuJoCo C's kinematics of that file,
+overlaps of the profile's capsules from MuJoCo's collision detection. The kinematics of this library take no part. The
+exit code is 1 if a bar of ``FIGURES`` is not met.
 """
 
 from __future__ import annotations
@@ -166,9 +167,13 @@ class Judge:
         return first.index(common) + second.index(common)
 
     def _corners(self) -> np.ndarray:
-        """Corners of left heel, left toe, right heel and right toe. (4, 2, 3)."""
-        feet = [self.profile.feet[side] for side in ("left", "right")]
-        return np.array([[self.place(foot.frame, p) for p in part] for foot in feet for part in (foot.heel, foot.toe)])
+        """Lowest points of the soles' corners: heel and toe of two feet, all of one on four. (4, corners, 3)."""
+        rows, feet = [], self.profile.feet
+        for foot in (feet[name] for name in sorted(feet)):
+            down = np.array([0.0, 0.0, foot.radius])
+            heel, toe = ([self.place(foot.frame, p) - down for p in part] for part in (foot.heel, foot.toe))
+            rows += [heel, toe] if len(feet) == 2 else [[*heel, *toe]]
+        return np.array(rows)
 
     def _angle(self, limb: tuple[str, str], human: dict[str, np.ndarray], frame: int) -> float:
         """Angle between a person's segment and the robot's [deg]."""
@@ -188,7 +193,7 @@ class Judge:
                 slip = slip if landed is None else max(slip, float(np.linalg.norm(points[frame, k, :2] - landed)))
         height = points[..., 2][contact].max(initial=0.0)
         below = max(-float(corners[..., 2].min()), 0.0)
-        return {"slip": 1e3 * slip, "float": 1e3 * height, "below": 1e3 * below}
+        return {"slip": None if self.profile.rolls else 1e3 * slip, "float": 1e3 * height, "below": 1e3 * below}
 
 
 def _urdf_spec(file: Path) -> mujoco.MjSpec:
@@ -226,7 +231,7 @@ def _model_limits(model: mujoco.MjModel) -> dict[str, tuple[float, float, float]
     }
 
 
-def judged(source: Source, clips: list[HumanMotion]) -> Iterator[tuple[str, dict]]:
+def judged(source: Source, people: list[HumanMotion], dogs: list[HumanMotion]) -> Iterator[tuple[str, dict]]:
     """The name and the judge's figures of each clip on a robot."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", osik.OsikWarning)
@@ -234,6 +239,7 @@ def judged(source: Source, clips: list[HumanMotion]) -> Iterator[tuple[str, dict
         retargeter = Retargeter(robot)
         profile = retargeter.profile
         judge = Judge(source, profile, robot.floating_base)
+        clips = dogs if len(profile.feet) == 4 and profile.walks else people
         for motion, result in zip(clips, retargeter.retarget_all(clips, progress=False), strict=True):
             yield motion.name, judge.figures(result)
 
@@ -245,17 +251,18 @@ def main() -> int:
     parser.add_argument(
         "--robots", nargs="+", default=["g1", "nao", "talos"], help="names or files, :fixed behind them"
     )
+    parser.add_argument("--dogs", nargs="+", default=[], help="motion files of animals, for robots on four feet")
     parser.add_argument("--csv", type=Path, help="file for the figures of each clip")
     options = parser.parse_args()
     configure_cpu()
     jax.config.update("jax_enable_x64", True)
-    clips = [load_motion(path) for path in options.clips]
+    people, dogs = ([load_motion(path) for path in paths] for paths in (options.clips, options.dogs))
     heads = [f"{key} [{unit}]" for key, (unit, _, _) in FIGURES.items()]
     table, rows, failed = [["robot", "clips", *heads], ["---"] * (2 + len(heads))], [], []
     for text in options.robots:
         source, found = source_of(text), []
         label = source.name + (", fixed" if text.endswith(":fixed") else "")
-        for name, figures in judged(source, clips):
+        for name, figures in judged(source, people, dogs):
             found.append([figures[key] for key in FIGURES])
             rows.append([label, name, *map(_cell, FIGURES, found[-1])])
             print(*rows[-1], sep=", ", file=sys.stderr, flush=True)

@@ -13,4 +13,5 @@ from ._report import report as report
 from ._retarget import Retargeter as Retargeter
 from ._retarget import retarget as retarget
 from ._retargeted import Retargeted as Retargeted
-from ._retargeted import RobotMotion as RobotMotion
+from ._robot_motion import RobotMotion as RobotMotion
+from ._source_motion import SourceMotion as SourceMotion

@@ -21,12 +21,12 @@ from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
 from ._facing import facing_at_home
 from ._goals import Goals
-from ._person import Person, directions
+from ._person import Person, axes_from, directions
 from ._places import pairs_at_home
 from ._profile import Limb, Profile, world_points
 from ._roles import LEGS, SIDES
 from ._rotations import moved_poses
-from ._terms import ORIGIN, Bounds
+from ._terms import ORIGIN, Bounds, reach_length
 
 _TOUCH, _NEARS = 1e5, 0.03
 """Weight of what is held [1/m^2], relative to that of limbs, and the time in which it grows tenfold before [s]: a hand
@@ -69,10 +69,9 @@ class Build:
 
     profile: Profile  # the robot's profile
     points: Mapping[str, Float[np.ndarray, "3"]]  # world positions of the keypoints [m]
-    measured: tuple[Limb, ...]  # limbs whose lengths give the scale: the legs of a free base, else all limbs
-    size: float  # their total length [m]
-    ankle: float  # height of the ankles above the soles [m]
-    # midpoint of the hips, which follows the person's path; the pelvis of a fixed base [m]
+    lengths: Mapping[Limb, float]  # lengths of the limbs that give the scale (``measured``) [m]
+    ankle: float  # height of the ankles above the soles, or of the pelvis if the robot does not walk [m]
+    # the point that follows the person's path: midpoint of the hips, or the pelvis without legs [m]
     root: Float[np.ndarray, "3"]
     base: Float[np.ndarray, "3"]  # origin of the root body [m]
     turn: Float[np.ndarray, "3 3"]  # rotation matrix of the root body
@@ -91,18 +90,20 @@ class Build:
         places = [*profile.keypoints.values(), *profile.corners, (profile.pelvis, origin), (root, origin)]
         positions = world_points(robot, kinematics, places)
         points = dict(zip(profile.keypoints, positions, strict=False))
-        bases = robot.tree.free_bases
-        limbs, ankle = LEGS if bases else profile.followed, 0.0
+        lengths = {(a, b): float(np.linalg.norm(points[b] - points[a])) for a, b in measured(profile)}
+        lengths |= {limb: reach_length(robot, profile, limb) for limb in profile.reached if limb in lengths}
+        ankle = 0.0
         if profile.feet:
-            above = [points[f"{side}_ankle"][2] for side in SIDES]
-            ankle = float(np.mean(above) - np.mean(positions[len(points) : -2, 2]))
+            ends = profile.standing if len(profile.feet) == 4 else [f"{side}_ankle" for side in SIDES]
+            above = [points[role][2] for role in ends] if profile.walks else positions[-2, 2]
+            ankle = float(np.mean(above) - np.mean(positions[len(points) : -2, 2] - profile.rises))
+        bases = robot.tree.free_bases
         return cls(
             profile=profile,
             points=points,
-            measured=limbs,
-            size=sum(float(np.linalg.norm(points[b] - points[a])) for a, b in limbs),
+            lengths=lengths,
             ankle=ankle,
-            root=0.5 * (points["left_hip"] + points["right_hip"]) if bases else positions[-2],
+            root=0.5 * (points["left_hip"] + points["right_hip"]) if profile.walks else positions[-2],
             base=positions[-1],
             turn=np.asarray(kinematics.frame_pose(robot, root)[1]),
             facing=facing_at_home(robot, profile.across),
@@ -113,16 +114,30 @@ class Build:
             speed=np.asarray(robot.velocity_limit),
         )
 
+    @property
+    def size(self) -> float:
+        """Return the total length of the limbs that give the scale [m]."""
+        return sum(self.lengths.values())
+
     def seen(self, person: Person) -> Person:
         """Return the person without the motion that the robot's base cannot follow.
 
-        A robot with a free base follows the person in the world. One with a fixed base follows limbs relative to the
-        trunk: to the pelvis if its own trunk bends, else to the chest.
+        A walking robot follows the person in the world. A robot on wheels stays upright and follows heading and path. A
+        robot whose feet stay in place follows orientations relative to the heading. A robot with a fixed base follows
+        limbs relative to the trunk: to the pelvis if its own trunk bends, else to the chest.
         """
-        if self.free is not None:
+        profile, frames = self.profile, len(person.root)
+        if profile.walks and self.free is not None:
             return person
-        trunk = person.torso if self.profile.torso is None else person.pelvis
-        turn, root = self.facing @ np.swapaxes(trunk, 1, 2), np.tile(self.root, (len(trunk), 1))
+        trunk = person.torso if profile.torso is None else person.pelvis
+        heading = axes_from(trunk[..., 1] * [1.0, 1.0, 0.0], np.array([0.0, 0.0, 1.0]))
+        fixed = self.free is None
+        to = heading if profile.rolls and not fixed else np.broadcast_to(self.facing, trunk.shape)
+        turn = to @ np.swapaxes(trunk if fixed or profile.rolls else heading, 1, 2)
+        root = np.tile(self.root, (frames, 1))
+        root[:, 2] = self.root[2] if fixed else self.ankle
+        if profile.rolls and not fixed:
+            root[:, :2] = self.scale(person) * person.root[:, :2]
         points = {role: root + np.einsum("fij,fj->fi", turn, at - person.root) for role, at in person.points.items()}
         return dataclasses.replace(
             person,
@@ -135,7 +150,7 @@ class Build:
                 name: moved_poses(poses, turn, root - np.einsum("fij,fj->fi", turn, person.root))
                 for name, poses in person.objects.items()
             },
-            contact=np.zeros_like(person.contact),
+            contact=np.full((frames, 4), bool(profile.feet) and not fixed),
         )
 
     def scale(self, person: Person) -> float:
@@ -143,28 +158,35 @@ class Build:
         profile = self.profile
         if profile.scale is not None:
             return profile.scale
-        return profile.stretch * self.size / sum(person.lengths[limb] for limb in self.measured)
+        return profile.stretch * self.size / sum(person.lengths[limb] for limb in measured(profile))
 
     def goals(self, person: Person, firm: bool = True) -> Goals:
         """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot.
 
         ``firm``: whether long contacts get a larger weight (``_firmness``).
         """
-        root, touches, frames = person.root, self.touches(person), len(person.root)
-        if self.free is not None:
+        profile, root = self.profile, person.root
+        if profile.walks and self.free is not None:
             scale = self.scale(person)
             root = scale * root
             root[:, 2] += self.ankle - scale * person.ankle
-        wanted = directions(person.points, self.profile.followed)
-        pulls = [_pull(touch.held, person.fps) for touch in touches]
+        reached, followed, touches = profile.reached, profile.followed, self.touches(person)
+        wanted = directions(person.points, followed)
+        for k, (a, b) in enumerate(reached, len(followed) - len(reached)):
+            length = person.lengths[a, b] if profile.walks else self.lengths[a, b] / self.scale(person)
+            wanted[:, k] = (person.points[b] - person.points[a]) / length
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
             **{name: getattr(person, name) for name in ("pelvis", "torso", "feet")},
             "directions": np.concatenate([wanted, *(touch.goal[:, None] for touch in touches)], 1),
-            "held": np.stack(pulls, -1) if pulls else np.zeros((frames, 0)),
+            "held": np.stack(
+                [*np.ones((len(reached), len(root))), *(_pull(touch.held, person.fps) for touch in touches)], -1
+            )
+            if reached or touches
+            else np.zeros((len(root), 0)),
             "contact": _firmness(person.contact) if firm and dtype == np.float64 else person.contact,
             "root": root,
-            "present": np.ones(frames),
+            "present": np.ones(len(root)),
         }
         return Goals(**{name: part.astype(dtype) for name, part in parts.items()})
 
@@ -192,8 +214,9 @@ class Build:
         }
 
     def _in_world(self, person: Person, at: Float[np.ndarray, "F 3"], scale: float) -> Float[np.ndarray, "F 3"]:
-        """Return points of a person's world in the robot's: scaled, about the root of a fixed base."""
-        return scale * at if self.free is not None else person.root + scale * (at - person.root)
+        """Return points of a person's world in the robot's: scaled, about the root if the base does not walk."""
+        walks = self.profile.walks and self.free is not None
+        return scale * at if walks else person.root + scale * (at - person.root)
 
     def first_guess(self, goals: Goals) -> Float[np.ndarray, "F nq"]:
         """Return configurations with the start posture in all frames and the pelvis at the goal pose. (F, nq)."""
@@ -239,6 +262,11 @@ def held_point(
     for start, end in stretches(held):
         out[start:end] = poses[start:end, :3] + turns[start:end].apply(inside[start:end].mean(0))
     return out
+
+
+def measured(profile: Profile) -> tuple[Limb, ...]:
+    """Return the limbs whose lengths are compared with the person's: the legs, or all limbs without legs."""
+    return LEGS if profile.walks and len(profile.feet) == 2 else profile.reached or profile.followed
 
 
 def _firmness(contact: Bool[np.ndarray, "F 4"]) -> Float[np.ndarray, "F 4"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import csv
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -31,17 +32,17 @@ _JOB = "job.json"
 
 def write_folder(result: Retargeted, name: str, out: Path) -> dict[str, Any]:
     """Write motion (.npz and .csv), report and profile; return the report."""
+    figures = {"clip": name, **report(result)}
+    _write_motion(result, figures, out)
     save_profile(result.profile, out / "profile.toml")
-    return _write_motion(result, {"clip": name}, out)
+    return figures
 
 
-def _write_motion(result: Retargeted, about: dict[str, Any], out: Path) -> dict[str, Any]:
-    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to a folder; return the report."""
-    figures = {**about, **report(result)}
+def _write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
     result.save(out / "motion.npz")
     result.motion.save_csv(out / "motion.csv")
     _write_json(figures, out / "report.json")
-    return figures
 
 
 def _write_json(figures: dict[str, Any], path: Path) -> None:
@@ -64,9 +65,9 @@ def retarget_folder(
     """Retarget every ``.bvh`` and ``.npz`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
-    also holds ``profile.toml``, ``job.json`` (the job's options) and the summary ``report.json``. Finished clips of the
-    same file and options are kept. A clip that cannot be read is listed in the summary with its error, and tried again
-    in the next run.
+    also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with
+    one line of figures and notes per clip. Finished clips of the same file and options are kept. A clip that cannot be
+    read is listed in the summary with its error, and tried again in the next run.
 
     Args:
         retargeter: the retargeter of the robot.
@@ -109,8 +110,9 @@ def retarget_folder(
             except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
                 failed[name] = _reason(error)
                 return
+            found[name] = {"clip": name, **sources[name], **report(result)}
             (out / name).mkdir(exist_ok=True)
-            found[name] = _write_motion(result, {"clip": name, **sources[name]}, out / name)
+            _write_motion(result, found[name], out / name)
 
         def read(name: str) -> Clip:
             path = files[name]
@@ -125,6 +127,8 @@ def retarget_folder(
                 advance(1)
         summary = {**_summary(found, failed, [*files]), "no_clips": others}
         _write_json(summary, out / "report.json")
+        with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
+            csv.writer(file).writerows(_index(summary))
     return summary
 
 
@@ -217,3 +221,13 @@ def _summary(found: Mapping[str, dict[str, Any]], failed: Mapping[str, str], ord
         "notes": {name: own["notes"] for name, own in figures.items() if own.get("notes")},
         "figures": rows,
     }
+
+
+def _index(summary: dict[str, Any]) -> list[list[Any]]:
+    """Return a row of headings, and one row per clip with its figures and notes; clips with notes come first."""
+    notes: dict[str, list[str]] = summary["notes"]
+    rows: list[list[Any]] = [["clip", "look at", "frames", "fps", *FIGURES]]
+    rows += [[name, reason] for name, reason in summary["failed"].items()]
+    for name in sorted(summary["figures"], key=lambda name: name not in notes):
+        rows.append([name, "; ".join(notes.get(name, ())), *summary["figures"][name].values()])
+    return rows

@@ -18,15 +18,15 @@ def _number(value: Any) -> Array:
 class Goals(eqx.Module):
     """Goals of one frame; for a clip every leaf has a leading axis of frames."""
 
-    # unit vectors along each of the limbs that are followed; of a pair that is held together, its vector [m]
+    # unit vectors along each of the limbs that are followed; of a reach, the vector over its nominal length
     directions: Float[Array, "*B limbs 3"]
     pelvis: Float[Array, "*B 3 3"]  # axes of the pelvis as columns
     torso: Float[Array, "*B 3 3"]  # axes of the chest as columns
-    root: Float[Array, "*B 3"]  # midpoint of the hips [m]
+    root: Float[Array, "*B 3"]  # midpoint of the hips, or the pelvis of a robot without legs [m]
     feet: Float[Array, "*B 2 3 3"]  # axes of the left and right foot as columns
-    # for left heel, left toe, right heel and right toe: 1 in contact, more in a long contact, else 0
+    # for each point of ``Profile.standing``: 1 in contact, more in a long contact, else 0
     contact: Float[Array, "*B 4"]
-    held: Float[Array, "*B held"]  # weight of each pair that is held together relative to ``limb``; 0 while it is not
+    held: Float[Array, "*B reaches"]  # weight of each reach relative to ``limb``: 1; of what a joint holds more, or 0
     present: Float[Array, "*B"]  # 1 for a frame of the clip, 0 for padding behind its end
 
 

@@ -57,11 +57,13 @@ def guess_profile(robot: Robot) -> Profile:
     it with ``save_profile`` to edit it.
 
     A robot may lack legs or arms, and its arms may end at the elbow. With a fixed base its limbs follow the
-    person's beside the trunk. A free base stands on two feet. An ``OsikWarning`` says what is found where that is not
-    two legs and two arms (``describe_profile``).
+    person's beside the trunk. A free base stands on two feet, on four, or on wheels (bodies called ``wheel`` or
+    ``caster``). On four feet, legs follow those of a person or an animal on all fours; where there are arms too,
+    these follow and the feet stay where they are. An ``OsikWarning`` says what is found where that is not two legs
+    and two arms (``describe_profile``).
 
     Raises:
-        ValueError: neither two legs nor two arms are found, or a free base does not have two feet.
+        ValueError: neither two legs nor two arms are found, or a free base has neither feet nor wheels.
     """
     tree = robot.tree
     robot, kinematics, feet = _facing_feet(robot)
@@ -76,20 +78,21 @@ def guess_profile(robot: Robot) -> Profile:
         )
     keypoints: dict[str, Place] = {}
     found: dict[str, Limb] = {name: find_arm(robot, kinematics, arm) for name, arm in arms.items()}
-    for side, leg in legs.items():
-        found[side] = find_leg(robot, kinematics, leg, feet[side])
+    for name, leg in legs.items() if len(legs) == 2 or not arms else ():
+        found[name] = find_leg(robot, kinematics, leg, feet[name], pointed=len(legs) == 4)
     for name, limb in found.items():
-        side, part = name.split("_")[0], "arm" if name in arms else "leg"
+        side, part = name.split("_")[0], "arm" if name in arms or name.endswith("_front") else "leg"
         places = zip(CHAINS[part], limb, strict=True)
         keypoints |= {f"{side}_{role}": place for role, place in places if place is not None}
+    soles = {name: _foot(robot, kinematics, feet[name], leg, found.get(name)) for name, leg in legs.items()}
     if robot.floating_base and not legs:
-        raise OsikValueError("nothing holds the robot's base: it has no feet. Load it with floating_base=False")
-    soles = {side: _foot(robot, kinematics, feet[side], leg, found[side]) for side, leg in legs.items()}
+        soles = _wheels(robot, kinematics)
     profile = Profile(
         keypoints=dict(sorted(keypoints.items())),
         pelvis=tree.frame_names[tree.frame_bodies.index(base_body(robot))],
         torso=_torso(robot, list(arms.values())),
         feet=soles if robot.floating_base else {},
+        rolls=robot.floating_base and not legs,
     )
     profile = dataclasses.replace(profile, capsules=_capsules(robot, kinematics, profile))
     if set(profile.keypoints) != set(NEEDED):
@@ -100,7 +103,11 @@ def guess_profile(robot: Robot) -> Profile:
 def describe_profile(robot: Robot, profile: Profile) -> str:
     """Say in words what of a person the robot's profile has, what it lacks, and which joints follow nothing."""
     tree, parts = robot.tree, _limbs_found(profile)
-    parts.append(f"{len(profile.feet)} feet" if robot.floating_base else "the base is fixed")
+    if not robot.floating_base:
+        parts.append("the base is fixed")
+    else:
+        parts.append("wheels that roll anywhere" if profile.rolls else f"{len(profile.feet)} feet")
+        parts += [] if profile.walks or profile.rolls else ["the feet stay where they are"]
     parts.append("a trunk that does not turn" if profile.torso is None else f"a trunk that turns {profile.torso}")
     bodies = [tree.frame_bodies[tree.frame(frame)] for frame in profile.frames]
     moved = set(np.flatnonzero(tree.descendants[:, bodies].any(1)).tolist())
@@ -126,20 +133,33 @@ def _limbs_found(profile: Profile) -> list[str]:
 
 
 def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:
-    """Return the robot turned to face x, its home kinematics, and its feet by side (empty: none).
+    """Return the robot turned to face x, its home kinematics, and its feet by their names in a profile (empty: none).
 
     Raises:
-        ValueError: frames that look like feet are not two, and the base is free.
+        ValueError: frames that look like feet are neither two nor four, and the base is free.
     """
-    tree, kinematics = robot.tree, home_kinematics(robot)
+    tree = robot.tree
     names = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
-    if not names or (len(names) != 2 and not robot.floating_base):
+    kinematics = home_kinematics(robot)
+    if not names or (len(names) not in (2, 4) and not robot.floating_base):
         return robot, kinematics, {}
-    if len(names) != 2:
-        raise OsikValueError(f"two feet are needed, and {len(names)} frames look like some: {', '.join(names)}")
-    left, right = by_name(sorted(names, key=lambda name: -np.asarray(kinematics.frame_pose(robot, name)[0])[1]))
-    robot = facing_x(robot, (left, right))
-    return robot, home_kinematics(robot), {"left": left, "right": right}
+    if len(names) not in (2, 4):
+        raise OsikValueError(f"two or four feet are needed, and {len(names)} frames look like some: {', '.join(names)}")
+
+    def at(name: str) -> np.ndarray:
+        return np.asarray(kinematics.frame_pose(robot, name)[0])
+
+    lefts = sorted(names, key=lambda name: -at(name)[1])[: len(names) // 2]
+    pairs = []
+    for left in lefts:
+        distances = {other: float(np.linalg.norm(at(other) - at(left))) for other in names if other not in lefts}
+        pairs.append(by_name([left, min(distances, key=distances.__getitem__)]))
+    robot = facing_x(robot, (pairs[0][0], pairs[0][1]))
+    kinematics = home_kinematics(robot)
+    out = {}
+    for row, pair in zip(("", "_front"), sorted(pairs, key=lambda pair: at(pair[0])[0]), strict=False):
+        out |= {f"{side}{row}": name for side, name in zip(SIDES, pair, strict=True)}
+    return robot, kinematics, dict(sorted(out.items()))
 
 
 def _arms(robot: Robot, kinematics: Kinematics, used: set[int]) -> dict[str, Chain]:
@@ -180,15 +200,42 @@ def _torso(robot: Robot, arms: list[Chain]) -> str | None:
     return tree.body_names[trunk] if turns else None
 
 
-def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Limb) -> Foot:
+def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
+    """Return the two halves of the rectangle that wheels stand on, at the height of their lowest point, as feet."""
+    tree = robot.tree
+    wheels = [b for b, name in enumerate(tree.body_names) if re.search(r"wheel|caster", name, re.IGNORECASE)]
+    if not wheels:
+        raise OsikValueError(
+            "nothing holds the robot's base: it has no feet and no wheels that are called so. Load it with "
+            "floating_base=False"
+        )
+    at = np.asarray(kinematics.body_position)[wheels]
+    radii = np.zeros(len(wheels))
+    for geom, body in enumerate(tree.geom_bodies):
+        if body in wheels:
+            radii[wheels.index(body)] = max(radii[wheels.index(body)], float(robot.geom_size[geom, 0]))
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, tree.body_names[tree.root]))
+    # without shapes, the floor is where the root is: base_footprint and its like
+    low = float((at[:, 2] - radii).min() if radii.any() else min(float(position[2]), at[:, 2].min()))
+    rear, front = float(at[:, 0].min()), float(at[:, 0].max())
+    wide = float(np.abs(at[:, 1]).max())
+    front, rear = (front, rear) if front - rear > wide else (rear + wide, rear - wide)
+    feet = {}
+    for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
+        edges = sorted((0.5 * sign * wide, sign * wide), reverse=True)
+        heel, toe = (_pair((np.array([[x, y, low] for y in edges]) - position) @ rotation) for x in (rear, front))
+        feet[side] = Foot(tree.body_names[tree.root], heel, toe)
+    return feet
+
+
+def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Limb | None) -> Foot:
     """Return the sole's corners, else those of a foot sized after the leg (at height 0 of a frame called a sole).
 
-    A foot that no joint moves beside the shank is a point.
+    A foot that no joint moves beside the shank is a ball about its frame, as large as the sphere that is there.
     """
+    if limb is None or limb.end == (frame, ORIGIN):
+        return _ball(robot, kinematics, frame)
     corners = _corners(robot, kinematics, frame)
-    if limb.end == (frame, ORIGIN):
-        point = _pair(np.tile(min([*corners], key=np.linalg.norm, default=np.zeros(3)), (2, 1)))
-        return Foot(frame, point, point)
     if len(corners) >= 4:
         ordered = corners[np.argsort(corners[:, 0])]
         heel, toe = (_pair(part[np.argsort(-part[:, 1])]) for part in (ordered[:2], ordered[-2:]))
@@ -199,6 +246,28 @@ def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Li
     rear, front = -_HEEL * foot, (1.0 - _HEEL) * foot
     heel, toe = (_pair(np.array([[x, width, -height], [x, -width, -height]])) for x in (rear, front))
     return Foot(frame, heel, toe)
+
+
+def _ball(robot: Robot, kinematics: Kinematics, frame: str) -> Foot:
+    """Return a round foot: the sphere nearest to a frame on its body, or the frame as a point."""
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+    found = [(float(np.linalg.norm(at - position)), at, radius) for at, radius in _spheres(robot, kinematics, frame)]
+    distance, at, radius = min(found, key=lambda ball: ball[0], default=(0.0, position, 0.0))
+    at, radius = (at, radius) if distance <= 2.0 * radius else (position, 0.0)
+    point = _pair(np.tile((at - position) @ rotation, (2, 1)))
+    return Foot(frame, point, point, round(radius, 6))
+
+
+def _spheres(robot: Robot, kinematics: Kinematics, frame: str) -> list[tuple[np.ndarray, float]]:
+    """Return the centres [m] in the world and the radii [m] of the spheres of a frame's body."""
+    tree, model = robot.tree, robot.mj_model
+    body = tree.frame_bodies[tree.frame(frame)]
+    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
+    return [
+        (origin + turn @ np.asarray(robot.geom_position[geom]), float(robot.geom_size[geom, 0]))
+        for geom in range(model.ngeom)
+        if tree.geom_bodies[geom] == body and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+    ]
 
 
 def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
@@ -246,7 +315,7 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
     floor = -np.inf
     if profile.corners:
-        floor = float((world_points(robot, kinematics, profile.corners)[:, 2]).min())
+        floor = float((world_points(robot, kinematics, profile.corners)[:, 2] - profile.rises).min())
     return _apart_at_home(robot, kinematics, [*seen, *missing], floor)
 
 
@@ -409,7 +478,7 @@ def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> l
             along = (end - start) / length
             ends = inside(known[a][0], start + radius * along, end - 0.5 * radius * along)
             out.append((Capsule(known[a][0], *ends, round(radius, 6)), known[b][0]))
-        if f"{side}_wrist" in known:
+        if f"{side}_wrist" in known and len(profile.feet) != 4:
             elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
             radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
             frame = known[f"{side}_wrist"][0]

@@ -71,11 +71,11 @@ def find_chains(robot: Robot, kinematics: Kinematics, ends: list[int], least: in
     return chains
 
 
-def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str) -> Limb:
-    """Return hip, knee and ankle of a leg; the foot is the ankle if no joint moves it beside the shank."""
+def find_leg(robot: Robot, kinematics: Kinematics, leg: Chain, foot: str, *, pointed: bool = False) -> Limb:
+    """Return hip, knee and ankle of a leg; the foot is the ankle if it is ``pointed`` or no joint moves it."""
     knee = _bend(robot, kinematics, leg, 0)
     ankle = None if knee is None else _after(leg.anchors, knee)
-    if knee is not None and ankle is not None:
+    if knee is not None and ankle is not None and not pointed:
         return Limb(*(_body(robot, leg.bodies[i]) for i in (max(knee - 2, 0), knee, ankle)))
     at = np.asarray(kinematics.frame_pose(robot, foot)[0])
     extended = Chain((*leg.bodies, leg.bodies[-1]), np.concatenate([leg.anchors, at[None]]))

@@ -128,7 +128,7 @@ class LiveRetargeter(OnRobot):
         self.iterations = int(iterations)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
-        self._measures = measure(standing, self.roles)
+        self._measures = measure(standing, self.roles, self.profile.standing)
         self._window_bounds = self._bounds(self._dt)
         self.reset()
 
@@ -218,7 +218,7 @@ class LiveRetargeter(OnRobot):
             _filled(seen, self._known),
             contact=contact,
         )
-        own = read_person(motion, self.roles, self._measures)
+        own = read_person(motion, self.roles, self._measures, self.profile.standing)
         person, now = self._build.seen(own), self._history
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
         goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person, firm=False))

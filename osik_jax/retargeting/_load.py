@@ -56,9 +56,16 @@ def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None
     return standing_up(str(path), motion, up, "z", find_rest_up(motion))
 
 
-def _from_npz(path: Path) -> HumanMotion:
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a ``.npz`` file that have a use (``arrays_to_read``); nothing is unpickled."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
     with open_npz(path) as data:
-        arrays = {name: data[name] for name in arrays_to_read(data.files)}
+        return {name: data[name] for name in arrays_to_read(data.files)}
+
+
+def _from_npz(path: Path) -> HumanMotion:
+    arrays = load_arrays(path)
     if is_smpl(arrays):
         return read_smpl(path, arrays)
     missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]

@@ -59,7 +59,8 @@ class HumanMotion:
 
     def __post_init__(self) -> None:
         frames, joints = len(self.positions), len(self.joint_names)
-        _check_rate(self.fps)
+        if not 0.0 < self.fps <= _FASTEST:
+            raise OsikValueError(f"fps is {self.fps}; it is frames a second, more than 0 and {_FASTEST:g} at most")
         repeated = sorted({name for name in self.joint_names if self.joint_names.count(name) > 1})
         if repeated:
             raise OsikValueError(f"joint names occur twice: {', '.join(repeated)}")
@@ -114,13 +115,9 @@ class HumanMotion:
         Raises:
             ValueError: a rate that is not positive.
         """
-        _check_rate(fps)
-        if fps == self.fps or self.frames == 1:
+        if check_rate(fps) == self.fps or self.frames == 1:
             return dataclasses.replace(self, fps=float(fps))
-        # 1e-9 keeps the last frame where the rates divide evenly up to rounding
-        at = np.arange(int(np.floor((self.frames - 1) / self.fps * fps + 1e-9)) + 1) / fps * self.fps
-        before = np.minimum(at.astype(int), self.frames - 2)
-        part = np.clip(at - before, 0.0, 1.0)
+        before, part = instants(self.frames, self.fps, fps)
         rotations, nearer = self.rotations, before + (part >= 0.5)
         if rotations is not None:
             share = np.broadcast_to(part[:, None], (len(part), rotations.shape[1]))
@@ -128,8 +125,8 @@ class HumanMotion:
         low, high = self.positions[before], self.positions[before + 1]
         objects = {}
         for name, poses in self.objects.items():
-            place = poses[before, :3] + part[:, None] * (poses[before + 1, :3] - poses[before, :3])
-            objects[name] = np.concatenate([place, slerp(poses[before, 3:], poses[before + 1, 3:], part)], -1)
+            at = poses[before, :3] + part[:, None] * (poses[before + 1, :3] - poses[before, :3])
+            objects[name] = np.concatenate([at, slerp(poses[before, 3:], poses[before + 1, 3:], part)], -1)
         return dataclasses.replace(
             self,
             objects=objects,
@@ -141,10 +138,19 @@ class HumanMotion:
         )
 
 
-def _check_rate(fps: float) -> None:
-    """Raise ValueError if a frame rate [1/s] is not positive or above ``_FASTEST``."""
-    if not 0.0 < fps <= _FASTEST:
-        raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0 and {_FASTEST:g} at most")
+def check_rate(fps: float) -> float:
+    """Return a frame rate [1/s], or raise ValueError if it is not positive and finite."""
+    if not (np.isfinite(fps) and fps > 0.0):
+        raise OsikValueError(f"fps is {fps}; it is frames a second, more than 0")
+    return fps
+
+
+def instants(frames: int, fps: float, wanted: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each instant of another rate, the frame before it and its fraction of the way to the next frame."""
+    # 1e-9 keeps the last frame where the rates divide evenly up to rounding
+    at = np.arange(int(np.floor((frames - 1) / fps * wanted + 1e-9)) + 1) / wanted * fps
+    before = np.minimum(at.astype(int), frames - 2)
+    return before, np.clip(at - before, 0.0, 1.0)
 
 
 def _check_array(name: str, value: np.ndarray | None, shape: tuple[int, ...]) -> None:

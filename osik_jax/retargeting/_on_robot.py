@@ -16,6 +16,7 @@ from ._motion import HumanMotion
 from ._profile import Limb, Profile
 from ._profile_file import check_profile, find_profile
 from ._skeletons import find_roles
+from ._source_motion import SourceMotion
 from ._terms import Body, Bounds
 
 ACCELERATION = 240.0
@@ -52,10 +53,10 @@ class OnRobot:
         if robot.floating_base and not self.profile.feet:
             raise OsikValueError(
                 "nothing holds the robot's base: the profile has no feet. Load the robot with floating_base=False, or "
-                "give the profile feet"
+                "give the profile feet; those of a base on wheels have rolls = true"
             )
-        if balance is not None and not robot.floating_base:
-            raise OsikValueError("balance is that of a robot on feet; this one has a fixed base")
+        if balance is not None and not (self.profile.walks and robot.floating_base):
+            raise OsikValueError("balance is that of a robot on feet; this one has no legs that walk")
         robot = self.robot = facing_x(robot, self.profile.across)
         self.limits = ConfigurationLimit(robot), VelocityLimit(robot), _on_joints(robot, acceleration)
         self._acceleration = np.asarray(self.limits[2].acceleration)
@@ -74,10 +75,24 @@ class OnRobot:
             self._bodies[touching] = Body.of(self.robot, self.profile, self._pairs, self.balance, touching)
         return self._bodies[touching]
 
-    def _roles(self, motion: HumanMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
-        """Return the clip's joint for each role, or raise if a needed role is missing."""
+    def _roles(self, motion: HumanMotion | SourceMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
+        """Return the clip's joint for each role (empty for a robot's motion), or raise if a needed role is missing."""
         needed = tuple(dict.fromkeys(role for limb in self.profile.followed for role in limb))
-        return find_roles(motion.joint_names, mapping, needed, motion.positions)
+        if isinstance(motion, HumanMotion):
+            return find_roles(motion.joint_names, mapping, needed, motion.positions)
+        if mapping is not None:
+            raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
+        missing = [role for limb in self.profile.followed for role in limb if role not in motion.seen.keypoints]
+        if missing:
+            raise OsikValueError(
+                f"the robot that is followed has no {', '.join(dict.fromkeys(missing))}; give a profile without these "
+                "keypoints"
+            )
+        if self.profile.walks and motion.seen.standing != self.profile.standing:
+            raise OsikValueError(
+                f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
+            )
+        return {}
 
     def _bounds(self, dt: float) -> Bounds:
         """Return the joint bounds of a plan with one frame per ``dt`` seconds."""

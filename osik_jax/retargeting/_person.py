@@ -13,7 +13,7 @@ from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_ground, find_noise, mean_over, noise_steps
 from ._motion import CONTACT_POINTS, HumanMotion, Touch
 from ._profile import Limb
-from ._roles import LEGS, LIMBS, SIDES
+from ._roles import LEGS, LIMBS, REACHES, SIDES
 from ._up import find_up
 
 # Vectors shorter than this [m] have no direction; a spine shorter than 1 mm means chest and hips are one joint.
@@ -42,8 +42,10 @@ class Person:
     torso: Float[np.ndarray, "F 3 3"]  # forward, left and up axes of the chest as columns
     root: Float[np.ndarray, "F 3"]  # midpoint of the hips, or of the shoulders if the hips are unknown [m]
     feet: Float[np.ndarray, "F 2 3 3"]  # forward, left and up axes of the left and right foot as columns
-    contact: Bool[np.ndarray, "F 4"]  # whether left heel, left toe, right heel and right toe stand
-    lengths: Mapping[Limb, float]  # lengths of the limbs with known ends [m]
+    # whether the points of ``Profile.standing`` stand: left heel, left toe, right heel and right toe, or the four feet
+    # of a four-legged robot
+    contact: Bool[np.ndarray, "F 4"]
+    lengths: Mapping[Limb, float]  # lengths of the limbs and reaches with known ends [m]
     ankle: float  # height of the ankles above the floor when standing [m]
     # poses of objects, as of ``HumanMotion``
     objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
@@ -86,7 +88,7 @@ def foot_axes(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 class Measures:
     """Constant measures of a person: leg length, ankle height, floor, noise and reference poses."""
 
-    lengths: Mapping[Limb, float]  # lengths of the limbs with known ends [m]
+    lengths: Mapping[Limb, float]  # lengths of the limbs and reaches with known ends [m]
     ankle: float  # height of the ankles above the floor when standing; 0 if unknown [m]
     floor: float  # height of the floor [m]
     noise: float  # standard deviation of each coordinate of the standing points [m]
@@ -96,13 +98,23 @@ class Measures:
     straight: tuple[np.ndarray, np.ndarray]
 
 
-def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
-    """Measure a person and the floor from a clip; an ``OsikWarning`` is given if z does not seem to point up."""
+def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, ...] = CONTACT_POINTS) -> Measures:
+    """Measure a person and the floor from a clip.
+
+    An ``OsikWarning`` is given if z does not seem to point up. ``standing`` are the points that say when feet stand.
+    """
     points = {role: motion.track(name) for role, name in roles.items()}
-    legs = _has_legs(points)
-    _check_up(motion, roles)
-    flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES} if legs else {}
-    if motion.rest_positions is not None:
+    legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
+    if not on_four:
+        _check_up(motion, roles)
+    flat = {}
+    if legs:
+        flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
+    if on_four:
+        turns = _turns(points)
+        middle = np.argsort(turns[0][:, 2, 2], kind="stable")[len(turns[0]) // 2]
+        straight = turns[0][middle, None], turns[1][middle, None]
+    elif motion.rest_positions is not None:
         at = {role: motion.joint_names.index(name) for role, name in roles.items()}
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES} if legs else {}
@@ -111,19 +123,20 @@ def measure(motion: HumanMotion, roles: Mapping[str, str]) -> Measures:
         straight = _upright(points)
     known = [limb for limb in LIMBS if set(limb) <= set(points)]
     lengths = {(a, b): float(np.linalg.norm(points[b] - points[a], axis=-1).mean()) for a, b in known}
-    if legs:
+    lengths |= {limb: reach_length(points, limb) for limb in REACHES if set(limb) <= set(points)}
+    if legs and not on_four:
         leg = 0.5 * sum(lengths[limb] for limb in LEGS)
         if not _LEGS[0] < leg < _LEGS[1]:
             raise OsikValueError(f"the legs of {motion.name} are {leg:.4g} m long; positions are metres")
     soles = _with_soles(points, flat)
-    noise, floor, ankle = 0.0, 0.0, 0.0
-    if set(CONTACT_POINTS) <= set(soles):
-        found = np.stack([soles[name] for name in CONTACT_POINTS], 1)
-        noise = find_noise(found)
-        floor = find_ground(found, noise_steps(noise, motion.fps))
-    floor = floor if motion.ground is None else motion.ground
-    if {"left_ankle", "right_ankle"} <= set(points):
-        heights = np.stack([points[f"{side}_ankle"][:, 2] for side in SIDES], 1)
+    found = np.stack([soles[name] for name in standing if name in soles] or [np.zeros((motion.frames, 3))], 1)
+    noise, seen = find_noise(found), all(name in soles for name in standing) and bool(standing)
+    detected = find_ground(found, noise_steps(noise, motion.fps)) if seen else 0.0
+    floor = detected if motion.ground is None else motion.ground
+    ends = standing if on_four else ("left_ankle", "right_ankle")
+    ankle = 0.0
+    if set(ends) <= set(points):
+        heights = np.stack([points[role][:, 2] for role in ends], 1)
         # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
         ankle = float(np.percentile(heights.min(1), 5)) - floor
     return Measures(lengths, ankle, floor, noise, flat, straight)
@@ -143,28 +156,31 @@ def read_person(
     motion: HumanMotion,
     roles: Mapping[str, str],
     measures: Measures | None = None,
+    standing: tuple[str, ...] = CONTACT_POINTS,
 ) -> Person:
     """Return the person of a clip.
 
-    ``measures`` are those of a person whom the clip is too short to show; None: measured from the clip.
+    ``measures`` are those of a person whom the clip is too short to show; None: measured from the clip. ``standing``
+    are the points whose contact with the floor counts (``Profile.standing``).
     """
-    known = measure(motion, roles) if measures is None else measures
+    known = measure(motion, roles, standing) if measures is None else measures
     down = np.array([0.0, 0.0, known.floor])
     points = _with_soles({role: motion.track(name) for role, name in roles.items()}, known.flat)
     points = {role: track - down for role, track in points.items()}
-    contact = motion.contact
-    if contact is None and set(CONTACT_POINTS) <= set(points):
-        soles = np.stack([points[name] for name in CONTACT_POINTS], 1)
+    contact = None if standing != CONTACT_POINTS and "left_toe" in roles else motion.contact
+    if contact is None and standing and set(standing) <= set(points):
+        soles = np.stack([points[name] for name in standing], 1)
         contact = find_contact(soles, motion.fps, 0.0, noise=known.noise)
     turns, straight = _turns(points), known.straight
     pelvis, torso = (_from_rest(turns[k], straight[k][0]) for k in range(2))
     level = np.broadcast_to(np.eye(3), (motion.frames, 2, 3, 3))
+    root = path_of(points)
     return Person(
         fps=motion.fps,
         points=points,
         pelvis=pelvis,
         torso=torso,
-        root=_middle(points, "hip", "shoulder"),
+        root=root,
         feet=np.stack([_foot(points, side) for side in SIDES], 1) if _has_legs(points) else level,
         contact=np.zeros((motion.frames, 4), bool) if contact is None else np.asarray(contact, bool),
         lengths=known.lengths,
@@ -172,6 +188,11 @@ def read_person(
         objects={name: poses - np.pad(down, (0, 4)) for name, poses in motion.objects.items()},
         touches=motion.touches,
     )
+
+
+def reach_length(points: Mapping[str, np.ndarray], limb: Limb) -> float:
+    """Return the median over frames of the distance between a limb's ends [m]."""
+    return float(np.median(np.linalg.norm(points[limb[1]] - points[limb[0]], axis=-1)))
 
 
 def _has_legs(points: Mapping[str, np.ndarray]) -> bool:
@@ -186,6 +207,11 @@ def _middle(points: Mapping[str, np.ndarray], *parts: str) -> np.ndarray:
         if found:
             return 0.5 * (found[0] + found[-1])
     raise OsikValueError(f"none of these is known: {', '.join(parts)}")
+
+
+def path_of(points: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the point of a person that the robot's path follows: the middle of the hips, or of the shoulders."""
+    return _middle(points, "hip", "shoulder")
 
 
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -26,14 +26,14 @@ class Places(NamedTuple):
     keypoints: dict[str, Float[np.ndarray, "F 3"]]  # positions by role [m]
     # rotation matrices of pelvis, chest (or pelvis again for a rigid trunk), left and right foot
     turns: Float[np.ndarray, "F 4 3 3"]
-    # corners of the soles [m]. (F, 8, 3), or (F, 0, 3) without feet
+    # corners of the soles, or lowest points of round feet [m]. (F, 8, 3), or (F, 0, 3) without feet
     soles: Float[np.ndarray, "F corners 3"]
     center: Float[np.ndarray, "F 3"]  # centre of mass [m]
     capsules: Float[np.ndarray, "F k 2 3"]  # both ends of each capsule's axis [m]
 
     @property
     def standing(self) -> Float[np.ndarray, "F parts 3"]:
-        """Return the midpoints of left heel, left toe, right heel and right toe [m]. (F, 4, 3), or (F, 0, 3)."""
+        """Return the midpoints of the parts of the feet, in the order of ``Profile.standing`` [m]. (F, 4, 3)."""
         return self.soles.reshape(len(self.soles), self.soles.shape[1] // 2, 2, 3).mean(2)
 
 
@@ -56,6 +56,7 @@ def find_places(robot: Robot, profile: Profile, qpos: Float[np.ndarray, "F nq"])
         points[f] = [poses[frame][0] + poses[frame][1] @ np.array(point) for frame, point in wanted]
         turns[f] = [poses[frame][1] for frame in turned]
     keys, corners = len(profile.keypoints), len(profile.corners)
+    points[:, keys : keys + corners, 2] -= profile.rises
     return Places(
         keypoints=dict(zip(profile.keypoints, np.moveaxis(points[:, :keys], 1, 0), strict=True)),
         turns=turns,

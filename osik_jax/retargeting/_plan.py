@@ -280,7 +280,7 @@ def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:
 def _weights_between(body: Body, goals: Goals, weights: Weights) -> Float[Array, "F 4"]:
     """Return the weight of each contact point's motion since the frame before; 0 in the first frame. (F, 4)."""
     both = goals.contact[1:] * goals.contact[:-1]
-    return weights.stance * jnp.concatenate([jnp.zeros_like(both[:1]), both])
+    return (0.0 if body.rolls else weights.stance) * jnp.concatenate([jnp.zeros_like(both[:1]), both])
 
 
 class _Hinge(NamedTuple):

@@ -75,7 +75,7 @@ def _structure(body: Body) -> np.ndarray:
         places=len(places),
         straight=int(np.array_equal(columns, np.arange(tree.nv))),
         limbs=len(body.limbs),
-        reaches=body.held,
+        reaches=body.lengths.shape[-1],
         roots=len(body.roots),
         corners=body.corners,
         scalars=len(scalar_q),
@@ -91,16 +91,15 @@ def _structure(body: Body) -> np.ndarray:
 
 def _numbers(body: Body, weights: Weights, bounds: Bounds) -> Float[Array, "_ k"]:
     """Return the float arrays of ``ClipRobot``: robot, profile and weights; the stiffness entry is 0. (_, k)."""
-    none, fixed = np.zeros(1), (0.0, CLEARANCE, SWINGING, SHORTEST, 1.0)
+    none, fixed = np.zeros(1), (0.0, CLEARANCE, SWINGING, SHORTEST, 1.0 - body.rolls)
     balance = (none, none) if body.inside is None else (weights.balance, body.inside)
-    lengths, rises = np.ones((1, body.held)), np.zeros((1, body.corners))
     robot, ids = body.robot, np.array([body.robot.tree.frame(name) for name in body.frames])
     turned, rotations, w = ids[len(body.keys) : len(body.keys) + 4], robot.frame_rotation, weights
     points = robot.frame_position[:, ids] + product(rotations[:, ids], body.offsets[..., None])[..., 0]
     return side_by_side(
         robot.tree.qpos_source[1][None], robot.qpos_offset, robot.joint_reference, robot.body_position,
         robot.body_quaternion, robot.joint_position, robot.joint_axis, dof_columns(robot.tree)[1][None], points,
-        rotations[:, turned], body.home, lengths, rises, body.radii, bounds.lower, bounds.upper,
+        rotations[:, turned], body.home, body.lengths, body.rises, body.radii, bounds.lower, bounds.upper,
         robot.q0[:, scalar_layout(robot)[1]], bounds.step, bounds.change, mass_fractions(robot),
         robot.body_com, w.limb, w.pelvis, w.torso, w.root, w.foot,
         w.posture, w.stance, w.apart, w.limit, w.margin, np.array([fixed]), w.smooth, w.smooth_base, w.speed, *balance,

@@ -12,7 +12,7 @@ from .._errors import OsikValueError, unknown_name
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._goals import Weights
-from ._roles import LIMBS, NEEDED, SIDES
+from ._roles import LIMBS, NEEDED, REACHES, STANDING
 
 Point = tuple[float, float, float]
 Place = tuple[str, Point]
@@ -28,15 +28,13 @@ class Foot:
     frame: str  # a frame of the robot with x forward and z up when the foot stands
     heel: tuple[Point, Point]  # the rear left and the rear right corner in that frame [m]
     toe: tuple[Point, Point]  # the front left and the front right corner in that frame [m]
+    radius: float = 0.0  # radius of a round foot, whose corners are its centre [m]
 
     def __post_init__(self) -> None:
         _check_points(f"heel of {self.frame}", self.heel, (2, 3))
         _check_points(f"toe of {self.frame}", self.toe, (2, 3))
-
-    @property
-    def is_point(self) -> bool:
-        """Return whether the foot is one point, which has no orientation."""
-        return len({*self.heel, *self.toe}) == 1
+        if not self.radius >= 0.0:
+            raise OsikValueError(f"the radius of {self.frame} is {self.radius}; it is a length in metres, 0 or more")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +68,12 @@ class Profile:
             has. A limb may end early or be absent.
         pelvis: the frame that follows the orientation of the person's pelvis; x forward, z up.
         torso: the frame that follows the orientation of the person's chest; None: the robot's trunk is rigid.
-        feet: ``left`` and ``right``; empty without feet.
+        feet: ``left`` and ``right``; ``left_front`` and ``right_front`` too on four feet; empty without feet.
         capsules: shapes that are kept apart and above the floor.
         scale: factor on the person's path; None: the ratio of leg lengths (arm lengths without legs) times ``stretch``.
         stretch: factor on the ratio of lengths.
         weights: weights of the cost terms.
+        rolls: whether the feet are wheels that roll in any direction: they stay on the floor and move along it.
 
     Raises:
         ValueError: a limb lacks its beginning, no limb is left, or feet, scale or stretch are invalid.
@@ -89,6 +88,7 @@ class Profile:
     scale: float | None = None
     stretch: float = 1.0
     weights: Weights = dataclasses.field(default_factory=Weights)
+    rolls: bool = False
 
     def __post_init__(self) -> None:
         hips = "left_hip", "right_hip"
@@ -104,17 +104,39 @@ class Profile:
             _check_points(f"the keypoint {role}", point, (3,))
         if not self.followed:
             raise OsikValueError("the profile has no limb: give the keypoints of a leg or an arm")
-        if self.feet and (set(self.feet) != set(SIDES) or "left_hip" not in self.keypoints):
-            raise OsikValueError(f"the profile has feet {', '.join(self.feet)}; it has left, right and hips, or none")
+        if self.feet and tuple(sorted(self.feet)) not in STANDING:
+            known = " or ".join(", ".join(names) for names in STANDING)
+            raise OsikValueError(f"the profile has feet {', '.join(self.feet)}; it has {known}, or none")
         if self.scale is not None and not self.scale > 0.0:
             raise OsikValueError(f"scale is {self.scale}; it is robot over person, more than 0")
         if not self.stretch > 0.0:
             raise OsikValueError(f"stretch is {self.stretch}; it has to be more than 0")
 
     @property
+    def reached(self) -> tuple[Limb, ...]:
+        """Return the pairs of roles whose vector is tracked, direction and length, relative to nominal lengths.
+
+        Hip to ankle and shoulder to wrist of a robot that walks on four feet.
+        """
+        pairs = REACHES if len(self.feet) == 4 and self.walks else ()
+        return tuple(pair for pair in pairs if set(pair) <= set(self.keypoints))
+
+    @property
     def followed(self) -> tuple[Limb, ...]:
-        """Return the limbs between keypoints, whose directions are tracked."""
-        return tuple(limb for limb in LIMBS if set(limb) <= set(self.keypoints))
+        """Return what is tracked: the limbs between keypoints that do not end where a reach does, then the reaches."""
+        ends = {role for limb in self.reached for role in limb}
+        limbs = (limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
+        return (*limbs, *self.reached)
+
+    @property
+    def walks(self) -> bool:
+        """Return whether the robot has legs that walk: feet and hips, and no wheels."""
+        return bool(self.feet) and "left_hip" in self.keypoints and not self.rolls
+
+    @property
+    def standing(self) -> tuple[str, ...]:
+        """Return the person's contact points that the robot's feet follow, such as heels and toes; () without feet."""
+        return STANDING.get(tuple(sorted(self.feet)), ())
 
     @property
     def across(self) -> tuple[str, str] | None:
@@ -138,9 +160,22 @@ class Profile:
 
     @property
     def corners(self) -> tuple[Place, ...]:
-        """Return the two corners of left heel, left toe, right heel and right toe."""
-        feet = [self.feet[side] for side in SIDES if side in self.feet]
-        return tuple((foot.frame, point) for foot in feet for point in (*foot.heel, *foot.toe))
+        """Return two corners for each point of ``standing``.
+
+        Of two feet, these are the corners of heel and toe; of four, the midpoints of heel and of toe.
+        """
+        parts = []
+        for name in sorted(self.feet):
+            foot = self.feet[name]
+            pairs = (foot.heel, foot.toe) if len(self.feet) == 2 else ((_middle(*foot.heel), _middle(*foot.toe)),)
+            parts += [(foot.frame, point) for pair in pairs for point in pair]
+        return tuple(parts)
+
+    @property
+    def rises(self) -> tuple[float, ...]:
+        """Return the height of each corner above the floor in contact: the radius of its foot [m]."""
+        each = 8 // max(len(self.feet), 1)
+        return tuple(self.feet[name].radius for name in sorted(self.feet) for _ in range(each))
 
 
 def world_points(robot: Robot, kinematics: Kinematics, places: Sequence[Place]) -> Float[np.ndarray, "k 3"]:
@@ -154,3 +189,8 @@ def _check_points(what: str, points: object, shape: tuple[int, ...]) -> None:
     numbers = np.asarray(points, float)
     if numbers.shape != shape or not np.isfinite(numbers).all():
         raise OsikValueError(f"{what} is {points!r}, of shape {numbers.shape}; expected {shape}, finite, in metres")
+
+
+def _middle(a: Point, b: Point) -> Point:
+    """Return the midpoint of two points [m]."""
+    return 0.5 * (a[0] + b[0]), 0.5 * (a[1] + b[1]), 0.5 * (a[2] + b[2])

@@ -63,6 +63,7 @@ def profile_text(profile: Profile) -> str:
     lines += [] if profile.torso is None else [f'torso = "{profile.torso}"']
     lines += [] if profile.scale is None else [f"scale = {profile.scale!r}"]
     lines += [] if profile.stretch == 1.0 else [f"stretch = {profile.stretch!r}"]
+    lines += ["rolls = true"] if profile.rolls else []
     rows = [f'frame = "{c.frame}", start = {_point(c.start)}, end = {_point(c.end)}, radius = {c.radius!r}'
             for c in profile.capsules]  # fmt: skip
     lines += ["capsules = [", *(f"    {{ {row} }}," for row in rows), "]"] if rows else []
@@ -71,6 +72,7 @@ def profile_text(profile: Profile) -> str:
     for side, foot in profile.feet.items():
         lines += ["", f"[feet.{side}]", f'frame = "{foot.frame}"']
         lines += [f"{part} = [{', '.join(_point(p) for p in getattr(foot, part))}]" for part in ("heel", "toe")]
+        lines += [f"radius = {foot.radius!r}"] if foot.radius else []
     lines += ["", "[weights]"]
     for field in dataclasses.fields(Weights):
         value = np.asarray(getattr(profile.weights, field.name), float)

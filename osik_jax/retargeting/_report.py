@@ -133,7 +133,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
-    """Return what ``report`` says of the feet: None without feet or with a fixed base."""
+    """Return what ``report`` says of the feet: None without feet or with a fixed base; slip is None for wheels."""
     names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
     if not result.profile.feet or not result.robot.floating_base:
         return dict.fromkeys(names)
@@ -146,7 +146,7 @@ def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
     heights = points[..., 2][contact]
     values = (
         float(contact.any(1).mean()),
-        1e3 * max(slip),
+        None if result.profile.rolls else 1e3 * max(slip),
         1e3 * float(max(0.0, heights.max(initial=0.0))),
         1e3 * float(max(0.0, -places.soles[..., 2].min())),
     )

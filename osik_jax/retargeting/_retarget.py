@@ -29,9 +29,11 @@ from ._person import Person, read_person, with_path
 from ._plan import make_plan
 from ._profile import Limb, Profile
 from ._retargeted import Retargeted
+from ._source_motion import SourceMotion
 from ._terms import Body, Bounds
 
-_Checked = tuple[HumanMotion, Mapping[str, str]]
+Source = HumanMotion | SourceMotion
+_Checked = tuple[Source, Mapping[str, str]]
 LENGTHS = 16
 """Programs are compiled for multiples of this number of frames."""
 
@@ -97,7 +99,7 @@ class Retargeter(OnRobot):
         self.max_iterations = max_iterations
 
     def retarget(
-        self, motion: HumanMotion, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
+        self, motion: Source, *, mapping: Mapping[str, str] | None = None, fps: float | None = None
     ) -> Retargeted:
         """Retarget one clip; see the function ``retarget``."""
         clip = self._prepared(motion, mapping, fps)
@@ -105,7 +107,7 @@ class Retargeter(OnRobot):
 
     def retarget_all(
         self,
-        motions: Sequence[HumanMotion],
+        motions: Sequence[Source],
         *,
         mapping: Mapping[str, str] | None = None,
         fps: float | None = None,
@@ -169,26 +171,30 @@ class Retargeter(OnRobot):
         for (length, _), clips in waiting.items():
             yield from starmap(finish, self._solved(clips, length, lanes))
 
-    def _prepared(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
+    def _prepared(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> Clip:
         """Return a clip as arrays for planning, after checking it."""
         return self._read(*self._checked(motion, mapping, fps))
 
-    def _checked(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    def _checked(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
         """Return a clip at the requested rate and its joints by role; raise ValueError if it cannot be retargeted."""
         motion = motion if fps is None else motion.resampled(fps)
         if motion.frames < 3:
             raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
         return motion, self._roles(motion, mapping)
 
-    def _checked_by_name(self, motion: HumanMotion, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    def _checked_by_name(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
         try:
             return self._checked(motion, mapping, fps)
         except (ValueError, KeyError) as error:
             raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
-    def _read(self, motion: HumanMotion, roles: Mapping[str, str]) -> Clip:
+    def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
         """Return a checked clip as arrays for planning; ``roles`` maps roles to the clip's joint names."""
-        person = self._build.seen(read_person(with_path(motion, roles), roles))
+        if isinstance(motion, SourceMotion):
+            own = motion.person()
+        else:
+            own = read_person(with_path(motion, roles), roles, standing=self.profile.standing)
+        person = self._build.seen(own)
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
@@ -288,7 +294,7 @@ def _raise(error: Exception) -> NoReturn:
 
 def retarget(
     robot: Robot,
-    motion: HumanMotion,
+    motion: Source,
     *,
     profile: Profile | None = None,
     mapping: Mapping[str, str] | None = None,
@@ -308,8 +314,8 @@ def retarget(
 
     Args:
         robot: robot with limbs of a person (``guess_profile``), z up at home.
-        motion: clip of a person.
-        mapping: role to joint name of the clip. None: by common names.
+        motion: clip of a person, or of another robot (``SourceMotion``).
+        mapping: role to joint name of a person's clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
         profile: as in ``Retargeter``.
         acceleration: as in ``Retargeter``.
@@ -318,7 +324,8 @@ def retarget(
         max_iterations: as in ``Retargeter``.
 
     Raises:
-        ValueError: the clip has fewer than three frames or lacks a needed joint, or the robot has no limbs of a person.
+        ValueError: the clip has fewer than three frames or lacks a needed joint, the robot has no limbs of a person,
+            or ``mapping`` comes with a robot's motion.
         KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
     own = Retargeter(

@@ -1,4 +1,4 @@
-"""Records of a retargeted motion: the robot's, and with it the person's."""
+"""Record of a retargeted motion together with the person's motion."""
 
 from __future__ import annotations
 
@@ -12,35 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..robot import Robot
-from ..robot._mujoco import model_qpos
-from ..robot._tree import FREE
 from ._body import TouchGoal
-from ._motion import CONTACT_POINTS
 from ._person import Person
 from ._profile import Profile
+from ._robot_motion import RobotMotion, in_mujoco_order
 from ._roles import bones
-
-
-@dataclasses.dataclass(frozen=True)
-class RobotMotion:
-    """Motion of a robot in MuJoCo's joint order.
-
-    Attributes:
-        fps: frame rate [1/s].
-        joint_names: joints of the columns of ``qpos`` after the seven of the free joint.
-        qpos: position of the base [m], its quaternion w x y z, then one number per joint [rad or m]; of a robot whose
-            base is fixed the joints alone. (F, 7 + joints) or (F, joints)
-    """
-
-    fps: float
-    joint_names: tuple[str, ...]
-    qpos: Float[np.ndarray, "F nq"]
-
-    def save_csv(self, path: str | os.PathLike[str]) -> None:
-        """Write the CSV layout of GMR and mjlab: position, quaternion x y z w, joints; no headings."""
-        base = [0, 1, 2, 4, 5, 6, 3] if self.qpos.shape[1] > len(self.joint_names) else []
-        columns = [*base, *range(len(base), self.qpos.shape[1])]
-        np.savetxt(path, self.qpos[:, columns], fmt="%.9g", delimiter=",")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +31,8 @@ class Retargeted:
         human: positions of the person's joints, floor at height 0 [m]. (F, J, 3)
         human_names: roles of these joints, and ``root``, the midpoint of the hips.
         turns: forward, left and up axes of the person's pelvis and chest as columns. (F, 2, 3, 3)
-        contact: whether left heel, left toe, right heel and right toe stand. (F, 4)
+        contact: whether left heel, left toe, right heel and right toe stand, or the points of ``Profile.standing`` of a
+            robot of another shape. (F, 4)
         off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
         iterations: iterations of the plan; 0 for a live stream.
         cost: final cost of the goals, and of the violated bounds; 0 for a live stream.
@@ -102,7 +79,7 @@ class Retargeted:
         """
         names = self.human_names
         pairs = [(names.index(a), names.index(b)) for a, b in bones(names)]
-        standing = [names.index(name) for name in CONTACT_POINTS if self.profile.feet and name in names]
+        standing = [names.index(name) for name in self.profile.standing if name in names]
         objects: dict[str, Any] = {f"object.{name}": poses for name, poses in self.objects.items()}
         np.savez_compressed(
             Path(path),
@@ -117,12 +94,3 @@ class Retargeted:
             ground=0.0,
             **objects,
         )
-
-
-def in_mujoco_order(robot: Robot, q: Float[np.ndarray, "F nq"], fps: float) -> RobotMotion:
-    """Return a motion with all joints of the robot's model, locked and coupled joints included."""
-    tree, qpos = robot.tree, model_qpos(robot, q)
-    joints = [j for j, kind in enumerate(tree.joint_types) if kind != FREE]
-    base = [int(tree.full_qpos_address[free]) + k for free in tree.free_bases for k in range(7)]
-    columns = [*base, *(int(tree.full_qpos_address[j]) for j in joints)]
-    return RobotMotion(float(fps), tuple(tree.joint_names[j] for j in joints), qpos[:, columns])

@@ -1,4 +1,4 @@
-"""Names of a person's joints and limbs in retargeting."""
+"""Names of a person's joints and limbs in retargeting; an animal on four legs has the same."""
 
 import itertools
 from collections.abc import Collection
@@ -14,9 +14,16 @@ LIMBS = tuple(
 )
 """Segments whose directions are tracked if the robot has them, from the first role to the second."""
 LEGS = LIMBS[:4]
+REACHES = tuple((f"{side}_{roles[0]}", f"{side}_{roles[-1]}") for side in SIDES for roles in CHAINS.values())
+"""Limbs of a four-legged robot, each from its first joint to its foot."""
 NEEDED = tuple(dict.fromkeys(role for limb in LIMBS for role in limb))
 """Roles that every clip must have."""
 OPTIONAL = ("pelvis", "chest", "neck", "head", "left_heel", "left_toe", "right_heel", "right_toe")
+STANDING = {
+    ("left", "right"): ("left_heel", "left_toe", "right_heel", "right_toe"),
+    ("left", "left_front", "right", "right_front"): tuple(end for _, end in REACHES),
+}
+"""Sorted names of a robot's feet, and the four points of a person whose contact with the floor they share."""
 
 _TRUNK = (
     ("left_hip", "right_hip"),

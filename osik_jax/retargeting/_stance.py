@@ -64,7 +64,7 @@ def hold_feet(
     """
     if not body.corners:
         return Held(integrate(body.robot, q, step), step, stance, jnp.zeros((), step.dtype))
-    held = contact & stance.stands
+    held = contact & stance.stands & (not body.rolls)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
         return (state.error > _SMALL) & (state.iterations < _MOST_ITERATIONS)

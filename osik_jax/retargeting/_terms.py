@@ -22,13 +22,15 @@ from ..tasks._rotation import dot, rotation_log
 from ._balance import mass_fractions, overhang
 from ._facing import facing_at_home
 from ._goals import Goals, Weights
-from ._profile import Limb, Place, Profile
-from ._roles import SIDES
+from ._profile import Limb, Place, Profile, world_points
+from ._roles import CHAINS, SIDES
 
 # Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
 ORIGIN = "origin"
-"""The world's origin as the first point of a pair: the second follows a path in the world."""
+"""The world's origin as the first point of a reach: the second follows a path in the world."""
+# Length of a standing leg over its stretched length, for robots whose legs are straight at home.
+STANDING_SHARE = 0.85
 # Pairs of capsules that get rows; the nearest ones are chosen in each iteration.
 PAIRS = 12
 CLEARANCE, SWINGING = 3e-3, 2e-3
@@ -43,19 +45,21 @@ class Body(eqx.Module):
     radii: Float[Array, " capsules"]  # radii of the capsules [m]
     # rotation matrices of pelvis, chest and feet at home, relative to the robot's forward, left and up axes
     home: Float[Array, "4 3 3"]
+    lengths: Float[Array, " reaches"]  # nominal lengths of the reaches [m]
+    rises: Float[Array, " corners"]  # heights of the corners above the floor in contact: radii of round feet [m]
     inside: Float[Array, ""] | None  # margin of the centre of mass inside the support polygon [m]; None: not bounded
     # frame of each place: keypoints, pelvis, torso, feet, corners, both ends of each capsule (static)
     frames: tuple[str, ...] = eqx.field(static=True)
     keys: tuple[str, ...] = eqx.field(static=True)  # the role of each keypoint (static)
-    # first and second keypoint of each limb that is followed, and of each pair that is held together (static)
+    # first and second keypoint of each limb that is followed, the reaches last (static)
     limbs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    held: int = eqx.field(static=True)  # number of pairs that are held together, the last of ``limbs`` (static)
     # indices into ``home`` of the orientations that are followed (static)
     turned: tuple[int, ...] = eqx.field(static=True)
     # the two places whose midpoint follows the root's path; empty if the base is fixed (static)
     roots: tuple[int, ...] = eqx.field(static=True)
     # number of the feet's corners: 8, or 0 without feet or with a fixed base (static)
     corners: int = eqx.field(static=True)
+    rolls: bool = eqx.field(static=True)  # whether points in contact may move along the floor (static)
     # capsules kept above the floor: not the feet's, which have corners, nor capsules inside others (static)
     above: tuple[int, ...] = eqx.field(static=True)
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)  # pairs of capsules that are kept apart (static)
@@ -71,7 +75,8 @@ class Body(eqx.Module):
     ) -> Body:
         """Return the arrays for a robot and a profile; capsules of ``pairs`` are kept apart.
 
-        Balance keeps the margin ``inside`` [m]. The pairs ``touching`` are held together; they may begin at ``ORIGIN``.
+        Balance keeps the margin ``inside`` [m]. Reaches ``touching``, of length 1 m, come after those of the profile;
+        they may begin at ``ORIGIN``.
         """
         fixed: dict[str, Place] = {ORIGIN: (robot.tree.body_names[0], (0.0, 0.0, 0.0))} if touching else {}
         points = {**profile.keypoints, **fixed}
@@ -83,23 +88,27 @@ class Body(eqx.Module):
             places += [(capsule.frame, capsule.start), (capsule.frame, capsule.end)]
         feet = {robot.tree.frame_bodies[robot.tree.frame(foot.frame)] for foot in profile.feet.values()}
         bodies = [robot.tree.frame_bodies[robot.tree.frame(capsule.frame)] for capsule in profile.capsules]
-        flat = [2 + i for i, side in enumerate(SIDES) if side in profile.feet and not profile.feet[side].is_point]
-        turned = [*([0] if free else []), *flat, *([] if profile.torso is None else [1])]
+        flat = [2 + i for i, side in enumerate(SIDES) if side in profile.feet and not profile.feet[side].radius]
+        turned = [*([0] if free else []), *(flat if profile.walks else []), *([] if profile.torso is None else [1])]
+        hips = (keys.index("left_hip"), keys.index("right_hip")) if profile.walks else (len(keys), len(keys))
         at_home = home_kinematics(robot)
         home = at_home.frame_poses(robot, profile.turned)[1]
+        lengths = [*(reach_length(robot, profile, limb) for limb in profile.reached), *(1.0 for _ in touching)]
         return cls(
             robot=robot,
             offsets=jnp.array([point for _, point in places], robot.q0.dtype),
             radii=jnp.array([capsule.radius for capsule in profile.capsules], robot.q0.dtype),
             home=jnp.asarray(facing_at_home(robot, profile.across).T, home.dtype) @ home,
+            lengths=jnp.array(lengths, robot.q0.dtype),
+            rises=jnp.array(profile.rises[: len(corners)], robot.q0.dtype),
             inside=None if inside is None else jnp.asarray(inside, robot.q0.dtype),
             frames=tuple(frame for frame, _ in places),
             keys=keys,
             limbs=tuple((keys.index(a), keys.index(b)) for a, b in (*profile.followed, *touching)),
-            held=len(touching),
             turned=tuple(turned),
-            roots=(keys.index("left_hip"), keys.index("right_hip")) if free else (),
+            roots=hips if free else (),
             corners=len(corners),
+            rolls=profile.rolls,
             above=tuple(
                 i
                 for i, (body, own) in enumerate(zip(bodies, profile.capsules, strict=True))
@@ -107,6 +116,16 @@ class Body(eqx.Module):
             ),
             pairs=tuple((int(i), int(j)) for i, j in pairs),
         )
+
+
+def reach_length(robot: Robot, profile: Profile, limb: Limb) -> float:
+    """Return the nominal length of a reach [m]: that at home, at most ``STANDING_SHARE`` of the stretched limb."""
+    side, end = limb[1].split("_")
+    roles = next(roles for roles in CHAINS.values() if end in roles)
+    known = [profile.keypoints[role] for role in (f"{side}_{part}" for part in roles) if role in profile.keypoints]
+    points = world_points(robot, home_kinematics(robot), known)
+    stretched = float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
+    return min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
 
 
 class Joints(NamedTuple):
@@ -126,7 +145,7 @@ class FrameRows(NamedTuple):
     soft: Float[Array, " m"]  # weights of goals, 0 in the rows of bounds
     stiff: Float[Array, " m"]  # weights of bounds, 0 in the rows of goals
     joints: Joints  # terms of single joints
-    stance: Float[Array, "8"]  # x and y of left heel, left toe, right heel and right toe [m], 0 without feet
+    stance: Float[Array, "8"]  # x and y of the four points of ``Profile.standing`` [m], 0 without feet
     stance_jacobian: Float[Array, "8 nv"]  # derivative of ``stance``
 
 
@@ -187,7 +206,7 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
     soft += [_root(place, body.roots, goals, weights)] if body.roots else []
     soft += [_turn(place, k, i, dot(turns[i][0], body.home[i]), turns[i][1]) for i in body.turned]
     corners = slice(k + 4, first)
-    stiff = [_soles(place, corners, goals.contact, weights.stance)] if body.corners else []
+    stiff = [_soles(place, corners, body.rises, goals.contact, weights.stance)] if body.corners else []
     if body.above:
         stiff.append(_floor(place, first, body, weights.stance))
     if body.pairs:
@@ -217,6 +236,7 @@ def soles(body: Body, kinematics: Kinematics) -> tuple[Float[Array, "8 3"], Floa
     """Return the lowest points of the soles' corners in the world [m], and their derivatives."""
     robot, first = body.robot, len(body.keys) + 4
     points, _, moves = _placed(body, kinematics, slice(first, first + 8))
+    points = points.at[:, 2].add(-body.rises)
     axes = jnp.tile(jnp.eye(3, dtype=points.dtype), (8, 1))
     rates = _Motion.of(robot, kinematics).rates(np.repeat(moves, 3, 0), axes, jnp.repeat(points, 3, 0))
     return points, independent_columns(robot.tree, rates).reshape(8, 3, -1)
@@ -246,23 +266,26 @@ class _Places(NamedTuple):
 def _limbs(place: _Places, body: Body, goals: Goals, weights: Weights) -> _Rows:
     """Return the error of each limb's direction, ``d - u``, with ``d' = (I - d d^T) / length (J_b - J_a)``.
 
-    A pair that is held together has its vector [m] in place of d, with ``d' = J_b - J_a``.
+    A reach has the vector over its nominal length in place of d, with ``d' = (J_b - J_a) / length``.
     """
     first, second = (np.array([limb[i] for limb in body.limbs]) for i in range(2))
     across = place.points[second] - place.points[first]
-    directed = (np.arange(len(first)) < len(first) - body.held)[:, None]
-    length = jnp.where(directed, jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), SHORTEST), 1.0)
+    reaches = body.lengths.shape[-1]
+    length = jnp.linalg.norm(across, axis=-1)
+    length = length.at[len(length) - reaches :].set(body.lengths) if reaches else length
+    length = jnp.maximum(length, SHORTEST)[:, None]
     direction = across / length
-    sideways = (
-        jnp.eye(3, dtype=length.dtype) - directed[..., None] * direction[:, :, None] * direction[:, None]
-    ) / length[..., None]
+    directed = (np.arange(len(first)) < len(first) - reaches)[:, None, None]
+    sideways = (jnp.eye(3, dtype=length.dtype) - directed * direction[:, :, None] * direction[:, None]) / length[
+        ..., None
+    ]
     sideways = sideways.reshape(-1, 3)
     ends = []
     for index in (first, second):
         index = np.repeat(index, 3)
         ends.append(place.motion.rates(place.moves[index], sideways, place.points[index]))
     residual = (direction - goals.directions).ravel()
-    weight = jnp.concatenate([jnp.ones(len(first) - body.held, residual.dtype), goals.held])
+    weight = jnp.concatenate([jnp.ones(len(first) - reaches, residual.dtype), goals.held])
     return _Rows(residual, ends[1] - ends[0], weights.limb * jnp.repeat(weight, 3))
 
 
@@ -289,7 +312,7 @@ def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
     return points[:, 2], place.motion.rates(place.moves[some], up, points)
 
 
-def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
+def _soles(place: _Places, corners: slice, rises: Array, contact: Float[Array, "4"], weight: Float[Array, ""]) -> _Rows:
     """Return the rows of the sole corners: height 0 in contact, at least a clearance otherwise.
 
     Corners without contact weigh less, because their rows switch on and off between iterations; so a swinging foot may
@@ -297,7 +320,7 @@ def _soles(place: _Places, corners: slice, contact: Float[Array, "4"], weight: F
     """
     height, rates = _heights(place, corners)
     stands = jnp.repeat(contact, 2) > 0.5
-    gap = height - jnp.where(stands, 0.0, CLEARANCE)
+    gap = height - rises - jnp.where(stands, 0.0, CLEARANCE)
     return _Rows(gap, rates, jnp.where(stands, weight, jnp.where(gap < 0.0, SWINGING * weight, 0.0)))
 
 

@@ -335,14 +335,24 @@ def test_another_rate_goes_through_the_frames():
     assert motion.resampled(10.0).frames == 3
 
 
-def test_a_robots_motion_is_written_as_a_table(tmp_path):
+def test_a_robots_motion_comes_back_from_both_files(tmp_path):
     rng = np.random.default_rng(3)
     qpos = np.hstack([rng.normal(size=(4, 3)), Rotation.random(4, random_state=1).as_quat(scalar_first=True)])
     motion = RobotMotion(30.0, ("hip", "knee"), np.hstack([qpos, rng.normal(size=(4, 2))]))
+    np.savez(tmp_path / "motion.npz", fps=motion.fps, joint_names=motion.joint_names, qpos=motion.qpos)
+    back = RobotMotion.load(tmp_path / "motion.npz")
+    assert back.joint_names == motion.joint_names and (back.qpos == motion.qpos).all()
     motion.save_csv(tmp_path / "motion.csv")
     first = np.loadtxt(tmp_path / "motion.csv", delimiter=",")[0]
     np.testing.assert_allclose(first[3:7], np.roll(motion.qpos[0, 3:7], -1), rtol=1e-8)
-    np.testing.assert_allclose(first[[0, 1, 2, 7, 8]], motion.qpos[0, [0, 1, 2, 7, 8]], rtol=1e-8)
+    back = RobotMotion.load(tmp_path / "motion.csv", joint_names=("hip", "knee"), fps=30.0)
+    np.testing.assert_allclose(back.qpos, motion.qpos, rtol=1e-8)
+    with pytest.raises(ValueError, match="say joint_names and fps"):
+        RobotMotion.load(tmp_path / "motion.csv")
+    with pytest.raises(ValueError, match="line 1: 9 numbers, not 8"):
+        RobotMotion.load(tmp_path / "motion.csv", joint_names=("hip",), fps=30.0)
+    with pytest.raises(ValueError, match="not of unit length in frame 0"):
+        RobotMotion(30.0, (), np.ones((1, 7)))
 
 
 @pytest.mark.parametrize("frames", [1, 4])

@@ -25,6 +25,7 @@ from osik_jax.kinematics._home import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,
+    RobotMotion,
     _plan,
     guess_profile,
     load_motion,
@@ -318,9 +319,12 @@ def test_a_folder_goes_on_where_it_was(nao, dance, danced, tmp_path, capsys, mon
     assert {path.name for path in (out / "short").iterdir()} == {"motion.npz", "motion.csv", "report.json"}
     summary = json.loads((out / "report.json").read_text())
     assert set(summary["figures"]) == {"dance", "short"} and set(summary["failed"]) == {"broken"}
+    index = [line.split(",") for line in (out / "index.csv").read_text().splitlines()]
+    assert [row[0] for row in index] == ["clip", "broken", "dance", "short"] and "ROOT" in ",".join(index[1])
+    assert float(index[2][index[0].index("slip_mm_max")]) == summary["figures"]["dance"]["slip_mm_max"]
     slips = [json.loads((out / name / "report.json").read_text())["feet"]["slip_mm_max"] for name in ("dance", "short")]
     assert summary["worst"]["slip_mm_max"] == max(slips) < 0.1
-    np.testing.assert_allclose(np.load(out / "dance" / "motion.npz")["qpos"], danced.motion.qpos, atol=1e-5)
+    np.testing.assert_allclose(RobotMotion.load(out / "dance" / "motion.npz").qpos, danced.motion.qpos, atol=1e-5)
     # what is there is not made again, but where its file is another one now
     made = []
     monkeypatch.setattr(Retargeter, "_made", lambda own, clip, length: made.append(length))
@@ -386,8 +390,9 @@ def test_the_last_pass_keeps_limits_whatever_the_plan(nao):
 
 def test_files_come_back(danced, tmp_path):
     danced.save(tmp_path / "motion.npz")
+    back = RobotMotion.load(tmp_path / "motion.npz")
+    np.testing.assert_array_equal(back.qpos, danced.motion.qpos)
     with np.load(tmp_path / "motion.npz", allow_pickle=False) as data:
-        np.testing.assert_array_equal(data["qpos"], danced.motion.qpos)
         pictured = {"human", "human_names", "human_bones", "human_standing"}
         assert set(data.files) == {"fps", "qpos", "joint_names", *pictured, "contact", "ground"}
         assert data["human"].shape == (30, len(data["human_names"]), 3) and data["contact"].shape == (30, 4)
@@ -402,8 +407,9 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     assert {path.name for path in out.iterdir()} == {"motion.npz", "motion.csv", "report.json", "profile.toml"}
     figures = json.loads((out / "report.json").read_text())
     assert figures["clip"] == "dance" and figures["feet"]["slip_mm_max"] < 0.01
-    table, qpos = np.loadtxt(out / "motion.csv", delimiter=","), np.load(out / "motion.npz")["qpos"]
-    np.testing.assert_allclose(table, qpos[:, [0, 1, 2, 4, 5, 6, 3, *range(7, qpos.shape[1])]], atol=1e-8)
+    motion = RobotMotion.load(out / "motion.npz")
+    table = RobotMotion.load(out / "motion.csv", joint_names=motion.joint_names, fps=motion.fps)
+    np.testing.assert_allclose(table.qpos, motion.qpos, atol=1e-8)
     assert load_profile(out / "profile.toml").keypoints == load_profile("nao").keypoints
 
 

@@ -1,4 +1,4 @@
-"""Robots that lack limbs: small models, judged by MuJoCo and by equal motions."""
+"""Robots that lack limbs, roll or stand on four feet: small models, judged by MuJoCo and by equal motions."""
 
 import dataclasses
 from functools import partial
@@ -11,18 +11,23 @@ import pytest
 from core_checks import needs_core
 from motion_files import dancer, write_bvh
 from scipy.spatial.transform import Rotation
-from small_robots import FPS, SIDES, on_four, quietly, robot_of
+from small_robots import ARM, FOREARM, FPS, SIDES, on_four, quietly, robot_of, trotting
 
 import osik_jax as osik
 from osik_jax.retargeting import (
     HumanMotion,
     LiveRetargeter,
     Retargeter,
+    RobotMotion,
+    SourceMotion,
     describe_profile,
     guess_profile,
     load_motion,
+    load_profile,
     report,
+    save_profile,
 )
+from osik_jax.retargeting._person import read_person
 from osik_jax.retargeting._plan import _Clip, _descended, _descended_plain
 from osik_jax.retargeting._skeletons import find_roles
 
@@ -66,9 +71,15 @@ def test_arms_on_a_fixed_base_follow_beside_the_trunk(motion, tmp_path):
     asked = Rotation.from_euler("z", 90.0, degrees=True).apply(asked)
     assert np.degrees(np.arccos(upper @ asked / np.linalg.norm(upper) / np.linalg.norm(asked))) < 1.0
     # its files have no free joint
+    result.save(tmp_path / "motion.npz")
     result.motion.save_csv(tmp_path / "motion.csv")
-    assert len(result.motion.joint_names) == robot.nv
-    np.testing.assert_allclose(np.loadtxt(tmp_path / "motion.csv", delimiter=","), result.motion.qpos, atol=1e-8)
+    joints = result.motion.joint_names
+    for loaded in (
+        RobotMotion.load(tmp_path / "motion.npz"),
+        RobotMotion.load(tmp_path / "motion.csv", joint_names=joints, fps=FPS),
+    ):
+        assert not loaded.is_free and loaded.joint_names == joints
+        np.testing.assert_allclose(loaded.qpos, result.motion.qpos, atol=1e-8)
 
 
 def test_an_upper_body_needs_no_legs_in_the_clip(motion):
@@ -94,11 +105,95 @@ def test_legs_without_arms_and_arms_that_end_at_the_elbow_walk_as_the_person(mot
         assert figures["feet"]["contact_share"] == 1.0 and figures["tracking"]["segment_angle_deg_mean"] < 2.0
 
 
+@pytest.mark.release
+def test_a_base_on_wheels_takes_heading_and_path_and_stays_level(motion):
+    robot = robot_of("arms", "wheels")
+    retargeter = quietly(Retargeter, robot)
+    assert retargeter.profile.rolls and len(retargeter.profile.feet) == 2
+    way = np.linspace([0.0, 0.0, 0.0], [0.6, 0.3, 0.0], motion.frames)
+    turns = Rotation.from_euler("zy", np.linspace([0, 0], [60, 20], motion.frames), degrees=True).as_matrix()
+    moved = np.einsum("fij,fkj->fki", turns, motion.positions) + way[:, None]
+    clip = dataclasses.replace(motion, positions=moved, rotations=None, rest_positions=None)
+    result = quietly(retargeter.retarget, clip)
+    figures = judged(result)
+    assert figures["feet"]["float_mm_max"] < 0.2 and figures["feet"]["below_floor_mm_max"] < 0.2
+    assert figures["feet"]["slip_mm_max"] is None
+    base = Rotation.from_quat(result.q[:, 3:7], scalar_first=True)
+    np.testing.assert_allclose(base.as_matrix()[:, 2, 2], 1.0, atol=1e-5)
+    heading = base.as_euler("zyx", degrees=True)[:, 0]
+    assert heading[-1] - heading[0] == pytest.approx(60.0, abs=2.0)
+    person = read_person(clip, find_roles(clip.joint_names))
+    scale = retargeter._build.scale(person)
+    walked = result.q[-1, :2] - result.q[0, :2]
+    np.testing.assert_allclose(walked, scale * (person.root[-1] - person.root[0])[:2], atol=0.02)
+    assert figures["tracking"]["segment_angle_deg_mean"] < 2.0
+
+
+@pytest.mark.release
+def test_four_feet_follow_a_dog(tmp_path):
+    robot = on_four()
+    retargeter = quietly(Retargeter, robot)
+    profile = retargeter.profile
+    assert tuple(profile.feet) == ("left", "left_front", "right", "right_front")
+    assert {foot.radius for foot in profile.feet.values()} == {0.02} and len(profile.reached) == 4
+    clip = trotting()
+    result = retargeter.retarget(clip)
+    figures = judged(result)
+    np.testing.assert_allclose(result.contact.mean(0), 0.5, atol=0.1)
+    # by MuJoCo: balls that stand are where they landed and touch the floor; the others are lifted
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    names = [f"{s}_{row}_ball" for s, _ in SIDES for row in ("hind", "front")]
+    balls = np.zeros((len(result.q), 4, 3))
+    for frame, qpos in enumerate(result.motion.qpos):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        balls[frame] = [data.geom(name).xpos for name in names]
+    assert np.abs(balls[..., 2][result.contact] - 0.02).max() < 2e-4 and balls[..., 2].min() > 0.0198
+    both = result.contact[1:] & result.contact[:-1]
+    assert np.linalg.norm(np.diff(balls, axis=0)[..., :2], axis=-1)[both].max() < 5e-5
+    scale = retargeter._build.scale(read_person(clip, find_roles(clip.joint_names), standing=profile.standing))
+    assert balls[..., 2].max() - 0.02 == pytest.approx(0.06 * scale, rel=0.2)
+    assert result.q[-1, 0] - result.q[0, 0] == pytest.approx(scale * 0.4 * (clip.frames - 1) / FPS, rel=0.05)
+    assert figures["feet"]["slip_mm_max"] < 0.5
+    # and the profile comes back from its file
+    save_profile(profile, tmp_path / "robot.toml")
+    assert load_profile(tmp_path / "robot.toml") == profile
+
+
+@pytest.mark.release
+def test_four_feet_stay_where_an_arm_follows(motion):
+    """The feet stand all the time, and the trunk leans as the person's does beside the heading."""
+    arm = ARM.format(s="right", y=0, dy=-0.05, forearm=FOREARM.format(s="right"))
+    robot = on_four(f'<body name="mount" pos="0.4 0 0.2">{arm}</body>')
+    with pytest.warns(osik.OsikWarning, match="no left arm; .*right arm to the wrist; 4 feet; the feet stay"):
+        retargeter = Retargeter(robot)
+    assert not retargeter.profile.walks and not retargeter.profile.reached
+    turns = Rotation.from_euler("ZY", np.linspace([0, 0], [60, 10], motion.frames), degrees=True).as_matrix()
+    turned = np.einsum("fij,fkj->fki", turns, motion.positions)
+    result = quietly(
+        retargeter.retarget, dataclasses.replace(motion, positions=turned, rotations=None, rest_positions=None)
+    )
+    figures = judged(result)
+    assert figures["feet"]["contact_share"] == 1.0 and figures["feet"]["slip_mm_max"] < 0.1
+    assert figures["feet"]["float_mm_max"] < 0.1 and figures["tracking"]["segment_angle_deg_mean"] < 3.0
+    lean = Rotation.from_quat(result.q[:, 3:7], scalar_first=True).as_euler("zyx", degrees=True)
+    assert lean[-1, 1] - lean[0, 1] == pytest.approx(10.0, abs=3.0) and np.abs(lean[:, 0]).max() < 3.0
+    np.testing.assert_allclose(result.q[:, 2], 0.42, atol=0.02)
+
+
 @pytest.mark.slow
+@pytest.mark.variants(release=["wheels", "four feet"])
 @needs_core
-def test_the_core_plans_other_shapes_as_the_plain_method(motion):
-    own = quietly(Retargeter, robot_of("arms", free=False))
-    short = dataclasses.replace(motion, positions=motion.positions[:9], rotations=None)
+@pytest.mark.parametrize("shape", ["four feet", "wheels", "fixed"])
+def test_the_core_plans_other_shapes_as_the_plain_method(shape, motion):
+    shapes = {
+        "four feet": on_four,
+        "wheels": partial(robot_of, "arms", "wheels"),
+        "fixed": partial(robot_of, "arms", free=False),
+    }
+    own = quietly(Retargeter, shapes[shape]())
+    few = dataclasses.replace(motion, positions=motion.positions[:9], rotations=None)
+    short = trotting(9) if shape == "four feet" else few
     asked = own._prepared(short, None, None)
     clip = jax.tree.map(
         jnp.asarray, _Clip(own._body, asked.goals, own.profile.weights, asked.bounds, jnp.ones(len(asked.start)))
@@ -127,20 +222,35 @@ def test_a_stream_drives_a_fixed_base(motion):
 
 
 def test_profiles_of_other_shapes_say_what_is_wrong():
+    profile = quietly(guess_profile, on_four())
     robot = robot_of("legs", "arms")
-    profile = quietly(guess_profile, robot)
     with pytest.raises(ValueError, match="nothing holds the robot's base"):
-        Retargeter(robot, profile=dataclasses.replace(profile, feet={}))
-    with pytest.raises(ValueError, match="it has no feet"):
+        Retargeter(robot, profile=dataclasses.replace(quietly(guess_profile, robot), feet={}))
+    with pytest.raises(ValueError, match="it has no feet and no wheels"):
         guess_profile(robot_of("arms"))
     with pytest.raises(ValueError, match="no keypoints right_hip"):
         dataclasses.replace(profile, keypoints={r: p for r, p in profile.keypoints.items() if r != "right_hip"})
     with pytest.raises(KeyError, match="no keypoint 'tail'"):
-        dataclasses.replace(profile, keypoints={**profile.keypoints, "tail": ("base", (0.0, 0.0, 0.0))})
-    with pytest.raises(ValueError, match="has feet left; it has left, right and hips, or none"):
-        dataclasses.replace(profile, feet={"left": profile.feet["left"]})
-    with pytest.raises(ValueError, match="two feet are needed, and 4 frames look like some"):
-        guess_profile(on_four())
+        dataclasses.replace(profile, keypoints={**profile.keypoints, "tail": ("trunk", (0.0, 0.0, 0.0))})
+    with pytest.raises(ValueError, match="has feet left, left_front, right;"):
+        dataclasses.replace(profile, feet={name: foot for name, foot in profile.feet.items() if name != "right_front"})
     fixed = robot_of("arms", free=False)
     with pytest.raises(ValueError, match="balance is that of a robot on feet"):
         Retargeter(fixed, profile=quietly(guess_profile, fixed), balance=0.01)
+
+
+@pytest.mark.release
+def test_a_robot_follows_one_with_the_limbs_that_it_has(motion):
+    """Arms of a humanoid on a fixed base; no arms, and other feet, are refused."""
+    walker = robot_of("legs", "arms")
+    danced = Retargeter(walker).retarget(motion)
+    source = SourceMotion(walker, danced.motion, danced.profile)
+    retargeter = quietly(Retargeter, robot_of("arms", free=False))
+    followed = retargeter.retarget(source)
+    own = retargeter.retarget(motion)
+    np.testing.assert_allclose(followed.q, own.q, atol=0.05)
+    legs = quietly(Retargeter, robot_of("legs")).retarget(motion)
+    with pytest.raises(ValueError, match="has no left_shoulder, left_elbow"):
+        retargeter.retarget(SourceMotion(legs.robot, legs.motion, legs.profile))
+    with pytest.raises(ValueError, match="4 feet cannot follow 2"):
+        quietly(Retargeter, on_four()).retarget(source)

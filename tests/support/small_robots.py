@@ -1,4 +1,4 @@
-"""Small robots of other shapes than a person's, for tests of retargeting."""
+"""Small robots of other shapes than a person's, and the walk of a dog, for tests of retargeting."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 import osik_jax as osik
+from osik_jax.retargeting import HumanMotion
 
 FPS = 30.0
 LEG = """<body name="{s}_hip_yaw" pos="0 {y} 0"><joint name="{s}_hip_yaw" axis="0 0 1" range="-60 60"/>
@@ -30,6 +31,8 @@ FOREARM = """<body name="{s}_yaw" pos="0 0 -0.1"><joint name="{s}_yaw" axis="0 0
   <geom size="0.03"/>
   <body name="{s}_elbow" pos="0 0 -0.15"><joint name="{s}_elbow" axis="0 1 0" range="-60 90"/>
   <geom type="capsule" fromto="0.03 0 0 0.25 0 0" size="0.03"/></body></body>"""
+WHEEL = """<body name="{s}_wheel" pos="0 {y} -0.3"><joint name="{s}_wheel" axis="0 1 0" limited="false"/>
+  <geom type="cylinder" size="0.1 0.02" euler="90 0 0"/></body>"""
 PAW = """<body name="{s}_hip" pos="{x} {y} 0"><joint name="{s}_abduction" axis="1 0 0" range="-45 45"/>
   <geom size="0.03"/>
   <body name="{s}_thigh" pos="0 {dy} 0"><joint name="{s}_thigh" axis="0 1 0" range="-120 120"/>
@@ -55,7 +58,7 @@ def robot_of(*parts: str, free: bool = True, turn: float = 0.0, forearm: str = F
     inside = ""
     for s, sign in SIDES:
         arm = ARM.replace("{forearm}", forearm)
-        texts = {"legs": LEG, "arms": arm}
+        texts = {"legs": LEG, "arms": arm, "wheels": WHEEL}
         inside += "".join(texts[part].format(s=s, y=0.15 * sign, dy=0.05 * sign) for part in parts)
     return osik.Robot.from_mjcf(
         f"""<mujoco><compiler autolimits="true"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
@@ -64,17 +67,36 @@ def robot_of(*parts: str, free: bool = True, turn: float = 0.0, forearm: str = F
     )
 
 
-def on_four() -> osik.Robot:
-    """A robot on four feet."""
+def on_four(arm: str = "") -> osik.Robot:
+    """A robot on four feet with knees that point backwards; its feet are balls of 2 cm. Its floor is at z = 0.6 m."""
     legs = ""
     for row, x in (("front", 0.25), ("hind", -0.25)):
         for s, sign in SIDES:
             legs += PAW.format(s=f"{s}_{row}", x=x, y=0.08 * sign, dy=0.06 * sign)
     return osik.Robot.from_mjcf(
         f"""<mujoco><compiler autolimits="true"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
-        <body name="trunk" pos="0 0 1.02"><freejoint/><geom type="box" size="0.25 0.07 0.05"/>{legs}</body>
+        <body name="trunk" pos="0 0 1.02"><freejoint/><geom type="box" size="0.25 0.07 0.05"/>{legs}{arm}</body>
         </worldbody></mujoco>""",
     )
+
+
+def trotting(frames: int = 36, speed: float = 0.4, period: float = 0.6, lift: float = 0.06) -> HumanMotion:
+    """A dog: diagonal pairs of paws stand for half of the period; knees point forward, elbows backward."""
+    time, points = np.arange(frames) / FPS, {}
+    for s, sign in SIDES:
+        rows = (("hip", "knee", "ankle"), -0.3, 0.0), (("shoulder", "elbow", "wrist"), 0.3, 0.5)
+        for names, x, phase in rows:
+            phase = (phase + 0.5 * (sign < 0.0)) % 1.0
+            steps, part = np.divmod(time / period + phase, 1.0)
+            swing = np.clip(2.0 * part - 1.0, 0.0, 1.0)
+            at = (steps - phase + 0.25 + swing**2 * (3.0 - 2.0 * swing)) * period * speed
+            still = np.full(frames, 0.1 * sign)
+            top = np.stack([speed * time + x, still, 0.45 + 0.01 * np.sin(4.0 * np.pi * time / period)], 1)
+            paw = np.stack([at + x, still, lift * np.sin(np.pi * swing) ** 2], 1)
+            bend = [0.06 if x < 0.0 else -0.06, 0.0, 0.0]
+            tracks = zip(names, (top, 0.5 * (top + paw) + bend, paw), strict=True)
+            points |= {f"{s}_{name}": track for name, track in tracks}
+    return HumanMotion("trot", FPS, tuple(points), np.stack(list(points.values()), 1))
 
 
 def quietly(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:

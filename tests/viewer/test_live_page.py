@@ -17,7 +17,7 @@ from waiting import steps_of, until
 
 import osik_jax as osik
 from osik_jax.cli import main
-from osik_jax.retargeting._retargeted import in_mujoco_order
+from osik_jax.retargeting._robot_motion import in_mujoco_order
 from osik_jax.viewer import export_html, serve, serve_batch
 from osik_jax.viewer._parts import Part, robot_parts
 from osik_jax.viewer.live._open import default_session, sole_polygon, standing
