@@ -9,7 +9,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax import calibration as cal
-from osik_jax.placement import place_base
+from osik_jax.placement import place_base, place_robots
 
 from ._given import Add, F, K, T, V, arm
 from ._models import folder
@@ -53,6 +53,8 @@ def placements(add: Add) -> None:
     add("bases: q0 of another length", lambda: _place(q0=np.zeros(3)), V, "q has shape (3,)")
     add("bases: a number for the footprint", lambda: _place(scene=osik.Scene(), footprint=0.3), T, "CollisionShapes")
     add("bases: a negative number of refinements", lambda: _place(refine=-1), V, "refine")
+    add("robots: one placement", lambda: place_robots({"left": _place()}), V, "two placements or more")
+    add("robots: placements without a scene", lambda: place_robots(dict.fromkeys("ab", _place())), V, "no scene")
 
 
 def calibrations(add: Add) -> None:

@@ -21,7 +21,7 @@ from ..kinematics._rigid import compose, compose_poses, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
-from ._convex import ConvexShape, shape_table
+from ._convex import ConvexShape, shape_table, table_shapes
 from ._geometry import Kind
 from ._pairs import members
 from ._shape import CollisionShape
@@ -329,6 +329,19 @@ def _with(scene: Scene, **changes: Any) -> Any:
     for name in ("table", "body", "contact", "among", "partners", "labels"):
         object.__setattr__(made, name, changes.get(name, getattr(scene, name)))
     return made
+
+
+def with_objects(scene: Scene, objects: Mapping[str, Sequence[ConvexShape]]) -> Scene:
+    """Return the scene with more objects, in the world; they may touch nothing."""
+    rows = [(f"{name}:{k}", name) for name, parts in objects.items() for k in range(len(parts))]
+    kept = table_shapes(jax.tree.map(np.asarray, scene.table))[: len(scene.names)]
+    table = shape_table([*kept, *(shape for parts in objects.values() for shape in parts)])
+    room = max(_room("", "", None, len(table.kind)), scene.capacity)
+    vertices = max(_room("", "", None, len(table.vertices)), len(scene.table.vertices))
+    names, owners = zip(*rows, strict=True)
+    labels = Labels((*scene.names, *names), (*scene.labels.objects, *owners))
+    larger = scene._enlarged(room, vertices, scene.partners)
+    return _with(larger, table=_padded(table, room, vertices), labels=labels)
 
 
 def _items(shapes: Any) -> list[tuple[str, Any]]:

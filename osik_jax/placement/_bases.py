@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision import Scene
@@ -22,9 +22,9 @@ from ..numerics._host import Numbers, module_of
 from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
-"""Coordinates of a base, in the order of the grid's axes."""
 _ROUNDING = 1e-6
 """Largest error of distances by rounding [m]."""
+"""Coordinates of a base, in the order of the grid's axes."""
 
 
 def checked_axis(name: str, given: Any) -> Float[np.ndarray, " n"]:
@@ -94,18 +94,25 @@ def base_clearances(
     says what may touch them.
     """
     shapes = _fixed_shapes(robot_shapes(robot, srdf), footprint)
-    q = jnp.broadcast_to(robot.q0, (len(bases), robot.nq))
-    near = gaps_at(core_robot(robot, shapes), q, core_scene(scenes_in_bases(scene, bases), shapes))
+    distance, pairs = shape_clearances(robot, bases, scene, shapes, robot.q0)
     objects, links = scene.labels.objects, shapes.links
-    return np.asarray(near.distance), [
-        (objects[max(pair) - len(links)], links[min(pair)]) if min(pair) >= 0 else ("", "")
-        for pair in np.asarray(near.pair)
+    return distance, [
+        (objects[max(pair) - len(links)], links[min(pair)]) if min(pair) >= 0 else ("", "") for pair in pairs
     ]
 
 
 def stands_free(gap: Any, clearance: Any) -> Any:
     """Return whether bases stand free; those that touch within rounding all do not."""
     return gap >= clearance + _ROUNDING
+
+
+def shape_clearances(
+    robot: Robot, bases: Float[np.ndarray, "n 4"], scene: Scene, shapes: RobotShapes, q: Any
+) -> tuple[Float[np.ndarray, " n"], Int[np.ndarray, "n 2"]]:
+    """Return the distance of the nearest pair of shapes at each base [m], and its numbers; q is (n, nq) or (nq,)."""
+    q = np.broadcast_to(q, (len(bases), robot.nq))
+    near = gaps_at(core_robot(robot, shapes), jnp.asarray(q), core_scene(scenes_in_bases(scene, bases), shapes))
+    return np.asarray(near.distance), np.asarray(near.pair)
 
 
 def _fixed_shapes(shapes: RobotShapes, footprint: Sequence[ConvexShape]) -> RobotShapes:

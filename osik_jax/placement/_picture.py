@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -20,9 +21,7 @@ _INK, _GREY, _BEST = "#2b2f36", "#5b636d", "#f08c3a"
 
 def draw_placement(found: Any) -> Figure:
     """Return the grid of a ``Placement`` from above: the most poses reached at each x and y, over yaws and heights."""
-    figure = Figure(figsize=(7.0, 6.0), dpi=130, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    place = figure.subplots()
+    figure, place = _page()
     share = found.reached.max((2, 3)).T / len(found.q)
     stands = found.stands_free.any((2, 3)).T
     edges = cell_edges((found.x, found.y))
@@ -31,24 +30,65 @@ def draw_placement(found: Any) -> Figure:
     cells = place.pcolormesh(*edges, reached, cmap=share_colors(), vmin=0.0, vmax=100.0)
     bar = figure.colorbar(cells, shrink=0.8)
     bar.set_label(f"of {len(found.q)} poses reached, best yaw and height [%]", color=_INK)
-    for outline in [] if found.scene is None else _outlines(found.scene):
-        place.fill(*outline.T, facecolor="none", edgecolor=_INK, linewidth=1.2)
+    _draw_scene(place, found.scene)
     met = np.repeat(found.is_reached, len(found.poses) // len(found.is_reached))  # poses of all frames
     for kind, chosen, label in ((".", met, "reached"), ("x", ~met, "not reached")):
         if chosen.any():
             place.plot(
                 *found.poses[chosen, :2].T, kind, color="#c0392b", ms=7, mew=0.6 if kind == "." else 1.5, label=label
             )
-    (x, y, yaw, height), length = found.best, 0.08 * float(np.ptp(place.get_xlim()))
-    place.plot(x, y, "o", color=_BEST, ms=9, label=f"best base: {found.is_reached.sum()} poses, height {height:.3g} m")
-    place.quiver(x, y, length * np.cos(yaw), length * np.sin(yaw), color=_BEST, angles="xy", scale_units="xy", scale=1)
+    label = f"best base: {found.is_reached.sum()} poses, height {found.best[3]:.3g} m"
+    _draw_base(place, found.best, _BEST, label)
+    _finish(place, "grey: no pose reached; white: the base does not stand free, or is not tried")
+    return figure
+
+
+def draw_team(team: Any) -> Figure:
+    """Return a ``Team`` from above: the robots at home, the scene, and the poses in the colour of who takes them."""
+    figure, place = _page()
+    _draw_scene(place, team.members[0].task.scene)
+    poses = np.asarray(team.members[0].task.goal.position)[..., :2]  # (poses, frames, 2)
+    if not team.is_reached.all():
+        place.plot(*poses[~team.is_reached].reshape(-1, 2).T, "x", color=_GREY, ms=6, label="reached by none")
+    for k, (name, base, member) in enumerate(zip(team.names, team.bases, team.members, strict=True)):
+        color, taken = f"C{k}", team.robot == k
+        _draw_scene(place, Scene({name: member.shapes_at(base, member.home)}), edgecolor=color, alpha=0.7)
+        place.plot(*poses[taken].reshape(-1, 2).T, ".", color=color, ms=8, mec="white", mew=0.6)
+        _draw_base(place, base, color, f"{name}: takes {taken.sum()} poses, height {base[3]:.3g} m")
+    _finish(place, "outlines of the robots at home; poses in the colour of the robot that takes them")
+    return figure
+
+
+def _page() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(7.0, 6.0), dpi=130, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots()
+
+
+def _draw_scene(place: Axes, scene: Scene | None, **style: Any) -> None:
+    """Draw the outlines of the shapes in the world."""
+    for outline in [] if scene is None else _outlines(scene):
+        place.fill(*outline.T, **{"facecolor": "none", "edgecolor": _INK, "linewidth": 1.2} | style)
+
+
+def _draw_base(place: Axes, base: Float[np.ndarray, "4"], color: str, label: str) -> None:
+    """Draw a base as a dot with an arrow along its x axis."""
+    (x, y, yaw, _), length = base, 0.08 * float(np.ptp(place.get_xlim()))
+    place.plot(x, y, "o", color=color, ms=9, label=label)
+    place.annotate(
+        "",
+        (x + length * np.cos(yaw), y + length * np.sin(yaw)),
+        (x, y),
+        arrowprops=dict(arrowstyle="->", color=color, lw=2),
+    )
+
+
+def _finish(place: Axes, title: str) -> None:
     place.set_aspect("equal")
     place.set_xlabel("x [m]", color=_INK)
     place.set_ylabel("y [m]", color=_INK)
-    note = "grey: no pose reached; white: the base does not stand free, or is not tried"
-    place.set_title(note, fontsize=9, color=_GREY)
+    place.set_title(title, fontsize=9, color=_GREY)
     place.legend(frameon=False, fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=2)
-    return figure
 
 
 def _outlines(scene: Scene) -> list[Float[np.ndarray, "k 2"]]:

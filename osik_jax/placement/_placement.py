@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -134,3 +135,22 @@ class Placement:
         from ._picture import draw_placement  # matplotlib, an extra
 
         return draw_placement(self)
+
+
+def compare_placements(found: Mapping[str, Placement]) -> str:
+    """Return a table of placements by name: robots, tools or heights for the same poses.
+
+    It has the poses that the best base reaches, their smallest margin and manipulability, and how many bases of the
+    grid reach all poses.
+    """
+    head = ("", "best base reaches", "smallest margin", "smallest manipulability", "bases that reach all poses")
+    rows: list[tuple[str, ...]] = [head]
+    for name, one in found.items():
+        reached, count = one.is_reached, len(one.q)
+        scores = ["-", "-"]
+        if reached.any():
+            scores = [f"{100.0 * np.nanmin(one.best_margin):.1f} %", f"{np.nanmin(one.best_manipulability):.3g}"]
+        full = int((one.reached == count).sum())
+        rows.append((name, f"{reached.sum()} of {count}", *scores, f"{full} of {one.reached.size}"))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(map(str.ljust, row, widths)).rstrip() for row in rows)

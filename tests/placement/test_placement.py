@@ -1,5 +1,6 @@
 """Placements judged by MuJoCo C: tips at the poses, distances to the scene, and bases that stand free."""
 
+import dataclasses
 import json
 from typing import Any
 
@@ -11,7 +12,7 @@ from refusals import refuses
 import osik_jax as osik
 from osik_jax.cli import main
 from osik_jax.core import _library
-from osik_jax.placement import Placement, place_base
+from osik_jax.placement import Placement, Team, compare_placements, place_base, place_robots
 
 pytestmark = pytest.mark.skipif(not _library.installed(), reason="no compiled core")
 
@@ -236,6 +237,100 @@ def test_a_footprint_and_what_the_base_may_touch_count(arm, scene, points):
     )
     on = place_base(arm, {"tip": points}, x=[0.6], y=[0.0], yaw=[0.0], refine=0, scene=scene.allow(("table", "stand")))
     assert on.base_clearance > 0.0
+
+
+@pytest.fixture(scope="module")
+def around(arm: osik.Robot, scene: osik.Scene) -> tuple[np.ndarray, Placement]:
+    """Points over the whole table, and the placement of one arm, which does not reach them all."""
+    points = np.random.default_rng(1).uniform([0.35, -0.8, 0.35], [0.85, 0.8, 0.5], (14, 3))
+    grid: dict[str, Any] = dict(x=np.linspace(-0.2, 1.4, 9), y=np.linspace(-1.0, 1.0, 9), yaw=[0.0, 3.0])
+    return points, place_base(arm, {"tip": points}, **grid, scene=scene, clearance=0.01)
+
+
+@pytest.fixture(scope="module")
+def team(around) -> Team:
+    return place_robots({"a": around[1], "b": around[1]})
+
+
+def two_arms(bases: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData, list[tuple[int, int]]]:
+    """Return MuJoCo's model of two arms on their bases (2, 4), and all pairs of a shape of each."""
+    bodies = [mjcf(base).split("<worldbody>")[1].split("</worldbody>")[0] for base in bases]
+    arms = [
+        body[body.index("<body") :].replace('name="', f'name="{name}_') for body, name in zip(bodies, "ab", strict=True)
+    ]
+    boxes = bodies[0][: bodies[0].index("<body")]
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{boxes}{"".join(arms)}</worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(text)
+    pairs = [(model.geom(f"a_{first}").id, model.geom(f"b_{second}").id) for first in PARTS for second in PARTS]
+    return model, mujoco.MjData(model), pairs
+
+
+def test_two_robots_reach_more_and_mujoco_sees_them_keep_clear(around, arm, team):
+    (points, one), (model, data, pairs) = around, two_arms(team.bases)
+    assert team.is_reached.sum() > one.is_reached.sum()
+    # no pair of bases of the grid reaches more, whether it keeps clear or not
+    reaches = one.reaches.reshape(-1, len(points)).astype(int)
+    together = reaches.sum(1)[:, None] + reaches.sum(1) - reaches @ reaches.T
+    assert team.is_reached.sum() <= together.max() <= team.is_reached.sum() + 1
+    for k, owner in enumerate(team.robot):
+        if owner < 0:
+            continue
+        name = "ab"[owner]
+        data.qpos[:] = np.tile(arm.q0, 2)
+        data.qpos[4 * owner : 4 * owner + 4] = team.q[owner][k]
+        mujoco.mj_forward(model, data)
+        assert np.linalg.norm(data.site(f"{name}_tip").xpos - points[k]) < 1e-3
+        assert distance(model, data, tuple(f"{name}_{part}" for part in PARTS)) > 0.01 - 1e-6
+        assert min(mujoco.mj_geomDistance(model, data, *pair, 2.0, None) for pair in pairs) > 0.01 - 1e-6
+    taken = [(team.robot == k).sum() for k in (0, 1)]
+    assert min(taken) > 0 and sum(taken) == team.is_reached.sum() and f"takes {taken[1]}" in team.explain()
+
+
+def test_robots_that_work_at_once_are_as_far_apart_as_mujoco_says(team):
+    """The second arm stands nearer than it was placed, so some configurations overlap."""
+    near = dataclasses.replace(team, bases=team.bases + np.array([[0.0] * 4, [-0.3, -0.5, 0.0, 0.0]]))
+    model, data, pairs = two_arms(near.bases)
+    found, seen = near.distances("a", "b"), 0
+    assert not np.array_equal(found, found.T, equal_nan=True)
+    np.testing.assert_allclose(near.distances("b", "a").T, found, atol=1e-6)
+    for k, row in enumerate(found):
+        for column, own in enumerate(row):
+            known = np.isfinite(team.q[0][k]).all() and np.isfinite(team.q[1][column]).all()
+            assert np.isfinite(own) == known
+            if known:
+                data.qpos[:] = np.concatenate([team.q[0][k], team.q[1][column]])
+                mujoco.mj_forward(model, data)
+                wanted = min(mujoco.mj_geomDistance(model, data, *pair, 2.0, None) for pair in pairs)
+                assert abs(own - wanted) < 1e-4 or max(own, wanted) < 0.0
+                seen += 1
+    assert seen > 20 and np.nanmin(found) < 0.01 < np.nanmax(found)
+    refuses(KeyError, "no robot 'c'", team.distances, "a", "c")
+
+
+def test_a_picture_of_a_team_has_its_robots_and_their_poses(team):
+    place = team.figure().axes[0]
+    text = [label.get_text() for label in place.get_legend().get_texts()]
+    assert [f"takes {(team.robot == k).sum()} poses" in own for k, own in enumerate(text[-2:])] == [True, True]
+    dots = [line for line in place.lines if line.get_marker() == "."]
+    assert [len(line.get_xdata()) for line in dots] == [(team.robot == k).sum() for k in (0, 1)]
+
+
+def test_robots_of_other_poses_or_without_a_scene_are_refused(around, arm, points):
+    _, one = around
+    alone = place_base(arm, {"tip": points}, x=0.0, y=0.0, yaw=1, refine=0)
+    refuses(ValueError, r"poses of each: {'a': 14}", place_robots, {"a": one})
+    refuses(ValueError, r"poses of each: {'a': 14, 'b': 10}", place_robots, {"a": one, "b": alone})
+    refuses(ValueError, "has no scene", place_robots, {"a": alone, "b": alone})
+
+
+def test_a_longer_tool_is_compared_with_a_shorter_one(found, scene, points):
+    other = osik.Robot.from_mjcf(mjcf().replace('pos="0.1 0 0"', 'pos="0.02 0 0"'))
+    short = place_base(other, {"tip": points}, **GRID, scene=scene, clearance=0.01)
+    lines = compare_placements({"long": found, "short": short}).splitlines()
+    for line, name, one in zip(lines[1:], ("long", "short"), (found, short), strict=True):
+        full = (one.reached == len(points)).sum()
+        assert line.split()[:4] == [name, str(one.is_reached.sum()), "of", "10"] and f"{full} of 90" in line
+    assert lines[1].split()[1:] != lines[2].split()[1:]
 
 
 def test_the_command_writes_the_base(tmp_path, monkeypatch, capsys, points):
