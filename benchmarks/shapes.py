@@ -1,12 +1,12 @@
 """Clips retargeted to robots of all shapes, and judged from their files: python -m benchmarks.shapes CLIP... [--help].
 
-    python -m benchmarks.shapes clips/*.bvh --dogs dogs/*.npz --robots g1 nao talos h1.urdf baxter:fixed go2
+    python -m benchmarks.shapes clips/*.bvh --dogs dogs/*.npz --robots g1 nao talos h1.urdf baxter:fixed go2 allegro
 
 A robot is a name of ``load_robot`` or ``robots_table``, or a file; ``:fixed`` behind it fixes its base. Profiles are
-bundled or guessed. Each robot takes the clips of people (robots on four feet those of ``--dogs``). The judge reads the
-motion that was written: ranges and speeds from the text of the URDF, poses from MuJoCo C's kinematics of that file,
-overlaps of the profile's capsules from MuJoCo's collision detection. The kinematics of this library take no part. The
-exit code is 1 if a bar of ``FIGURES`` is not met.
+bundled or guessed. Each robot takes the clips of people (robots on four feet those of ``--dogs``, hands the grasps of
+``benchmarks.hands``). The judge reads the motion that was written: ranges and speeds from the text of the URDF, poses
+from MuJoCo C's kinematics of that file, overlaps of the profile's capsules from MuJoCo's collision detection. The
+kinematics of this library take no part. The exit code is 1 if a bar of ``FIGURES`` is not met.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from osik_jax.robot.loading._named import EXAMPLES
 from osik_jax.runtime import configure_cpu
 
 from .data_file import write_csv
+from .hands import grasps
 from .robots_table import ROBOTS as TESTED
 from .robots_table import file_of
 
@@ -239,7 +240,7 @@ def judged(source: Source, people: list[HumanMotion], dogs: list[HumanMotion]) -
         retargeter = Retargeter(robot)
         profile = retargeter.profile
         judge = Judge(source, profile, robot.floating_base)
-        clips = dogs if len(profile.feet) == 4 and profile.walks else people
+        clips = grasps() if profile.is_hand else dogs if len(profile.feet) == 4 and profile.walks else people
         for motion, result in zip(clips, retargeter.retarget_all(clips, progress=False), strict=True):
             yield motion.name, judge.figures(result)
 

@@ -21,7 +21,7 @@ from ..robot._joint_selection import scalar_layout
 from ._contact import stretches
 from ._facing import facing_at_home
 from ._goals import Goals
-from ._person import Person, axes_from, directions
+from ._person import Person, axes_from, directions, palm_axes
 from ._places import pairs_at_home
 from ._profile import Limb, Profile, world_points
 from ._roles import LEGS, SIDES
@@ -43,6 +43,10 @@ _AT_END, _ARM_AT_END, _BENT = 0.01, 0.05, 1.0
 """Shares of a joint's range: a leg joint within 1 % of an end, or an arm joint within 5 % (a GR3's elbow extends 3 %
 beyond straight), starts from a bent position. That position is 1 rad from the end, or the middle of the range if
 nearer.
+"""
+_LEANS, _FINGER_AT_END = 0.3, 0.25
+"""A finger's joint that bends backwards by 0.3 rad or more, and by less than 25 % of its range (a LEAP's by 0.31 to
+0.51 rad), starts 0.3 rad forward.
 """
 
 
@@ -106,7 +110,7 @@ class Build:
             root=0.5 * (points["left_hip"] + points["right_hip"]) if profile.walks else positions[-2],
             base=positions[-1],
             turn=np.asarray(kinematics.frame_pose(robot, root)[1]),
-            facing=facing_at_home(robot, profile.across),
+            facing=palm_axes(points) if profile.is_hand else facing_at_home(robot, profile.across),
             start=_with_bent_limbs(robot, profile),
             free=robot.tree.qpos_address[bases[0]] if bases else None,
             lower=np.asarray(robot.position_lower),
@@ -287,7 +291,8 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
     """Return the home configuration with limb joints that are at an end of their range moved inside it. (nq,).
 
     A straight limb that bends to one side only is singular. The range bound blocks its hinge, and a rotation of the
-    hinge does not move the limb's end to first order, so the solver cannot bend it.
+    hinge does not move the limb's end to first order, so the solver cannot bend it. A finger that bends backwards too
+    would stay bent to that side.
     """
     q = np.array(robot.q0)
     scalar, index = scalar_layout(robot)
@@ -304,4 +309,6 @@ def _with_bent_limbs(robot: Robot, profile: Profile) -> Float[np.ndarray, " nq"]
             q[index[dof]] = lower[dof] + inside
         elif above < at_end[dof] * width:
             q[index[dof]] = upper[dof] - inside
+        elif profile.is_hand and _LEANS <= min(below, above) < _FINGER_AT_END * width:
+            q[index[dof]] += _LEANS if below < above else -_LEANS
     return q

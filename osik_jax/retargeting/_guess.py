@@ -18,11 +18,12 @@ from ..robot._feet import find_feet
 from ..robot._mujoco import own_masses
 from ..robot._tree import BALL, FREE, HINGE
 from ._facing import by_name, facing_x
+from ._hand import guess_hand
 from ._limbs import ORIGIN, Chain, Limb, base_body, find_arm, find_chains, find_leg
 from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
 from ._places import JOINTS_APART, joints_between
 from ._profile import Capsule, Foot, Place, Point, Profile, world_points
-from ._roles import CHAINS, LEGS, LIMBS, NEEDED, SIDES
+from ._roles import CHAINS, FINGERS, LEGS, LIMBS, NEEDED, SIDES
 
 # A foot without shapes, as shares of half the leg (ankle height: of the leg); the heel's share of its length.
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
@@ -60,12 +61,16 @@ def guess_profile(robot: Robot) -> Profile:
     person's beside the trunk. A free base stands on two feet, on four, or on wheels (bodies called ``wheel`` or
     ``caster``). On four feet, legs follow those of a person or an animal on all fours; where there are arms too,
     these follow and the feet stay where they are. An ``OsikWarning`` says what is found where that is not two legs
-    and two arms (``describe_profile``).
+    and two arms (``describe_profile``). A hand with a fixed base has fingers instead of limbs.
 
     Raises:
         ValueError: neither two legs nor two arms are found, or a free base has neither feet nor wheels.
     """
     tree = robot.tree
+    hand = guess_hand(robot)
+    if hand is not None:
+        warn(f"a profile is guessed: {describe_profile(robot, hand)}")
+        return hand
     robot, kinematics, feet = _facing_feet(robot)
     bodies = [tree.frame_bodies[tree.frame(name)] for name in feet.values()]
     legs = dict(zip(feet, find_chains(robot, kinematics, bodies), strict=True))
@@ -102,13 +107,14 @@ def guess_profile(robot: Robot) -> Profile:
 
 def describe_profile(robot: Robot, profile: Profile) -> str:
     """Say in words what of a person the robot's profile has, what it lacks, and which joints follow nothing."""
-    tree, parts = robot.tree, _limbs_found(profile)
+    tree, parts = robot.tree, _fingers_found(profile) if profile.is_hand else _limbs_found(profile)
     if not robot.floating_base:
         parts.append("the base is fixed")
     else:
         parts.append("wheels that roll anywhere" if profile.rolls else f"{len(profile.feet)} feet")
         parts += [] if profile.walks or profile.rolls else ["the feet stay where they are"]
-    parts.append("a trunk that does not turn" if profile.torso is None else f"a trunk that turns {profile.torso}")
+    if not profile.is_hand:
+        parts.append("a trunk that does not turn" if profile.torso is None else f"a trunk that turns {profile.torso}")
     bodies = [tree.frame_bodies[tree.frame(frame)] for frame in profile.frames]
     moved = set(np.flatnonzero(tree.descendants[:, bodies].any(1)).tolist())
     idle = [
@@ -130,6 +136,12 @@ def _limbs_found(profile: Profile) -> list[str]:
             end = f" (no {ends[0]})" if ends else ""
             parts.append(f"{side} {part} to the {known[-1]}{end}" if known else f"no {side} {part}")
     return parts
+
+
+def _fingers_found(profile: Profile) -> list[str]:
+    """Say where the tip of each finger is."""
+    tips = {finger: profile.keypoints.get(f"{finger}_4") for finger in FINGERS}
+    return [f"no {finger}" if tip is None else f"{finger} to {tip[0]}" for finger, tip in tips.items()]
 
 
 def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -198,23 +199,26 @@ def find_end(
     kinematics: Kinematics,
     arm: Chain,
     last: int,
+    *,
+    patterns: Sequence[str] = _HANDS,
+    least_share: float = _LEAST_FOREARM,
 ) -> tuple[Place, np.ndarray]:
-    """Return the end of the last link of an arm as a place and in the world [m].
+    """Return the end of the last link of an arm or finger as a place and in the world [m].
 
-    It is a named frame (``_HANDS``, the preferred ones first), else the far end of the link. Such a frame is at least
-    ``_LEAST_FOREARM`` of the upper arm from the last joint.
+    It is a named frame (``patterns``, the preferred ones first), else the far end of the link. Such a frame is at least
+    ``least_share`` of the upper arm from the last joint.
     """
     tree, body, anchor = robot.tree, arm.bodies[last], arm.anchors[last]
     upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
     names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
-    for pattern in _HANDS:
+    for pattern in patterns:
         at = {
             name: np.asarray(kinematics.frame_pose(robot, name)[0])
             for name in names
             if re.search(pattern, name, re.IGNORECASE)
         }
         far = {name: float(np.linalg.norm(place - anchor)) for name, place in at.items()}
-        far = {name: length for name, length in far.items() if length > max(_LEAST_FOREARM * upper, _SAME)}
+        far = {name: length for name, length in far.items() if length > max(least_share * upper, _SAME)}
         if far:
             nearest = min(far, key=lambda name: (far[name], name))
             return (nearest, ORIGIN), at[nearest]

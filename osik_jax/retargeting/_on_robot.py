@@ -15,6 +15,7 @@ from ._facing import facing_x
 from ._motion import HumanMotion
 from ._profile import Limb, Profile
 from ._profile_file import check_profile, find_profile
+from ._roles import chain
 from ._skeletons import find_roles
 from ._source_motion import SourceMotion
 from ._terms import Body, Bounds
@@ -77,7 +78,8 @@ class OnRobot:
 
     def _roles(self, motion: HumanMotion | SourceMotion, mapping: Mapping[str, str] | None) -> dict[str, str]:
         """Return the clip's joint for each role (empty for a robot's motion), or raise if a needed role is missing."""
-        needed = tuple(dict.fromkeys(role for limb in self.profile.followed for role in limb))
+        limbs = [chain(limb) if self.profile.is_hand else limb for limb in self.profile.followed]
+        needed = tuple(dict.fromkeys(role for limb in limbs for role in limb))
         if isinstance(motion, HumanMotion):
             return find_roles(motion.joint_names, mapping, needed, motion.positions)
         if mapping is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,7 +14,7 @@ from .._errors import OsikValueError, warn
 from ._contact import find_contact, find_ground, find_noise, mean_over, noise_steps
 from ._motion import CONTACT_POINTS, HumanMotion, Touch
 from ._profile import Limb
-from ._roles import LEGS, LIMBS, REACHES, SIDES
+from ._roles import FINGER_REACHES, FINGERS, LEGS, LIMBS, REACHES, SIDES, chain
 from ._up import find_up
 
 # Vectors shorter than this [m] have no direction; a spine shorter than 1 mm means chest and hips are one joint.
@@ -94,8 +95,9 @@ class Measures:
     noise: float  # standard deviation of each coordinate of the standing points [m]
     # per side, positions of knee, ankle and toe while the foot is flat on the floor [m]. (1, 3) each
     flat: Mapping[str, Mapping[str, np.ndarray]]
-    # axes of pelvis and chest when the person is upright, by the rest pose or by the clip's upright frames. (1, 3, 3)
-    straight: tuple[np.ndarray, np.ndarray]
+    # axes of pelvis and chest when the person is upright, by the rest pose or by the clip's upright frames; None for a
+    # hand. (1, 3, 3) each
+    straight: tuple[np.ndarray, np.ndarray] | None
 
 
 def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, ...] = CONTACT_POINTS) -> Measures:
@@ -107,23 +109,24 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
     legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
     if not on_four:
         _check_up(motion, roles)
-    flat = {}
+    straight, flat = None, {}
     if legs:
         flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
     if on_four:
         turns = _turns(points)
         middle = np.argsort(turns[0][:, 2, 2], kind="stable")[len(turns[0]) // 2]
         straight = turns[0][middle, None], turns[1][middle, None]
-    elif motion.rest_positions is not None:
+    elif motion.rest_positions is not None and "wrist" not in roles:
         at = {role: motion.joint_names.index(name) for role, name in roles.items()}
         rest = {role: motion.rest_positions[None, i] for role, i in at.items()}
         flat = {side: {**rest, **_toes(rest, side)} for side in SIDES} if legs else {}
         straight = _turns(rest)
-    else:
+    elif "wrist" not in roles:
         straight = _upright(points)
     known = [limb for limb in LIMBS if set(limb) <= set(points)]
     lengths = {(a, b): float(np.linalg.norm(points[b] - points[a], axis=-1).mean()) for a, b in known}
-    lengths |= {limb: reach_length(points, limb) for limb in REACHES if set(limb) <= set(points)}
+    reaches = [limb for limb in (*REACHES, *FINGER_REACHES) if set(limb) <= set(points)]
+    lengths |= {limb: bone_length(points, limb) for limb in reaches}
     if legs and not on_four:
         leg = 0.5 * sum(lengths[limb] for limb in LEGS)
         if not _LEGS[0] < leg < _LEGS[1]:
@@ -172,7 +175,7 @@ def read_person(
         soles = np.stack([points[name] for name in standing], 1)
         contact = find_contact(soles, motion.fps, 0.0, noise=known.noise)
     turns, straight = _turns(points), known.straight
-    pelvis, torso = (_from_rest(turns[k], straight[k][0]) for k in range(2))
+    pelvis, torso = (turns[k] if straight is None else _from_rest(turns[k], straight[k][0]) for k in range(2))
     level = np.broadcast_to(np.eye(3), (motion.frames, 2, 3, 3))
     root = path_of(points)
     return Person(
@@ -190,9 +193,11 @@ def read_person(
     )
 
 
-def reach_length(points: Mapping[str, np.ndarray], limb: Limb) -> float:
-    """Return the median over frames of the distance between a limb's ends [m]."""
-    return float(np.median(np.linalg.norm(points[limb[1]] - points[limb[0]], axis=-1)))
+def bone_length(points: Mapping[str, np.ndarray], limb: Limb) -> float:
+    """Return the median over frames of a limb's length [m]: between its ends, or along the bones of a finger."""
+    roles = [role for role in chain(limb) if role in points] if limb in FINGER_REACHES else limb
+    bones = [np.linalg.norm(points[b] - points[a], axis=-1) for a, b in itertools.pairwise(roles)]
+    return float(np.median(sum(bones)))
 
 
 def _has_legs(points: Mapping[str, np.ndarray]) -> bool:
@@ -210,12 +215,26 @@ def _middle(points: Mapping[str, np.ndarray], *parts: str) -> np.ndarray:
 
 
 def path_of(points: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the point of a person that the robot's path follows: the middle of the hips, or of the shoulders."""
-    return _middle(points, "hip", "shoulder")
+    """Return the point of a person that the robot's path follows: the wrist of a hand, else the middle of the hips."""
+    return points["wrist"] if "wrist" in points else _middle(points, "hip", "shoulder")
+
+
+def palm_axes(points: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return a hand's axes as columns: z from wrist to knuckles, y as near to the index as possible. (..., 3, 3).
+
+    The knuckles of fingers that one hand has and another lacks do not turn z: it goes to the middle finger's, if known.
+    """
+    knuckles = {finger: points[f"{finger}_1"] for finger in FINGERS[1:] if f"{finger}_1" in points}
+    first, *_, last = knuckles.values()
+    z = unit(knuckles.get("middle", 0.5 * (first + last)) - points["wrist"])
+    x = unit(_cross(first - last, z))
+    return np.stack([x, _cross(z, x), z], -1)
 
 
 def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the axes of pelvis and chest as columns; upright if the clip lacks joints. (F, 3, 3) each."""
+    if "wrist" in points:
+        return palm_axes(points), palm_axes(points)
     low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
     high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
     chest = points.get("chest", low)

@@ -12,7 +12,7 @@ from .._errors import OsikValueError, unknown_name
 from ..kinematics import Kinematics
 from ..robot import Robot
 from ._goals import Weights
-from ._roles import LIMBS, NEEDED, REACHES, STANDING
+from ._roles import FINGER_REACHES, FINGERS, HAND, LIMBS, NEEDED, REACHES, STANDING
 
 Point = tuple[float, float, float]
 Place = tuple[str, Point]
@@ -65,7 +65,7 @@ class Profile:
 
     Attributes:
         keypoints: place on the robot of those of a person's hips, knees, ankles, shoulders, elbows and wrists that it
-            has. A limb may end early or be absent.
+            has. A limb may end early or be absent. A hand has ``wrist`` and ``thumb_1`` to ``little_4`` instead.
         pelvis: the frame that follows the orientation of the person's pelvis; x forward, z up.
         torso: the frame that follows the orientation of the person's chest; None: the robot's trunk is rigid.
         feet: ``left`` and ``right``; ``left_front`` and ``right_front`` too on four feet; empty without feet.
@@ -99,9 +99,12 @@ class Profile:
                 "shoulder, and there are two hips or none"
             )
         for role, (_, point) in self.keypoints.items():
-            if role not in NEEDED:
-                raise unknown_name("keypoint", role, NEEDED)
+            if role not in (*NEEDED, *HAND):
+                raise unknown_name("keypoint", role, (*NEEDED, *HAND))
             _check_points(f"the keypoint {role}", point, (3,))
+        knuckles = [finger for finger in FINGERS[1:] if f"{finger}_1" in self.keypoints]
+        if self.is_hand and (len(knuckles) < 2 or "wrist" not in self.keypoints):
+            raise OsikValueError("a hand has a keypoint wrist, and index_1, middle_1, ring_1 or little_1: two of these")
         if not self.followed:
             raise OsikValueError("the profile has no limb: give the keypoints of a leg or an arm")
         if self.feet and tuple(sorted(self.feet)) not in STANDING:
@@ -116,9 +119,9 @@ class Profile:
     def reached(self) -> tuple[Limb, ...]:
         """Return the pairs of roles whose vector is tracked, direction and length, relative to nominal lengths.
 
-        Hip to ankle and shoulder to wrist of a robot that walks on four feet.
+        Hip to ankle and shoulder to wrist of a robot that walks on four feet, wrist to fingertips of a hand.
         """
-        pairs = REACHES if len(self.feet) == 4 and self.walks else ()
+        pairs = FINGER_REACHES if self.is_hand else REACHES if len(self.feet) == 4 and self.walks else ()
         return tuple(pair for pair in pairs if set(pair) <= set(self.keypoints))
 
     @property
@@ -127,6 +130,11 @@ class Profile:
         ends = {role for limb in self.reached for role in limb}
         limbs = (limb for limb in LIMBS if set(limb) <= set(self.keypoints) and not ends & set(limb))
         return (*limbs, *self.reached)
+
+    @property
+    def is_hand(self) -> bool:
+        """Return whether the robot is a hand, which follows the wrist and the fingers of a person's."""
+        return not set(HAND).isdisjoint(self.keypoints)
 
     @property
     def walks(self) -> bool:

@@ -185,6 +185,8 @@ def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:
     chains = {
         f"{side}_{limb}": [f"{side}_{role}" for role in roles] for side in SIDES for limb, roles in CHAINS.items()
     }
+    if result.profile.is_hand:
+        chains = {tip.removesuffix("_4"): [first, tip] for first, tip in result.profile.reached}
     for name, roles in chains.items():
         first, *others = [role for role in roles if role in robot and role in person] or [""]
         if others:
@@ -205,6 +207,8 @@ def _tracking(result: Retargeted, places: Places) -> dict[str, Any]:
 def _trunk(result: Retargeted, places: Places, person: dict[str, Float[np.ndarray, "F 3"]]) -> dict[str, float | None]:
     """Return mean angles [deg] between person and robot: of pelvis, chest and line from hips to shoulders."""
     robot, profile = result.robot, result.profile
+    if profile.is_hand:
+        return dict.fromkeys(("pelvis", "chest", "hips-shoulders"))
     home = find_places(robot, profile, model_qpos(robot, robot.q0)).turns[0, :2]
     turns = places.turns[:, :2] @ np.swapaxes(home, -1, -2) @ facing_at_home(robot, profile.across)
     off = Rotation.from_matrix((np.swapaxes(turns, -1, -2) @ result.turns).reshape(-1, 3, 3)).magnitude()

@@ -24,6 +24,11 @@ STANDING = {
     ("left", "left_front", "right", "right_front"): tuple(end for _, end in REACHES),
 }
 """Sorted names of a robot's feet, and the four points of a person whose contact with the floor they share."""
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+HAND = ("wrist", *(f"{finger}_{joint}" for finger in FINGERS for joint in (1, 2, 3, 4)))
+"""A hand's 21 keypoints: the wrist, and each finger from its first joint (1) to its tip (4)."""
+FINGER_REACHES = tuple(("wrist", f"{finger}_4") for finger in FINGERS)
+"""From the wrist to the tip of each finger."""
 
 _TRUNK = (
     ("left_hip", "right_hip"),
@@ -38,4 +43,15 @@ _TRUNK = (
 
 def bones(known: Collection[str]) -> list[tuple[str, str]]:
     """Return the bones of a stick figure between known roles."""
-    return [(a, b) for a, b in (*LIMBS, *_TRUNK) if a in known and b in known]
+    fingers = [pair for limb in FINGER_REACHES for pair in itertools.pairwise(chain(limb))]
+    return [(a, b) for a, b in (*LIMBS, *_TRUNK, *fingers) if a in known and b in known]
+
+
+def chain(limb: tuple[str, str]) -> tuple[str, ...]:
+    """Return the roles from the first end of a reach to the second, with the joints between."""
+    first, last = limb
+    if limb in FINGER_REACHES:
+        return first, *(f"{last[:-1]}{joint}" for joint in (1, 2, 3, 4))
+    side = last.split("_")[0]
+    roles = next(([f"{side}_{role}" for role in roles] for roles in CHAINS.values() if last.endswith(roles[-1])), [])
+    return tuple(roles) if roles[:1] == [first] else limb

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikValueError, unknown_name
-from ._roles import CHAINS, NEEDED, OPTIONAL, SIDES
+from ._roles import CHAINS, FINGERS, HAND, NEEDED, OPTIONAL, SIDES
 
-ROLES = (*NEEDED, *OPTIONAL)
+ROLES = (*NEEDED, *OPTIONAL, *HAND)
 """All roles: a person's joints and points in retargeting."""
 _LIMB_WORDS = {
     "hip": "upleg upperleg thigh femur hip leg 足",
@@ -67,7 +67,7 @@ def find_roles(
     """
     places = {} if positions is None else _places(joint_names, positions)
     roles = _by_name(joint_names, needed, places) if mapping is None else _checked(joint_names, mapping, needed)
-    sided = [role for role in roles if role.startswith(SIDES)]
+    sided = [role for role in roles if role in needed or role.startswith(SIDES)]
     for a, b in itertools.combinations(sided, 2):
         if _spans(a, b) and _is_at(places, roles[a], roles[b]):
             raise OsikValueError(
@@ -84,10 +84,10 @@ def _places(joint_names: tuple[str, ...], positions: Float[np.ndarray, "F J 3"])
 
 
 def _spans(a: str, b: str) -> bool:
-    """Return whether two landmarks give a direction: joints of one limb, or left and right joints."""
+    """Return whether two landmarks give a direction: joints of one limb, left and right joints, or a hand's."""
     (side, _, part), (other, _, second) = a.partition("_"), b.partition("_")
     arms = [joint in CHAINS["arm"] for joint in (part, second)]
-    return part == second or (side == other and arms[0] == arms[1])
+    return side not in SIDES or part == second or (side == other and arms[0] == arms[1])
 
 
 def _is_at(places: Mapping[str, np.ndarray], a: str, b: str) -> bool:
@@ -97,6 +97,10 @@ def _is_at(places: Mapping[str, np.ndarray], a: str, b: str) -> bool:
 
 def _by_name(joint_names: tuple[str, ...], needed: Sequence[str], places: Mapping[str, np.ndarray]) -> dict[str, str]:
     """Return the clip's joint for each role that its names tell, with the bone lengths that ``places`` show."""
+    if "wrist" in needed:
+        fingers = {role: name for name in joint_names for role, word in _hand_words() if _plain(name).endswith(word)}
+        _check_complete(joint_names, fingers, needed)
+        return fingers
     groups: dict[str, dict[Part, list[str]]] = {}
     for name in sorted(joint_names, key=lambda name: _plain(name) != _letters(name)):
         for prefix, part in _readings(_plain(name)):
@@ -133,6 +137,18 @@ def _spellings() -> dict[str, Part]:
     for word in (word for words in _TRUNK_WORDS.values() for word in words.split()):
         out |= {spelling: ("", word) for own in _MIDDLE_WORDS for spelling in (f"{own}{word}", f"{word}{own}")}
     return out
+
+
+@functools.cache
+def _hand_words() -> tuple[tuple[str, str], ...]:
+    """Return the ways to write the keypoints of a hand, with their roles: index_1, MediaPipe's index_finger_mcp."""
+    out = [("wrist", "wrist")]
+    for finger in FINGERS:
+        parts = ("cmc", "mcp", "ip", "tip") if finger == "thumb" else ("mcp", "pip", "dip", "tip")
+        for word in (finger, "pinky") if finger == "little" else (finger,):
+            for joint, part in enumerate(parts, 1):
+                out += [(f"{finger}_{joint}", w) for w in (f"{word}{joint}", f"{word}{part}", f"{word}finger{part}")]
+    return tuple(out)
 
 
 @functools.cache

@@ -12,12 +12,12 @@ from .._errors import OsikValueError, unknown_name
 from ..robot import Robot
 from ._contact import find_contact, find_ground, find_noise, noise_steps
 from ._facing import facing_x
-from ._person import Person, path_of, reach_length
+from ._person import Person, bone_length, palm_axes, path_of
 from ._places import find_places
 from ._profile import Profile
 from ._profile_file import check_profile, find_profile
 from ._robot_motion import RobotMotion, base_columns, joints_in_mujoco_order
-from ._roles import LIMBS, REACHES, SIDES
+from ._roles import FINGER_REACHES, LIMBS, REACHES, SIDES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +114,9 @@ class SourceMotion:
             points |= {role: standing[:, k] for k, role in enumerate(profile.standing)}
         points = {role: track - down for role, track in points.items()}
         turns = found.turns[1:] @ np.swapaxes(found.turns[0], -1, -2)
-        limbs = [limb for limb in (*LIMBS, *REACHES) if set(limb) <= set(upright)]
+        if profile.is_hand:
+            turns[:, :2] = palm_axes(points)[:, None]
+        limbs = [limb for limb in (*LIMBS, *REACHES, *FINGER_REACHES) if set(limb) <= set(upright)]
         return Person(
             fps=fps,
             points=points,
@@ -123,7 +125,7 @@ class SourceMotion:
             root=path_of(points),
             feet=turns[:, 2:],
             contact=np.zeros((self.frames, 4), bool) if contact is None else contact,
-            lengths={limb: reach_length(upright, limb) for limb in limbs},
+            lengths={limb: bone_length(upright, limb) for limb in limbs},
             ankle=ankle,
         )
 

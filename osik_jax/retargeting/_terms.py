@@ -23,7 +23,7 @@ from ._balance import mass_fractions, overhang
 from ._facing import facing_at_home
 from ._goals import Goals, Weights
 from ._profile import Limb, Place, Profile, world_points
-from ._roles import CHAINS, SIDES
+from ._roles import SIDES, chain
 
 # Guard of a limb's direction: a shorter limb [m] has none.
 SHORTEST = 1e-6
@@ -120,12 +120,11 @@ class Body(eqx.Module):
 
 def reach_length(robot: Robot, profile: Profile, limb: Limb) -> float:
     """Return the nominal length of a reach [m]: that at home, at most ``STANDING_SHARE`` of the stretched limb."""
-    side, end = limb[1].split("_")
-    roles = next(roles for roles in CHAINS.values() if end in roles)
-    known = [profile.keypoints[role] for role in (f"{side}_{part}" for part in roles) if role in profile.keypoints]
+    known = [profile.keypoints[role] for role in chain(limb) if role in profile.keypoints]
     points = world_points(robot, home_kinematics(robot), known)
     stretched = float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
-    return min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
+    bent = min(float(np.linalg.norm(points[-1] - points[0])), STANDING_SHARE * stretched)
+    return stretched if profile.is_hand else bent
 
 
 class Joints(NamedTuple):
