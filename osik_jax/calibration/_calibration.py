@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -151,7 +152,10 @@ class Calibration(eqx.Module):
         return draw_residuals(self.residuals)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write changes, deviations (null: infinite), residuals and undetermined combinations as JSON, in SI units."""
+        """Write changes, deviations (null: infinite), residuals and undetermined combinations to a YAML file.
+
+        The text is JSON, which is YAML. Units are SI.
+        """
         numbers = zip(self.names, np.asarray(self.vector), np.asarray(self.deviation), self.units, strict=True)
         content = {
             "converged": bool(self.converged),
@@ -179,7 +183,9 @@ class Calibration(eqx.Module):
                 for name, frame in {"base": self.base, **self.frames}.items()
             },
         }
-        write_text(path, json.dumps(content, indent=2) + "\n")
+        text = json.dumps(content, indent=2)
+        # PyYAML reads 1e-05 as text, and 1.0e-05 as a number
+        write_text(path, re.sub(r"(?m)([ -]\d)(e[-+]\d+,?)$", r"\1.0\2", text) + "\n")
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:

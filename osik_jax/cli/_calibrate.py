@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class Calibrate:
     """Finds a robot's offsets, lengths, tool, base or camera from measurements in a CSV file.
 
-    Prints each number with its deviation, and what the measurements do not determine. Writes calibration.json,
+    Prints each number with its deviation, and what the measurements do not determine. Writes calibration.yaml,
     robot.urdf and residuals.png.
     """
 
@@ -44,7 +44,7 @@ class Calibrate:
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy of the camera [pixels]."""
     frames: Path | None = None
-    """JSON or the frames of a calibration.json: {"camera": {"parent": "tool0", "position": [0, 0, 0.1]}}."""
+    """JSON, such as the frames of a calibration.yaml: {"camera": {"parent": "tool0", "position": [0, 0, 0.1]}}."""
     out: Path = Path("osik-calibration")
     """Folder for the files."""
     base: Literal["auto", "floating", "fixed"] = "auto"
@@ -75,10 +75,10 @@ class Calibrate:
         print(found.explain())
         with told(), writing(self.out):
             self.out.mkdir(parents=True, exist_ok=True)
-            found.save(self.out / "calibration.json")
+            found.save(self.out / "calibration.yaml")
             found.robot.to_urdf(self.out / "robot.urdf")
             found.figure().savefig(self.out / "residuals.png")
-        print(f"written: {self.out}/calibration.json, robot.urdf, residuals.png")
+        print(f"written: {self.out}/calibration.yaml, robot.urdf, residuals.png")
         return 0 if bool(found.converged) else 1
 
 

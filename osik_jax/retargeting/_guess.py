@@ -287,14 +287,10 @@ def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
     for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
         if len(corners):
             return corners
-    tree, body = robot.tree, robot.tree.frame_bodies[robot.tree.frame(frame)]
-    is_ball = np.asarray(robot.mj_model.geom_type) == mujoco.mjtGeom.mjGEOM_SPHERE
-    balls = np.flatnonzero((np.asarray(tree.geom_bodies)[: len(is_ball)] == body) & is_ball)
-    turn, origin = np.asarray(kinematics.body_rotation[body]), np.asarray(kinematics.body_position[body])
-    lowest = origin + np.asarray(robot.geom_position)[balls] @ turn.T
-    lowest[:, 2] -= np.asarray(robot.geom_size)[balls, 0]
+    balls = _spheres(robot, kinematics, frame)
     position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    return (lowest - position) @ rotation
+    points = np.array([at - [0.0, 0.0, radius] for at, radius in balls]).reshape(-1, 3)
+    return (points - position) @ rotation
 
 
 def _pair(points: np.ndarray) -> tuple[Point, Point]:

@@ -1,10 +1,10 @@
-"""Poses of SMPL as AMASS has them, made here."""
+"""Files of other programs, made here: poses of SMPL as AMASS has them, and a robot's table from a spreadsheet."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from osik_jax.retargeting import load_motion
+from osik_jax.retargeting import RobotMotion, load_motion
 from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._smpl import _TREE
 
@@ -88,3 +88,10 @@ def test_broken_poses_are_told(tmp_path, change, message):
     np.savez(tmp_path / "broken.npz", **arrays)
     with pytest.raises(ValueError, match=message):
         load_motion(tmp_path / "broken.npz")
+
+
+def test_a_robots_table_that_a_spreadsheet_saved(tmp_path):
+    file = tmp_path / "take.csv"
+    robot = ["0,0,1,0,0,0,1,0.5", "0,0,1,0,0,0,1,0.6"]
+    file.write_text("\r\n".join([*robot, ",,,,,,,"]) + "\r\n", encoding="utf-8-sig")
+    np.testing.assert_array_equal(RobotMotion.load(file, joint_names=("knee",), fps=30.0).qpos[:, 7], [0.5, 0.6])
