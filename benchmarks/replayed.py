@@ -8,7 +8,6 @@ import numpy as np
 from osik_jax.retargeting import HumanMotion, LiveRetargeter, Retargeted
 from osik_jax.retargeting._live import LiveFrame
 from osik_jax.retargeting._person import read_person
-from osik_jax.retargeting._retargeted import as_retargeted
 
 
 def replay(make: Callable[[HumanMotion], LiveRetargeter], motion: HumanMotion) -> tuple[Retargeted, list[LiveFrame]]:
@@ -22,4 +21,4 @@ def replay(make: Callable[[HumanMotion], LiveRetargeter], motion: HumanMotion) -
     frames = [frame for frame in found if frame is not None] + live.finish()
     q, contact, off = (np.array([getattr(frame, name) for frame in frames]) for name in ("q", "contact", "off_plan"))
     person = dataclasses.replace(read_person(motion, live.roles), contact=contact)
-    return as_retargeted(live.robot, live.profile, person, q, off), frames
+    return Retargeted.of(live.robot, live.profile, person, q, off), frames

@@ -39,8 +39,8 @@ from osik_jax.retargeting import (
     load_profile,
     report,
 )
-from osik_jax.retargeting._lanes import as_lane, solve_lanes
 from osik_jax.retargeting._live import LiveFrame
+from osik_jax.retargeting._retarget import as_lane, solve_lanes
 from osik_jax.robot.loading import NAMES
 from osik_jax.runtime import configure_cpu
 

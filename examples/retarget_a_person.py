@@ -11,7 +11,7 @@ jax.config.update("jax_enable_x64", True)
 
 
 def person(frames=61, fps=30.0):
-    """A made-up clip. For yours, retargeting.load_motion reads BVH files, and keypoints from .npz and .csv files."""
+    """A made-up clip. For yours, retargeting.load_motion reads BVH files, and keypoints from .npz files."""
     phase = np.linspace(0.0, 2.0 * np.pi, frames)
     zero, bend = 0.0 * phase, 0.35 * (1.0 - np.cos(phase))
     points = {}

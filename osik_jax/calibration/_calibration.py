@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._whole_file import write_text
 from ..robot import Robot
-from ._files import write_calibration
 from ._residuals import Combination, Residuals, root_mean_square
 from ._setup import BASE, FixedFrame, Setup
 from ._unknowns import Parameter
@@ -150,10 +152,40 @@ class Calibration(eqx.Module):
         return draw_residuals(self.residuals)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write changes, deviations, residuals and undetermined combinations to a YAML file."""
+        """Write changes, deviations (null: infinite), residuals and undetermined combinations to a YAML file.
+
+        The text is JSON, which is YAML. Units are SI.
+        """
         numbers = zip(self.names, np.asarray(self.vector), np.asarray(self.deviation), self.units, strict=True)
-        frames = {"base": self.base, **self.frames}
-        write_calibration(path, bool(self.converged), list(numbers), self.residuals, self.unobservable, frames)
+        content = {
+            "converged": bool(self.converged),
+            "unknowns": {
+                name: {"change": float(value), "sigma": float(sigma) if np.isfinite(sigma) else None, "unit": unit}
+                for name, value, sigma, unit in numbers
+            },
+            "residuals": [
+                {
+                    "of": part.kind,
+                    "readings": len(part.after),
+                    "rms_before": root_mean_square(part.before),
+                    "rms_after": root_mean_square(part.after),
+                    "unit": part.unit,
+                }
+                for part in self.residuals
+            ],
+            "undetermined": [one.coefficients for one in self.unobservable],
+            "frames": {
+                name: {
+                    "parent": frame.parent,
+                    "position": np.asarray(frame.position).tolist(),
+                    "rotation": np.asarray(frame.rotation).tolist(),
+                }
+                for name, frame in {"base": self.base, **self.frames}.items()
+            },
+        }
+        text = json.dumps(content, indent=2)
+        # PyYAML reads 1e-05 as text, and 1.0e-05 as a number
+        write_text(path, re.sub(r"(?m)([ -]\d)(e[-+]\d+,?)$", r"\1.0\2", text) + "\n")
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:

@@ -1,21 +1,17 @@
-"""Measurements from CSV, and results as YAML."""
+"""Measurements from CSV."""
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from .._errors import OsikKeyError, OsikValueError
-from .._whole_file import write_text
 from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot.loading._mjmodel import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
-from ._residuals import Combination, Residuals, root_mean_square
-from ._setup import FixedFrame
 
 _POSITION, _QUATERNION, _PIXEL = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("u", "v")
 
@@ -90,46 +86,3 @@ def _configurations(robot: Robot, joints: dict[str, np.ndarray], path: str) -> n
     q = np.tile(np.asarray(robot.q0, float), (len(next(iter(joints.values()))), 1))
     q[:, places] = np.stack(list(joints.values()), -1)
     return q
-
-
-def write_calibration(
-    path: str | os.PathLike[str],
-    converged: bool,
-    numbers: Sequence[tuple[str, float, float, str]],
-    residuals: Sequence[Residuals],
-    undetermined: Sequence[Combination],
-    frames: Mapping[str, FixedFrame],
-) -> None:
-    """Write a calibration as YAML, in SI units.
-
-    Args:
-        path: the file.
-        converged: whether the fit did.
-        numbers: name, change, deviation and unit of each unknown.
-        residuals: of each measurement.
-        undetermined: combinations of unknowns.
-        frames: fixed frames by name.
-    """
-    lines = [f"converged: {json.dumps(converged)}", "unknowns:"]
-    lines += [f"  {json.dumps(n)}: {{change: {_number(v)}, sigma: {_number(s)}, unit: {u}}}" for n, v, s, u in numbers]
-    lines += ["residuals:", *(f"  - {_of_residuals(part)}" for part in residuals)]
-    lines += ["undetermined:" if undetermined else "undetermined: []"]
-    lines += [f"  - {json.dumps({n: round(v, 6) for n, v in one.coefficients.items()})}" for one in undetermined]
-    lines += ["frames:", *(f"  {json.dumps(name)}: {_of_frame(frame)}" for name, frame in frames.items())]
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def _of_residuals(part: Residuals) -> str:
-    before, after = (_number(root_mean_square(rows)) for rows in (part.before, part.after))
-    numbers = f"readings: {len(part.after)}, rms_before: {before}, rms_after: {after}"
-    return f"{{of: {json.dumps(part.kind)}, {numbers}, unit: {json.dumps(part.unit)}}}"
-
-
-def _of_frame(frame: FixedFrame) -> str:
-    position, rotation = (json.dumps(np.asarray(part).tolist()) for part in (frame.position, frame.rotation))
-    return f"{{parent: {json.dumps(frame.parent)}, position: {position}, rotation: {rotation}}}"
-
-
-def _number(value: float) -> str:
-    """Return a number as YAML writes it."""
-    return repr(float(value)) if np.isfinite(value) else ".inf"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -30,11 +30,25 @@ class Measurement(eqx.Module):
         frame: name of the frame that is measured: of the robot, or a fixed frame (static).
         q: configuration of each reading, as the encoders read it. (n, nq)
         sigma: standard deviation of the noise of each reading. (n,)
+
+    Raises:
+        ValueError: wrong shapes, not finite, a sigma that is not positive.
     """
 
     frame: str = eqx.field(static=True)
     q: Float[Array, "n nq"]
     sigma: Float[Array, " n"]
+
+    rows = 1
+    """Rows of one reading."""
+    unit = "m"
+    """Unit of the rows."""
+    shared = ()
+    """Names of the arrays that all readings share."""
+    read: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields with what was read."""
+    also = ""
+    """Name of the field that names a second frame."""
 
     def _common(self, frame: str, q: Any, sigma: Any, readings: int) -> None:
         self.frame, self.q = frame, _array(q, "q", (readings, None))
@@ -43,12 +57,13 @@ class Measurement(eqx.Module):
     @property
     def frames(self) -> tuple[str, ...]:
         """Return the names of all frames that are needed."""
-        return (self.frame,)
+        return (self.frame, getattr(self, self.also)) if self.also else (self.frame,)
 
     @property
-    @abc.abstractmethod
     def readings(self) -> Any:
-        """Return what was read: a pytree of arrays (n, ...)."""
+        """Return what was read: an array (n, ...), or several."""
+        values = tuple(getattr(self, name) for name in self.read)
+        return values[0] if len(values) == 1 else values
 
     @abc.abstractmethod
     def predicted(self, setup: Setup) -> Any:
@@ -61,13 +76,6 @@ class Measurement(eqx.Module):
     def deviations(self) -> Float[Array, "n k"]:
         """Return the standard deviation of each row of the differences."""
         return jnp.broadcast_to(self.sigma[:, None], (len(self.q), self.rows))
-
-    rows = 1
-    """Rows of one reading."""
-    unit = "m"
-    """Unit of the rows."""
-    shared = ()
-    """Arrays that all readings share."""
 
 
 class Points(Measurement):
@@ -82,6 +90,7 @@ class Points(Measurement):
     point: Float[Array, "3"]
     rows = 3
     shared = ("point",)
+    read = ("position",)
 
     def __init__(
         self,
@@ -92,18 +101,9 @@ class Points(Measurement):
         sigma: Sigma = 1e-3,
         point: Num[ArrayLike, "3"] | Sequence[float] = (0.0, 0.0, 0.0),
     ):
-        """Record positions.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record positions."""
         self.position, self.point = _array(position, "position", (None, 3)), _array(point, "point", (3,))
         self._common(frame, q, sigma, len(self.position))
-
-    @property
-    def readings(self) -> Array:
-        """Return the positions. (n, 3)."""
-        return self.position
 
     def predicted(self, setup: Setup) -> Array:
         """Return the positions of the point. (n, 3)."""
@@ -124,6 +124,7 @@ class Poses(Measurement):
     rotation: Float[Array, "n 3 3"]
     sigma_rotation: Float[Array, " n"]
     rows = 6
+    read = ("position", "rotation")
     unit = "m, rad"
 
     def __init__(
@@ -136,20 +137,11 @@ class Poses(Measurement):
         sigma: Sigma = 1e-3,
         sigma_rotation: Sigma = 1e-3,
     ):
-        """Record poses.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record poses."""
         self.position = _array(position, "position", (None, 3))
         self.rotation = _array(rotation, "rotation", (len(self.position), 3, 3))
         self.sigma_rotation = _sigma(sigma_rotation, "sigma_rotation", len(self.position))
         self._common(frame, q, sigma, len(self.position))
-
-    @property
-    def readings(self) -> tuple[Array, Array]:
-        """Return positions (n, 3) and rotations (n, 3, 3)."""
-        return self.position, self.rotation
 
     def predicted(self, setup: Setup) -> tuple[Array, Array]:
         """Return the poses of the frame."""
@@ -177,6 +169,8 @@ class Distances(Measurement):
     other: str = eqx.field(static=True)
     distance: Float[Array, " n"]
     other_q: Float[Array, "n nq"]
+    also = "other"
+    read = ("distance",)
 
     def __init__(
         self,
@@ -188,24 +182,10 @@ class Distances(Measurement):
         other_q: Num[ArrayLike, "n nq"] | None = None,
         sigma: Sigma = 1e-3,
     ):
-        """Record distances.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record distances."""
         self.other, self.distance = other, _array(distance, "distance", (None,))
         self._common(frame, q, sigma, len(self.distance))
         self.other_q = self.q if other_q is None else _array(other_q, "other_q", self.q.shape)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of both frames."""
-        return self.frame, self.other
-
-    @property
-    def readings(self) -> Array:
-        """Return the distances. (n,)."""
-        return self.distance
 
     def predicted(self, setup: Setup) -> Array:
         """Return the distances [m]. (n,)."""
@@ -223,6 +203,8 @@ class PlaneContacts(Measurement):
 
     plane: str = eqx.field(static=True)
     height: Float[Array, " n"]
+    also = "plane"
+    read = ("height",)
 
     def __init__(
         self,
@@ -233,24 +215,10 @@ class PlaneContacts(Measurement):
         height: Num[ArrayLike, " n"] | float = 0.0,
         sigma: Sigma = 1e-3,
     ):
-        """Record contacts.
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
-        """
+        """Record contacts."""
         readings = len(_array(q, "q", (None, None)))
         self.plane, self.height = plane, jnp.broadcast_to(as_array(height, "height", float), (readings,))
         self._common(frame, q, sigma, readings)
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of the frame and of the plane."""
-        return self.frame, self.plane
-
-    @property
-    def readings(self) -> Array:
-        """Return the heights. (n,)."""
-        return self.height
 
     def predicted(self, setup: Setup) -> Array:
         """Return the heights over the plane [m]. (n,)."""
@@ -275,6 +243,8 @@ class Pixels(Measurement):
     rows = 2
     unit = "pixels"
     shared = ("intrinsics",)
+    also = "camera"
+    read = ("pixel",)
 
     def __init__(
         self,
@@ -297,25 +267,12 @@ class Pixels(Measurement):
             intrinsics: fx, fy, cx, cy.
             point: one point (3,), or one for each reading (n, 3) [m].
             sigma: standard deviation [pixels].
-
-        Raises:
-            ValueError: wrong shapes, not finite, a sigma that is not positive.
         """
         self.camera, self.pixel = camera, _array(pixel, "pixel", (None, 2))
         self.intrinsics = _array(intrinsics, "intrinsics", (4,))
         points = jnp.asarray(point, self.pixel.dtype)
         self.point = _array(jnp.broadcast_to(points, (len(self.pixel), 3)), "point", (None, 3))
         self._common(frame, q, sigma, len(self.pixel))
-
-    @property
-    def frames(self) -> tuple[str, ...]:
-        """Return the names of the marker's and of the camera's frame."""
-        return self.frame, self.camera
-
-    @property
-    def readings(self) -> Array:
-        """Return the pixels. (n, 2)."""
-        return self.pixel
 
     def predicted(self, setup: Setup) -> Array:
         """Return the pixels (n, 2); a marker behind the camera is mirrored to its front, far out."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -157,13 +157,40 @@ def _axes(robot: Robot, unknown: Unknown, name: str) -> list[int]:
 
 def apply(setup: Setup, parameters: tuple[Parameter, ...], change: Float[Array, " p"]) -> Setup:
     """Return the setup with the unknown numbers changed."""
-    for quantity in dict.fromkeys(part.quantity for part in parameters):
-        own = [k for k, part in enumerate(parameters) if part.quantity == quantity]
-        setup = _CHANGES[quantity](setup, [parameters[k] for k in own], change[np.array(own)])
+    groups: dict[tuple[str, bool], list[int]] = {}
+    for k, part in enumerate(parameters):
+        is_fixed = part.quantity.startswith(("frame", "base")) and part.name in setup.names
+        groups.setdefault((part.quantity, is_fixed), []).append(k)
+    for (quantity, is_fixed), own in groups.items():
+        setup = _changed(setup, quantity, is_fixed, [parameters[k] for k in own], change[np.array(own)])
     return setup
 
 
-def _change_offsets(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
+def _changed(setup: Setup, quantity: str, is_fixed: bool, parts: list[Parameter], change: Array) -> Setup:
+    """Return the setup with numbers of one quantity changed: of fixed frames, the base included, or of the robot."""
+    tree, (kind, field) = setup.robot.tree, quantity.split("_")
+    if quantity == "joint_offset":
+        return _with_offsets(setup, parts, change)
+    rows_of = {"joint": tree.joint, "body": lambda name: tree.body_names.index(name, 1), "frame": tree.frame}
+    row_of = setup.names.index if is_fixed else rows_of[kind]
+    name = "body_quaternion" if quantity == "body_rotation" else field if is_fixed else quantity
+
+    def array_of(setup: Setup) -> Array:
+        return getattr(setup if is_fixed else setup.robot, name)
+
+    old, axes = array_of(setup), np.array([part.axis for part in parts])
+    rows = np.array([row_of(part.name) for part in parts])
+    added = (old if field != "rotation" else jnp.zeros((len(old), 3), change.dtype)).at[rows, axes].add(change)
+    if field == "axis":
+        added = added / jnp.linalg.norm(added, axis=-1, keepdims=True)
+    elif name == "body_quaternion":
+        added = jax.vmap(jaxlie.SO3.multiply)(jaxlie.SO3(old), jaxlie.SO3.exp(added)).wxyz
+    elif field == "rotation":
+        added = compose(old, jax.vmap(jaxlie.SO3.as_matrix)(jaxlie.SO3.exp(added)))
+    return eqx.tree_at(array_of, setup, added)
+
+
+def _with_offsets(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
     """A joint that stands ``change`` further than its encoder reads has a reference lower by that; so do followers."""
     tree, places, terms = setup.robot.tree, [], []
     for part, value in zip(parts, change, strict=True):
@@ -173,72 +200,3 @@ def _change_offsets(setup: Setup, parts: list[Parameter], change: Array) -> Setu
             terms.append(-factor * value)
     reference = setup.robot.joint_reference.at[np.array(places)].add(jnp.stack(terms))
     return eqx.tree_at(lambda s: s.robot.joint_reference, setup, reference)
-
-
-def _change_axes(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
-    rows = np.array([setup.robot.tree.joint(part.name) for part in parts])
-    axis = _added(setup.robot.joint_axis, rows, parts, change)
-    axis = axis / jnp.linalg.norm(axis, axis=-1, keepdims=True)
-    return eqx.tree_at(lambda s: s.robot.joint_axis, setup, axis)
-
-
-def _added(array: Array, rows: np.ndarray, parts: list[Parameter], change: Array) -> Array:
-    return array.at[rows, np.array([part.axis for part in parts])].add(change)
-
-
-def _turns(count: int, rows: np.ndarray, parts: list[Parameter], change: Array) -> jaxlie.SO3:
-    """Return a rotation for each row, the identity where nothing is unknown."""
-    return jaxlie.SO3.exp(_added(jnp.zeros((count, 3), change.dtype), rows, parts, change))
-
-
-def _body_rows(setup: Setup, parts: list[Parameter]) -> np.ndarray:
-    return np.array([setup.robot.tree.body_names.index(part.name, 1) for part in parts])
-
-
-def _change_body_positions(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
-    moved = _added(setup.robot.body_position, _body_rows(setup, parts), parts, change)
-    return eqx.tree_at(lambda s: s.robot.body_position, setup, moved)
-
-
-def _change_body_rotations(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
-    old = setup.robot.body_quaternion
-    turned = jax.vmap(jaxlie.SO3.multiply)(jaxlie.SO3(old), _turns(len(old), _body_rows(setup, parts), parts, change))
-    return eqx.tree_at(lambda s: s.robot.body_quaternion, setup, turned.wxyz)
-
-
-def _frames_changed(setup: Setup, parts: list[Parameter], change: Array, field: str, new: Callable) -> Setup:
-    """Change frames of the robot and fixed frames, each in its own array."""
-    fixed = np.array([part.name in setup.names for part in parts])
-    for which, owner, rows in (
-        (~fixed, lambda s: getattr(s.robot, f"frame_{field}"), setup.robot.tree.frame),
-        (fixed, lambda s: getattr(s, field), setup.names.index),
-    ):
-        own = [part for part, here in zip(parts, which, strict=True) if here]
-        if own:
-            places = np.array([rows(part.name) for part in own])
-            setup = eqx.tree_at(owner, setup, new(owner(setup), places, own, change[np.flatnonzero(which)]))
-    return setup
-
-
-def _change_frame_positions(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
-    return _frames_changed(setup, parts, change, "position", _added)
-
-
-def _change_frame_rotations(setup: Setup, parts: list[Parameter], change: Array) -> Setup:
-    return _frames_changed(setup, parts, change, "rotation", _turned)
-
-
-def _turned(old: Array, rows: np.ndarray, parts: list[Parameter], change: Array) -> Array:
-    return compose(old, jax.vmap(jaxlie.SO3.as_matrix)(_turns(len(old), rows, parts, change)))
-
-
-_CHANGES = {
-    "joint_offset": _change_offsets,
-    "joint_axis": _change_axes,
-    "body_position": _change_body_positions,
-    "body_rotation": _change_body_rotations,
-    "frame_position": _change_frame_positions,
-    "frame_rotation": _change_frame_rotations,
-    "base_position": _change_frame_positions,
-    "base_rotation": _change_frame_rotations,
-}

@@ -44,7 +44,7 @@ class Calibrate:
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy of the camera [pixels]."""
     frames: Path | None = None
-    """JSON or the frames of a calibration.yaml as JSON: {"camera": {"parent": "tool0", "position": [0, 0, 0.1]}}."""
+    """JSON, such as the frames of a calibration.yaml: {"camera": {"parent": "tool0", "position": [0, 0, 0.1]}}."""
     out: Path = Path("osik-calibration")
     """Folder for the files."""
     base: Literal["auto", "floating", "fixed"] = "auto"

@@ -41,7 +41,7 @@ class Retarget:
     """
 
     clip: Annotated[str, tyro.conf.Positional]
-    """A BVH file, keypoints as .npz or .csv, or a folder of such files."""
+    """A BVH file, keypoints as .npz, or a folder of such files."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, g1, talos, or one of robot_descriptions."""
     base: Literal["floating", "fixed"] = "floating"
@@ -65,8 +65,6 @@ class Retarget:
     up: Literal["x", "y", "z", "-x", "-y", "-z"] | None = None
     """The clip's axis that points up, as --up=y. Default: found from the motion; where that does not say, the axis of a
     BVH's rest pose, and z of keypoints."""
-    trim: bool = True
-    """Leave out the rest pose at the start of a BVH, if the motion jumps from it."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""
@@ -74,8 +72,7 @@ class Retarget:
             return _retarget_folder(self)
         from ..retargeting import load_motion
         from ..retargeting._folder import write_folder
-        from ..retargeting._notes import notes
-        from ..retargeting._report import picked
+        from ..retargeting._report import notes, picked
 
         with told():
             motion = load_motion(self.clip, **_reading(self))
@@ -96,7 +93,7 @@ def _reading(command: Retarget) -> dict[str, Any]:
     unit: Any = command.unit
     with contextlib.suppress(TypeError, ValueError):  # no option, or a unit by name
         unit = float(unit)
-    return {"unit": unit, "up": command.up, "trim": command.trim}
+    return {"unit": unit, "up": command.up}
 
 
 def _retargeter(command: Retarget) -> Retargeter:
@@ -117,7 +114,7 @@ def _retargeter(command: Retarget) -> Retargeter:
 def _retarget_folder(command: Retarget) -> int:
     """Retarget all clips of a folder; return the exit code."""
     from ..retargeting._folder import retarget_folder
-    from ..retargeting._load import shortened
+    from ..retargeting._skeletons import shortened
 
     with told():
         summary = retarget_folder(

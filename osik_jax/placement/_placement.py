@@ -105,20 +105,6 @@ class Placement:
         """Return whether the base keeps the clearance to the scene at each base of the grid."""
         return np.asarray(stands_free(self.base_clearance, self.clearance))
 
-    @property
-    def pareto(self) -> Int[np.ndarray, "k 4"]:
-        """Return the indices of the grid's bases that no other base beats in poses reached, margin and manipulability.
-
-        The base with the most poses comes first.
-        """
-        fields = self.reached, self.margin, self.manipulability
-        scores = np.stack([np.nan_to_num(field.astype(float)).ravel() for field in fields], -1)
-        kept: list[int] = []
-        for k in np.lexsort(-scores.T[::-1]):
-            if scores[k, 0] > 0 and not any((scores[j] >= scores[k]).all() for j in kept):
-                kept.append(int(k))
-        return np.stack(np.unravel_index(np.array(kept, int), self.reached.shape), -1)
-
     def explain(self) -> str:
         """Return the best base, how many bases of the grid do how well, and what stops the robot, in words."""
         count, found, lines = len(self.q), self.is_reached, [self._summary()]

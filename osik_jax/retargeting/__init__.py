@@ -1,6 +1,5 @@
 """Motion retargeting: a recorded human motion becomes a motion of a legged robot."""
 
-from ._fit import fit as fit
 from ._goals import Weights as Weights
 from ._guess import describe_profile as describe_profile
 from ._guess import guess_profile as guess_profile

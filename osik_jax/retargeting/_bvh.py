@@ -5,11 +5,9 @@ A BVH file states neither unit nor up axis. The caller gives them, or they are i
 
 from __future__ import annotations
 
-import codecs
 import dataclasses
 import itertools
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +36,7 @@ _JUMP = 5.0
 """Speed of a joint relative to the root above which the step out of the rest pose counts as a jump [m/s]."""
 _ABOVE_ALL = 3.0
 """Least ratio of that step to every other step of the clip."""
-_KEYWORDS = {"ROOT", "JOINT", "END", "OFFSET", "CHANNELS", "{", "}", "MOTION"}
-_CHANNELS = {f"{axis}{kind}": (kind, axis.lower()) for axis in "XYZ" for kind in ("position", "rotation")}
+_CHANNELS = {f"{axis}{kind}".lower(): (kind, axis) for axis in "XYZ" for kind in ("position", "rotation")}
 _LARGEST = 1e8
 """Largest accepted absolute value of a length in any unit, or of an angle [deg]."""
 
@@ -50,14 +47,12 @@ class _Joint:
 
     name: str
     parent: int
-    offset: np.ndarray
-    channels: tuple[tuple[str, str], ...] = ()
-    is_end: bool = False
+    offset: Float[np.ndarray, "3"]
+    channels: tuple[tuple[str, str], ...]
+    is_end: bool
 
 
-def read_bvh(
-    path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
-) -> HumanMotion:
+def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
     """Read a BVH file.
 
     A joint's rotation is the product of its channels in the order in which the file lists them. Ends of chains
@@ -65,14 +60,18 @@ def read_bvh(
     rotations 0 and the root at the origin; None if nobody stands in it, as in files with all bones along one axis.
     Facing z with y up becomes facing x with z up.
 
-    ``unit``, ``up``, ``trim`` and errors are those of ``load_motion``. If nobody stands in the rest pose, the
+    ``unit``, ``up`` and errors are those of ``load_motion``. If nobody stands in the rest pose, the
     length of the joints from a foot to the head gives the unit.
     """
     source, up = str(path), checked_up(up)
-    words = _Words(source, _text(Path(path)))
-    joints = _hierarchy(words)
+    words, joints = _Words(source, Path(path).read_text(encoding="utf-8-sig", errors="replace")), list[_Joint]()
+    words.take("HIERARCHY")
+    words.take("ROOT")
+    _read_joint(words, joints, -1)
     fps, values = _frames(words, sum(len(joint.channels) for joint in joints))
     parents, names = [joint.parent for joint in joints], tuple(joint.name for joint in joints)
+    if len(set(names)) < len(names):
+        raise OsikValueError(f"{source}: a second joint is called {max(names, key=names.count)}")
     positions, rotations = forward(parents, *_moves(joints, values))
     rest = forward(parents, np.array([joint.offset for joint in joints]), np.tile(UNTURNED, (1, len(joints), 1)))[0][0]
     rest = rest - rest[0]
@@ -90,12 +89,11 @@ def read_bvh(
         rotations=continuous(rotations[:, kept]),
         rest_positions=scale * rest[kept] if stands else None,
     )
-    expected = rest_up or find_up(motion, "y")[0]
-    motion = standing_up(source, motion, up, expected, rest_up)
-    count = _rest_frames(motion) if trim else 0
+    motion = standing_up(source, motion, up, rest_up or find_up(motion, "y"), rest_up)
+    count = _rest_frames(motion)
     if not count:
         return motion
-    warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out; trim=False keeps it")
+    warn(f"{source} begins with its rest pose ({count} of {motion.frames} frames), left out")
     turns = motion.rotations
     return dataclasses.replace(
         motion, positions=motion.positions[count:], rotations=None if turns is None else continuous(turns[count:])
@@ -121,93 +119,53 @@ def _rest_frames(motion: HumanMotion) -> int:
     return count if jumps and motion.frames - count > 1 and alike[:count].all() and not alike[count] else 0
 
 
-def _text(path: Path) -> str:
-    """Return the file's text: UTF-8 with invalid bytes replaced, or UTF-16 if it starts with a byte order mark."""
-    content = path.read_bytes()
-    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return content.decode("utf-16" if wide else "utf-8-sig", errors="replace")
-
-
-def _hierarchy(words: _Words) -> list[_Joint]:
-    """Return the joints of the tree, parents first."""
-    if words.next("HIERARCHY").upper() != "HIERARCHY":
-        raise words.error("a BVH file starts with HIERARCHY")
-    joints: list[_Joint] = []
-    inside: list[int] = []  # the joints whose braces are open
-    while True:
-        word = words.next("JOINT, End Site, } or MOTION")
-        own = joints[inside[-1]] if inside else None
-        match word.upper():
-            case "ROOT" | "JOINT" | "END" as kind:
-                if (kind == "ROOT") == bool(joints) or (kind == "ROOT") == bool(inside):
-                    raise words.error("a skeleton is one ROOT, and every JOINT and End Site is inside it")
-                if own is not None and own.is_end:
-                    raise words.error("nothing is inside an End Site but its OFFSET")
-                joints.append(_joint(words, kind, joints, inside[-1] if inside else -1))
-                inside.append(len(joints) - 1)
-            case "OFFSET" if own is not None:
-                if not np.isnan(own.offset).any():
-                    raise words.error(f"{own.name} has an OFFSET already")
-                own.offset = words.offset()
-            case "CHANNELS" if own is not None:
-                if own.is_end or own.channels:
-                    what = "an End Site has no CHANNELS" if own.is_end else f"{own.name} has CHANNELS already"
-                    raise words.error(what)
-                own.channels = _channels(words)
-            case "}" if own is not None:
-                if np.isnan(own.offset).any():
-                    raise words.error(f"{own.name} has no OFFSET")
-                inside.pop()
-            case "MOTION" if joints and not inside:
-                return joints
-            case _:
-                raise words.error(f"{word} is not expected here")
-
-
-def _joint(words: _Words, kind: str, joints: list[_Joint], parent: int) -> _Joint:
-    """Return a joint after reading its name and opening brace."""
+def _read_joint(words: _Words, joints: list[_Joint], parent: int, is_end: bool = False) -> None:
+    """Read a joint after the word ROOT, JOINT or End, and all joints inside its braces; parents come first."""
     name = words.name()
-    if kind == "END":
+    words.take("{")
+    words.take("OFFSET")
+    offset, channels = words.numbers(3), ()
+    if not is_end and words.next("CHANNELS, JOINT, End Site or }") == "CHANNELS":
+        channels = _read_channels(words)
+    elif not is_end:
+        words.at -= 1
+    if is_end:
         name = f"{joints[parent].name}_end"
         name = name if all(joint.name != name for joint in joints) else f"{name}_{len(joints)}"
-    if not name:
-        raise words.error(f"{kind} has no name")
-    if any(joint.name == name for joint in joints):
-        raise words.error(f"a second joint is called {name}")
-    if words.next("{") != "{":
-        raise words.error(f"{{ should follow {name}")
-    return _Joint(name, parent, np.full(3, np.nan), is_end=kind == "END")
+    own = len(joints)
+    joints.append(_Joint(name, parent, offset, channels, is_end))
+    expected = "}" if is_end else "JOINT, End Site or }"
+    while (kind := words.next(expected)) != "}":
+        if is_end or kind not in ("JOINT", "END"):
+            raise words.error(f"{expected} should come here")
+        _read_joint(words, joints, own, kind == "END")
 
 
-def _channels(words: _Words) -> tuple[tuple[str, str], ...]:
-    count, *names = words.up_to_keyword() or [""]
-    if not count.isdigit() or int(count) != len(names):
-        raise words.error("CHANNELS is followed by how many there are, and by their names")
-    known = {name.lower(): value for name, value in _CHANNELS.items()}
-    for name in names:
-        if name.lower() not in known:
-            raise words.error(f"no channel {name}; there are {', '.join(_CHANNELS)}")
-    if len({name.lower() for name in names}) != len(names):
-        raise words.error("a channel is named twice")
-    return tuple(known[name.lower()] for name in names)
+def _read_channels(words: _Words) -> tuple[tuple[str, str], ...]:
+    """Return kind and axis of each channel after the word CHANNELS."""
+    count = words.next("the number of channels")
+    names = [words.next("a channel").lower() for _ in range(int(count) if count.isdigit() else 0)]
+    unknown = [name for name in names if name not in _CHANNELS]
+    if unknown or not names or len(set(names)) < len(names):
+        raise words.error(f"CHANNELS is followed by how many there are, and by some of {', '.join(_CHANNELS)}")
+    return tuple(_CHANNELS[name] for name in names)
 
 
 def _frames(words: _Words, channels: int) -> tuple[float, Float[np.ndarray, "F C"]]:
     """Return the frame rate [1/s] and one row of numbers per frame."""
-    is_head = words.next("Frames:").lower().rstrip(":") == "frames"
+    words.take("MOTION")
+    if not channels:
+        raise words.error("no joint has CHANNELS")
+    words.take("FRAMES:")
     count = words.next("the number of frames")
-    if not is_head or not count.isdigit():
-        raise words.error("Frames: and their number should follow MOTION")
-    if [words.next("Frame Time:").lower().rstrip(":") for _ in range(2)] != ["frame", "time"]:
-        raise words.error("Frame Time: and seconds should follow Frames:")
+    words.take("FRAME")
+    words.take("TIME:")
     step = as_number(words.next("the frame time"))
-    if not step > 0.0:
-        raise words.error("the frame time has to be more than 0 s")
-    if step > _SLOWEST:
-        raise words.error("the frame time is in seconds, and from one frame to the next it is less than one")
-    if step < _FASTEST:
-        raise words.error(f"the frame time is {step:g} s; it is {_FASTEST:g} s at least")
-    values = words.frames(int(count), channels)
+    if not _FASTEST <= step <= _SLOWEST:
+        raise words.error(f"the frame time is {step:g}; it is in seconds, {_FASTEST:g} to {_SLOWEST:g}")
+    values = words.rows(channels)
+    if count != str(len(values)) or not len(values):
+        raise words.error(f"the file says Frames: {count}, and has {len(values)}")
     fps = 1.0 / step
     # files round the frame time (0.0333333 s), so a rate within 0.01 of an integer is that integer
     return (float(round(fps)) if abs(fps - round(fps)) < 1e-2 else fps), values
@@ -226,9 +184,9 @@ def _moves(joints: list[_Joint], values: np.ndarray) -> tuple[np.ndarray, np.nda
         turns = [k for k, (kind, _) in enumerate(joint.channels) if kind == "rotation"]
         for k, (kind, axis) in enumerate(joint.channels):
             if kind == "position":
-                offsets[:, i, "xyz".index(axis)] = own[:, k]
+                offsets[:, i, "XYZ".index(axis)] = own[:, k]
         if turns:  # capital letters: about the axes that the earlier channels have turned
-            order = "".join(joint.channels[k][1] for k in turns).upper()
+            order = "".join(joint.channels[k][1] for k in turns)
             local[:, i] = Rotation.from_euler(order, own[:, turns], degrees=True).as_quat(scalar_first=True)
     return offsets, local
 
@@ -275,68 +233,51 @@ class _Words:
     """Words of a BVH file, read one after the other wherever its lines end; errors name the line read last."""
 
     def __init__(self, path: str, text: str):
-        self.path, self._lines, self._at = path, text.splitlines(), 0
-        spaced = (line.replace("{", " { ").replace("}", " } ").split() for line in self._lines)
-        self._words = [(number, word) for number, line in enumerate(spaced, 1) for word in line]
+        self.path, self.at = path, 0
+        self._lines = text.replace("{", " { ").replace("}", " } ").splitlines()
+        self._words = [(number, word) for number, line in enumerate(self._lines, 1) for word in line.split()]
 
     def next(self, expected: str) -> str:
-        """Return the next word."""
-        if self._at == len(self._words):
+        """Return the next word in upper case."""
+        if self.at == len(self._words):
             raise OsikValueError(f"{self.path} ends where {expected} should come")
-        self._at += 1
-        return self._words[self._at - 1][1]
+        self.at += 1
+        return self._words[self.at - 1][1].upper()
+
+    def take(self, expected: str) -> None:
+        """Go past a word, which has to be the expected one."""
+        if self.next(expected) != expected:
+            raise self.error(f"{expected} should come here")
 
     def name(self) -> str:
-        """Return the words up to the end of the present line, or up to a brace on it."""
-        line = self._words[self._at - 1][0]
-        return " ".join(self._take(lambda number, word: number == line and word != "{"))
+        """Return the words up to the next brace, which name a joint."""
+        found = [word for _, word in itertools.takewhile(lambda one: one[1] not in "{}", self._words[self.at :])]
+        self.at += len(found)
+        if not found:
+            raise self.error("a joint has no name")
+        return " ".join(found)
 
-    def up_to_keyword(self) -> list[str]:
-        """Return the words up to the next keyword."""
-        return self._take(lambda _, word: word.upper() not in _KEYWORDS)
+    def numbers(self, count: int) -> Float[np.ndarray, " count"]:
+        """Return the next words as so many numbers."""
+        return np.array([self._number(self.next(f"a number, of {count}")) for _ in range(count)])
 
-    def _take(self, belongs: Callable[[int, str], bool]) -> list[str]:
-        found = [word for _, word in itertools.takewhile(lambda one: belongs(*one), self._words[self._at :])]
-        self._at += len(found)
-        return found
-
-    def offset(self) -> Float[np.ndarray, "3"]:
-        """Return the numbers up to the next keyword, which are three."""
-        size = len(self.up_to_keyword())
-        values = self._checked(self._words[self._at - size : self._at], "OFFSET")
-        if size != 3:
-            raise self.error(f"OFFSET has {size} numbers where there should be 3")
-        return values
-
-    def frames(self, count: int, columns: int) -> Float[np.ndarray, "F C"]:
-        """Return all remaining words as ``count`` rows of ``columns`` numbers."""
-        left = self._words[self._at :]
-        values = self._checked(left, "a frame")
-        if len(left) != count * columns or not left:
+    def rows(self, columns: int) -> Float[np.ndarray, "F C"]:
+        """Return all remaining words as rows of ``columns`` numbers."""
+        first, self.at = self.at, len(self._words)
+        left = self._words[first:]
+        if len(left) % columns:
             for number, own in itertools.groupby(left, key=lambda one: one[0]):
-                size = len(list(own))
-                if size != columns:
+                if (size := len(list(own))) != columns:
                     raise self.error(f"a frame has {size} numbers where there should be {columns}", number)
-            raise self.error(f"the file says Frames: {count}, and has {len(left) // columns}")
-        return values.reshape(count, columns)
+        return np.array([self._number(word, number) for number, word in left]).reshape(-1, columns)
 
-    def _checked(self, words: list[tuple[int, str]], what: str) -> Float[np.ndarray, " n"]:
-        try:
-            values = np.array([float(word) for _, word in words])
-        except ValueError:
-            wrong = next(number for number, word in words if np.isnan(as_number(word)))
-            raise self.error(f"{what} is not numbers", wrong) from None
-        wrong = np.flatnonzero(~(np.abs(values) <= _LARGEST))
-        if wrong.size:
-            number, value = words[wrong[0]][0], values[wrong[0]]
-            if not np.isfinite(value):
-                raise self.error(f"{what} is not finite", number)
-            raise self.error(f"{what} has a number over {_LARGEST:g}, which is no length and no angle", number)
-        return values
+    def _number(self, word: str, number: int | None = None) -> float:
+        value = as_number(word)
+        if not abs(value) <= _LARGEST:
+            raise self.error(f"{word} is no length and no angle: a number, up to {_LARGEST:g}", number)
+        return value
 
     def error(self, what: str, number: int | None = None) -> ValueError:
         """Return an error that names a line: that of the word read last, or the given one."""
-        read = self._words[max(min(self._at, len(self._words)) - 1, 0)][0] if self._words else 1
-        number = read if number is None else number
-        line = self._lines[number - 1].strip() if self._lines else ""
-        return OsikValueError(f"{self.path}, line {number}: {what}; the line is {line[:60]!r}")
+        number = self._words[self.at - 1][0] if number is None else number
+        return OsikValueError(f"{self.path}, line {number}: {what}; it is {self._lines[number - 1].strip()[:60]!r}")

@@ -19,12 +19,12 @@ from .._progress import Progress, reported
 from .._whole_file import write_text
 from ..scaling._fingerprint import differences, fingerprint, identifier
 from ..scaling._folder import only_job
-from ._lanes import Clip
-from ._load import clips_in, load_motion
+from ._load import ENDINGS, load_motion
 from ._profile_file import profile_text, save_profile
 from ._report import FIGURES, picked, report
-from ._retarget import Retargeter
+from ._retarget import Clip, Retargeter
 from ._retargeted import Retargeted
+from ._skeletons import shortened
 from ._up import Up
 
 _JOB = "job.json"
@@ -57,13 +57,12 @@ def retarget_folder(
     *,
     unit: str | float | None = None,
     up: Up | None = None,
-    trim: bool = True,
     mapping: Mapping[str, str] | None = None,
     fps: float | None = None,
     chunk: int = 32,
     progress: Progress = True,
 ) -> dict[str, Any]:
-    """Retarget every ``.bvh``, ``.npz`` and ``.csv`` file directly inside a folder.
+    """Retarget every ``.bvh`` and ``.npz`` file directly inside a folder.
 
     Each clip gets a folder of its own name in ``out``, with ``motion.npz``, ``motion.csv`` and ``report.json``. ``out``
     also holds ``profile.toml``, ``job.json`` (the job's options), the summary ``report.json``, and ``index.csv`` with
@@ -76,7 +75,6 @@ def retarget_folder(
         out: output folder.
         unit: as of ``load_motion``, of the BVH files.
         up: as of ``load_motion``.
-        trim: as of ``load_motion``.
         mapping: as of ``Retargeter.retarget``, the same for all clips.
         fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
@@ -92,9 +90,9 @@ def retarget_folder(
         BlockingIOError: another process works in ``out``.
         OSError: something cannot be written.
     """
-    files, others = clips_in(folder)
+    files, others = _clips_in(folder)
     others = [name for name in others if folder / name != out]
-    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up, "trim": trim})
+    job = _job(retargeter, {"mapping": mapping, "fps": fps, "unit": unit, "up": up})
     with only_job(out):
         _claim(out, job)
         save_profile(retargeter.profile, out / "profile.toml")
@@ -118,7 +116,7 @@ def retarget_folder(
 
         def read(name: str) -> Clip:
             path = files[name]
-            motion = load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up, trim=trim)
+            motion = load_motion(path, unit=unit if path.suffix.lower() == ".bvh" else None, up=up)
             return retargeter._prepared(motion, mapping, fps)
 
         with (
@@ -132,6 +130,21 @@ def retarget_folder(
         with (out / "index.csv").open("w", newline="", encoding="utf-8") as file:
             csv.writer(file).writerows(_index(summary))
     return summary
+
+
+def _clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """Return the motion files of a folder by clip name, and the names of what else is in it.
+
+    A clip's name is the file's, without its ending unless two would clash. Hidden files are not named.
+    """
+    inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+    files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
+    others = [path.name + "/" * path.is_dir() for path in inside if path not in files]
+    if not files:
+        seen = shortened([path.name for path in inside]) or "nothing"
+        raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen}")
+    stems = [path.stem for path in files]
+    return {path.stem if stems.count(path.stem) == 1 else path.name: path for path in files}, others
 
 
 def _job(retargeter: Retargeter, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -148,12 +148,12 @@ def _facing_feet(robot: Robot) -> tuple[Robot, Kinematics, dict[str, str]]:
     """Return the robot turned to face x, its home kinematics, and its feet by their names in a profile (empty: none).
 
     Raises:
-        ValueError: frames that look like feet are neither two nor four.
+        ValueError: frames that look like feet are neither two nor four, and the base is free.
     """
     tree = robot.tree
     names = find_feet(zip(tree.frame_names, tree.frame_bodies, strict=True), tree.body_parents)
     kinematics = home_kinematics(robot)
-    if not names:
+    if not names or (len(names) not in (2, 4) and not robot.floating_base):
         return robot, kinematics, {}
     if len(names) not in (2, 4):
         raise OsikValueError(f"two or four feet are needed, and {len(names)} frames look like some: {', '.join(names)}")

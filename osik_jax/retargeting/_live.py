@@ -33,16 +33,6 @@ _HISTORY, _LEAST_HISTORY = 0.27, 4
 _LONGEST = 2.0
 """Longest allowed look-ahead [s]."""
 _FIRST_ITERATIONS = 100
-_SHARE, _BUDGET = 0.6, 4e-3
-"""Default share of a frame's time that computing may take, and the most [s]. At low rates more time gains little."""
-_CALMER = 0.2
-"""Weight of the newest frame in the running mean of an iteration's time."""
-_LEAST_ITERATIONS = 5
-"""Iterations of every frame regardless of time: with fewer, plans fall behind the person and feet slip."""
-_BROKEN = 0.5
-"""Cost of violated bounds above which a plan gets all its iterations regardless of time. Otherwise feet slip some
-frames later, because limits leave no way back.
-"""
 _DAMPING, _MOST_DAMPING, _LESS, _MORE = 1.0, 1e6, 0.25, 64.0
 """Least and largest damping of a frame's first iteration, and the factors on it after a frame with and without an
 accepted step.
@@ -82,10 +72,7 @@ class LiveFrame(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """State of a live plan: configurations (past frames first), velocity, stance, damping and figures.
-
-    ``penalty`` is the cost of the bounds that the plan violates: 0.5 for one standing point that is 1 mm off.
-    """
+    """State of a live plan: configurations (past frames first), velocity, stance, damping and figures."""
 
     q: Float[Array, "W nq"]
     velocity: Float[Array, " nv"]
@@ -94,7 +81,6 @@ class _Plan(NamedTuple):
     off: Float[Array, ""]
     feet_off: Float[Array, ""]
     iterations: Int[Array, ""]
-    penalty: Float[Array, ""]
 
 
 class LiveRetargeter(OnRobot):
@@ -114,9 +100,6 @@ class LiveRetargeter(OnRobot):
         balance: as in ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
-        budget: computing time per frame [s]. An iteration that would exceed it is not started, except the first five
-            and those of a plan that violates a bound, so a frame can take longer. None: 60 % of the time between
-            frames, 4 ms at most.
 
     Raises:
         ValueError: no limbs are found, nothing holds a free base, joints are missing, or a number is out of range.
@@ -133,25 +116,20 @@ class LiveRetargeter(OnRobot):
         acceleration: float | Mapping[str, float] = ACCELERATION,
         balance: float | None = None,
         look_ahead: float = 0.27,
-        iterations: int = 20,
-        budget: float | None = None,
+        iterations: int = 10,
     ):
         if not 0.0 < look_ahead <= _LONGEST:
             raise OsikValueError(f"look_ahead is {look_ahead}; it is a time in seconds, over 0 and up to {_LONGEST:g}")
         if not iterations >= 1:
             raise OsikValueError(f"iterations is {iterations}; it is 1 at least")
-        if budget is not None and not budget > 0.0:
-            raise OsikValueError(f"budget is {budget}; it is a time in seconds, over 0")
         super().__init__(robot, profile, acceleration, balance)
         self._dt = 1.0 / standing.fps
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
         self.iterations = int(iterations)
-        self.budget = min(_SHARE * self._dt, _BUDGET) if budget is None else float(budget)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)
         self._window_bounds = self._bounds(self._dt)
-        self._iteration_seconds = 0.0
         self.reset()
 
     @property
@@ -182,9 +160,7 @@ class LiveRetargeter(OnRobot):
 
             - ``q``: configuration. (nq,)
             - ``contact``: whether left heel, left toe, right heel and right toe stand. (4,)
-            - ``status``: an ``IntEnum``. ``FOLLOWED`` (0): the robot follows the plan. ``HELD_BACK`` (1): a limit keeps
-                it off the plan. ``FILLED`` (2): missing joints are interpolated. ``LOST`` (3): the person is missing
-                from here on, and the robot comes to rest. ``FEET_OFF`` (4): limits do not let the feet hold.
+            - ``status``: a ``LiveStatus``: ``FOLLOWED``, ``HELD_BACK``, ``FILLED``, ``LOST`` or ``FEET_OFF``.
             - ``off_plan``: largest distance of a joint from the plan because of a limit [rad or m].
             - ``feet_off``: largest distance of a contact point from its landing place or the floor, or of a sole below
                 the floor [m].
@@ -246,7 +222,7 @@ class LiveRetargeter(OnRobot):
         person, now = self._build.seen(own), self._history
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
         goals = jax.tree.map(lambda leaf: leaf[now - _PAST :], self._build.goals(person, firm=False))
-        self._plan = plan = self._advanced(goals, person.contact[now], began)
+        self._plan = plan = self._advanced(goals, person.contact[now])
         # slicing the array of JAX would be a program of its own
         off, feet_off, q = float(plan.off), float(plan.feet_off), np.asarray(plan.q)[_PAST]
         status = LiveStatus.HELD_BACK if off > _OFF else LiveStatus.FOLLOWED
@@ -256,8 +232,8 @@ class LiveRetargeter(OnRobot):
         seconds = time.perf_counter() - began
         return LiveFrame(q, person.contact[now], status, off, feet_off, int(plan.iterations), seconds)
 
-    def _advanced(self, goals: Goals, contact: Bool[np.ndarray, "4"], began: float) -> _Plan:
-        """Return the plan moved on by one frame; ``began`` is the arrival time of the frame [s]."""
+    def _advanced(self, goals: Goals, contact: Bool[np.ndarray, "4"]) -> _Plan:
+        """Return the plan moved on by one frame."""
         weights, bounds, guess = self.profile.weights, self._window_bounds, self._build.first_guess(goals)
         if self._plan is None:
             first = make_plan(self._body, goals, weights, bounds, guess, _FIRST_ITERATIONS).q
@@ -273,22 +249,9 @@ class LiveRetargeter(OnRobot):
             if (at := self._build.free) is not None:
                 q[-1, at : at + 3] += guess[-1, at : at + 3] - guess[-2, at : at + 3]
             velocity, stance, damping = self._plan.velocity, self._plan.stance, self._plan.damping
-        start, first = time.perf_counter(), self._plan is None
-        left = self.budget - (start - began)
-        most = min(max(int(left // max(self._iteration_seconds, 1e-9)) - 1, _LEAST_ITERATIONS), self.iterations)
-        known = self._body, goals, weights, bounds
-        plan = _advance(*known, q, (velocity, stance, damping), contact, self.limits, self._dt, most)
-        more = self.iterations - int(plan.iterations)
-        if float(plan.penalty) > _BROKEN and more > 0:
-            before = velocity, stance, plan.damping
-            plan = _advance(*known, plan.q, before, contact, self.limits, self._dt, more)
-            plan = plan._replace(iterations=plan.iterations + self.iterations - more)
-        # the last pass counts as one iteration
-        spent = (time.perf_counter() - start) / (int(plan.iterations) + 1)
-        mean = self._iteration_seconds
-        if not first:  # the first call may include compilation
-            self._iteration_seconds = spent if mean == 0.0 else mean + _CALMER * (min(spent, 2.0 * mean) - mean)
-        return plan
+        before = velocity, stance, damping
+        known = self._body, goals, weights, bounds, q, before, contact, self.limits
+        return _advance(*known, self._dt, self.iterations)
 
 
 @jax.jit
@@ -320,9 +283,7 @@ def _advance(
     limited, _ = moved(body.robot, goal, velocity, dt)
     q, velocity = moved(body.robot, goal, held.step / dt, dt)
     off = jnp.abs(difference(body.robot, limited, plan[_PAST])).max()
-    return _Plan(
-        plan.at[_PAST].set(q), velocity, held.stance, damping, off, held.off, mended.iterations, mended.cost[1]
-    )
+    return _Plan(plan.at[_PAST].set(q), velocity, held.stance, damping, off, held.off, mended.iterations)
 
 
 def _filled(seen: Float[np.ndarray, "F J 3"], known: Float[np.ndarray, "J 3"]) -> Float[np.ndarray, "F J 3"]:

@@ -1,24 +1,33 @@
-"""Reader for every kind of motion file."""
+"""Reader for every kind of motion file: BVH, and joint positions or SMPL poses as arrays."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from .._errors import OsikValueError
+from .._npz import open_npz
 from ._bvh import read_bvh
-from ._keypoints import read_keypoints
 from ._motion import HumanMotion
-from ._up import Up
+from ._rotations import continuous
+from ._smpl import arrays_to_read, is_smpl, read_smpl
+from ._up import Up, checked_up, find_rest_up, standing_up
 
-ENDINGS = (".bvh", ".npz", ".csv")
+ENDINGS = (".bvh", ".npz")
 
 
-def load_motion(
-    path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None, trim: bool = True
-) -> HumanMotion:
-    """Read a person's motion: BVH, ``.npz`` or ``.csv``, told apart by the ending.
+def load_motion(path: str | os.PathLike[str], *, unit: str | float | None = None, up: Up | None = None) -> HumanMotion:
+    """Read a person's motion: BVH or ``.npz``, told apart by the ending.
+
+    A ``.npz`` has ``fps``, ``positions`` (F, J, 3) in metres, z up, and ``joint_names`` (J,); optional ``rotations``
+    (F, J, 4; w x y z), ``rest_positions`` (J, 3), ``contact`` (F, 4; left heel, left toe, right heel, right toe, or
+    F, 2; left, right), ``ground``, ``object.NAME`` (F, 7; position and w x y z) and ``touch.ROLE.NAME`` (F,). One with
+    ``poses`` and ``trans`` is read as in AMASS (SMPL, SMPL-H or SMPL-X). Nothing is unpickled.
+
+    Rest-pose frames at the start of a BVH file, followed by a jump, are left out with an ``OsikWarning``.
 
     Args:
         path: the file.
@@ -26,7 +35,6 @@ def load_motion(
             of these in which the person is 1 to 2.3 m large. Other files are in metres.
         up: the file's axis that points up: ``"x"``, ``"y"``, ``"z"``, ``"-x"``, ``"-y"`` or ``"-z"``. None: the axis
             along which the person stands in the motion. An ``OsikWarning`` is given if the rest pose disagrees.
-        trim: leave out rest-pose frames at the start of a BVH file, with an ``OsikWarning``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -42,25 +50,66 @@ def load_motion(
     if not Path(path).is_file():
         raise FileNotFoundError(f"no such file: {path}")
     if ending == ".bvh":
-        return read_bvh(path, unit=unit, up=up, trim=trim)
-    return read_keypoints(path, up=up)
+        return read_bvh(path, unit=unit, up=up)
+    up = checked_up(up)
+    motion = _from_npz(Path(path))
+    return standing_up(str(path), motion, up, "z", find_rest_up(motion))
 
 
-def clips_in(folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """Return the motion files of a folder by clip name, and the names of what else is in it.
-
-    A clip's name is the file's, without its ending unless two would clash. Hidden files are not named.
-    """
-    inside = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
-    files = [path for path in inside if path.is_file() and path.suffix.lower() in ENDINGS]
-    others = [path.name + "/" * path.is_dir() for path in inside if path not in files]
-    if not files:
-        seen = shortened([path.name for path in inside]) or "nothing"
-        raise OsikValueError(f"{folder} has no clips ({', '.join(ENDINGS)}); in it: {seen}")
-    stems = [path.stem for path in files]
-    return {path.stem if stems.count(path.stem) == 1 else path.name: path for path in files}, others
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a ``.npz`` file that have a use (``arrays_to_read``); nothing is unpickled."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    with open_npz(path) as data:
+        return {name: data[name] for name in arrays_to_read(data.files)}
 
 
-def shortened(names: Sequence[str], most: int = 8) -> str:
-    """Return names joined by commas, ``most`` of them and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+def _from_npz(path: Path) -> HumanMotion:
+    arrays = load_arrays(path)
+    if is_smpl(arrays):
+        return read_smpl(path, arrays)
+    missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
+    if missing:
+        raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+    contact = _numbers(path, arrays, "contact")
+    if contact is not None and not np.isin(contact, (0.0, 1.0)).all():
+        raise OsikValueError(f"{path}: contact is 0 or 1, not {contact[~np.isin(contact, (0.0, 1.0))][0]:g}")
+    if contact is not None and contact.ndim == 2 and contact.shape[1] == 2:
+        contact = contact[:, [0, 0, 1, 1]]
+    rotations = _numbers(path, arrays, "rotations")
+    ground = _numbers(path, arrays, "ground")
+    try:
+        return HumanMotion(
+            name=path.stem,
+            fps=float(_number(path, arrays, "fps")),
+            joint_names=tuple(str(name) for name in arrays["joint_names"].ravel()),
+            positions=_numbers(path, arrays, "positions"),
+            rotations=None if rotations is None else continuous(rotations),
+            rest_positions=_numbers(path, arrays, "rest_positions"),
+            contact=None if contact is None else contact.astype(bool),
+            ground=None if ground is None else float(_number(path, arrays, "ground")),
+            objects={name[7:]: _numbers(path, arrays, name) for name in arrays if name.startswith("object.")},
+            touches=tuple(
+                (parts[1], parts[2], held.astype(bool))
+                for name, held in arrays.items()
+                if len(parts := name.split(".", 2)) == 3 and parts[0] == "touch"
+            ),
+        )
+    except ValueError as error:
+        raise OsikValueError(f"{path}: {error}" if str(path) not in str(error) else str(error)) from None
+
+
+def _numbers(path: Path, arrays: dict[str, np.ndarray], name: str) -> Any:
+    """Return an array as floats, or None if the file has none of this name."""
+    if name not in arrays:
+        return None
+    if arrays[name].dtype.kind not in "fiub":
+        raise OsikValueError(f"{path}: {name} is of type {arrays[name].dtype}; it has to be numbers")
+    return arrays[name].astype(float)
+
+
+def _number(path: Path, arrays: dict[str, np.ndarray], name: str) -> float:
+    values = np.ravel(_numbers(path, arrays, name))
+    if values.size != 1:
+        raise OsikValueError(f"{path}: {name} is one number, not {values.size}")
+    return float(values[0])

@@ -97,11 +97,6 @@ class HumanMotion:
         """Return the number of frames."""
         return len(self.positions)
 
-    @property
-    def seconds(self) -> float:
-        """Return the time from the first frame to the last [s]."""
-        return (self.frames - 1) / self.fps
-
     def track(self, name: str) -> Float[np.ndarray, "F 3"]:
         """Return the positions of one joint in the world [m]. (F, 3).
 

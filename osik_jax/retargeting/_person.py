@@ -147,12 +147,11 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
 
 def _check_up(motion: HumanMotion, roles: Mapping[str, str]) -> None:
     """Warn if z does not seem to point up."""
-    up, other = find_up(motion, "z", roles)
-    other = up if up != "z" else other
-    if other is not None:
+    up = find_up(motion, "z", roles)
+    if up != "z":
         warn(
-            f"{motion.name}: z is taken to point up, and the motion looks as if {other} did; "
-            f"load_motion(path, up={other!r}) and --up={other} turn {other} up"
+            f"{motion.name}: z is taken to point up, and the motion looks as if {up} did; "
+            f"load_motion(path, up={up!r}) and --up={up} turn {up} up"
         )
 
 

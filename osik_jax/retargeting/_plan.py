@@ -52,12 +52,11 @@ refused step one. While bounds are violated by more than that share, a small ste
 nothing, because a small gain may come from damping.
 """
 
-_Ending = Literal["ready", "settled", "mended", "spent"]
+_Ending = Literal["ready", "settled", "mended"]
 _START = {
     "ready": (_SOFTEST, _FIRST_DAMPING, _LITTLE),
     "settled": (_SOFT, _FIRST_DAMPING, _LITTLE),
     "mended": (1.0, _STIFF_DAMPING, 0.1 * _LITTLE),
-    "spent": (1.0, _STIFF_DAMPING, _LITTLE),
 }
 """Per ending: initial stiffness, initial damping, and relative gain that counts as small. A stream uses a smaller gain,
 because only its newest frame has much to gain.
@@ -140,7 +139,7 @@ def make_plan(
     return _descended(clip, _from_a_part(clip, start), max_iterations, until="settled")
 
 
-@partial(jax.jit, static_argnames="until")
+@jax.jit
 def mend_plan(
     body: Body,
     goals: Goals,
@@ -149,31 +148,13 @@ def mend_plan(
     q: Float[Array, "F nq"],
     free: Float[Array, " F"],
     iterations: Int[Array, ""] | int,
-    damping: Float[Array, ""] | float = _STIFF_DAMPING,
-    *,
-    until: Literal["mended", "spent"] = "mended",
+    damping: Float[Array, ""] | float,
 ) -> Plan:
     """Improve a nearly optimal plan until steps gain little, with bounds at full stiffness.
 
-    Frames where ``free`` is 0 are past and do not move. ``damping`` is at least ``_STIFF_DAMPING``; ``until="spent"``
-    runs all iterations regardless of gain.
+    Frames where ``free`` is 0 are past and do not move. ``damping`` is at least ``_STIFF_DAMPING``.
     """
-    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until=until)
-
-
-def at_solution(
-    body: Body, goals: Goals, weights: Weights, bounds: Bounds, q: Float[Array, "F nq"]
-) -> Float[Array, "F nq"]:
-    """Return q unchanged, with the derivative of the plan's minimum by its inputs.
-
-    At a minimum the Gauss-Newton step is 0. Its derivative with the system held fixed is the derivative of the minimum,
-    up to second derivatives of residuals, which are small (implicit function theorem).
-    """
-    clip = _Clip(body, goals, weights, bounds, jnp.ones(len(q), q.dtype))
-    here = _linearised(clip, q, jnp.ones((), q.dtype))
-    system = jax.lax.stop_gradient(here.system)
-    step = -solve_banded(system._replace(alone=system.alone + _LEAST_DAMPING), here.gradient)
-    return jax.vmap(lambda a, b: integrate(body.robot, a, b))(q, step - jax.lax.stop_gradient(step))
+    return _descended(_Clip(body, goals, weights, bounds, free), q, iterations, damping, until="mended")
 
 
 def _from_a_part(clip: _Clip, start: Float[Array, "F nq"]) -> Float[Array, "F nq"]:
@@ -237,7 +218,7 @@ def _descended_plain(
     stiffness, usual, little = _START[until]
 
     def goes_on(state: _State) -> Bool[Array, ""]:
-        over = state.ready if until == "ready" else (state.settled >= _SETTLED) & (until != "spent")
+        over = state.ready if until == "ready" else state.settled >= _SETTLED
         return ~over & (state.iterations < most)
 
     first = _State.at(clip, q, stiffness, usual if damping is None else damping)
@@ -258,7 +239,7 @@ def _descended_by_core(
 
     Arrays that all lanes share have an axis of length 1.
     """
-    endings = float(until == "ready"), float(until in ("settled", "mended"))
+    endings = float(until == "ready"), float(until != "ready")
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
     rules += (_CAREFUL, little, float(_SETTLED), stiffness)

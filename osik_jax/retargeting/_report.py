@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from ..robot._mujoco import model_qpos
 from ..tasks._polygon import hull
 from ._contact import stretches
 from ._facing import facing_at_home
-from ._notes import notes
 from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
 from ._roles import CHAINS, SIDES
@@ -42,6 +42,27 @@ FIGURES = {
     "chest_angle_deg_mean": ("tracking", "trunk_angle_deg", "chest"),
 }
 """Figures of summaries by name, with their keys in a report."""
+
+
+_BOUNDS = {
+    ("feet", "slip_mm_max"): (1.0, "feet that stand slip by {:.1f} mm"),
+    ("feet", "float_mm_max"): (2.0, "feet that stand are {:.1f} mm above the floor"),
+    ("feet", "below_floor_mm_max"): (2.0, "soles are {:.1f} mm below the floor"),
+    ("shapes", "penetration_mm_max"): (1.0, "shapes overlap by {:.1f} mm"),
+    ("touches", "off_mm_max"): (5.0, "hands are {:.1f} mm off what they hold"),
+    ("joints", "beyond_range_max"): (1e-6, "a joint is {:.2g} rad or m beyond its range"),
+    ("joints", "speed_over_limit_max"): (1.0 + 1e-6, "a joint has {:.3g} times its greatest speed"),
+}
+"""Figures of a report, the largest value where bounds hold, and the note for a larger value."""
+_LEAST_STANDING = 0.2
+_OFTEN, _OFF = 0.5, 4.0
+"""Share of frames with a joint at its speed limit, and mean angle between segments [deg], above both of which a clip is
+too fast.
+"""
+_LEANS, _RESTS, _MOST_JOINTS = 10.0, 0.5, 4
+"""Angle between the trunks of person and robot [deg], and share of frames with a joint at an end of its range, above
+which each is told; and largest number of joints that a note names.
+"""
 
 
 def report(result: Retargeted) -> dict[str, Any]:
@@ -84,34 +105,22 @@ def picked(figures: Any) -> dict[str, float | None]:
     return {name: functools.reduce(operator.getitem, path, figures) for name, path in FIGURES.items()}
 
 
-def joint_tracks(result: Retargeted) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions of the named joints, their ranges and speed limits. (F, joints), then (joints,) each."""
-    robot, names = result.robot, result.robot.joint_names
+def _joints(result: Retargeted) -> dict[str, Any]:
+    robot, names, fps = result.robot, result.robot.joint_names, result.motion.fps
     dofs = [robot.joint_dof_index(name) for name in names]
     low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
-    return result.q[:, [robot.joint_qpos_index(name) for name in names]], low, high, fast
-
-
-def at_ends(result: Retargeted) -> Bool[np.ndarray, "F joints"]:
-    """Return whether each named joint is at an end of its range. (F, joints)."""
-    q, low, high, _ = joint_tracks(result)
+    q = result.q[:, [robot.joint_qpos_index(name) for name in names]]
     room = np.where(np.isfinite(high - low), AT_END * (high - low), 0.0)
-    return ((q <= low + room) | (q >= high - room)) & (high > low)
-
-
-def _joints(result: Retargeted) -> dict[str, Any]:
-    (q, low, high, fast), fps = joint_tracks(result), result.motion.fps
-    names = result.robot.joint_names
+    at_end = (((q <= low + room) | (q >= high - room)) & (high > low)).mean(0)
     speed = np.diff(q, axis=0) * fps
     change = np.abs(np.diff(speed, axis=0))
-    worst = int(np.argmax(change.max(0)))
     return {
         "beyond_range_max": float(max(0.0, (low - q).max(), (q - high).max())),
         "speed_over_limit_max": float((np.abs(speed) / fast).max()),
         "at_speed_limit_share": float((np.abs(speed) > AT_SPEED * fast).any(1).mean()),
-        "at_end_share": {name: float(own) for name, own in zip(names, at_ends(result).mean(0), strict=True) if own},
+        "at_end_share": {name: float(own) for name, own in zip(names, at_end, strict=True) if own},
         "acceleration_max": float(change.max() * fps),
-        "acceleration_max_joint": names[worst],
+        "acceleration_max_joint": names[int(np.argmax(change.max(0)))],
         "acceleration_rms": _rms(change) * fps,
         "jerk_rms": _rms(np.diff(speed, 2, axis=0)) * fps**2,
         "jump_frames": int((change > JUMP).any(1).sum()),
@@ -227,3 +236,49 @@ def _angle(a: Float[np.ndarray, "F 3"], b: Float[np.ndarray, "F 3"]) -> float:
     """Return the mean angle between two sequences of vectors [deg]."""
     across, along = np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, -1)
     return float(np.degrees(np.arctan2(across, along)).mean())
+
+
+def notes(figures: Mapping[str, Any], balance: float | None = None) -> list[str]:
+    """Return notes that a user must read before using a motion; empty if there are none.
+
+    ``balance`` is the requested margin of the centre of mass inside the support polygon [m].
+    """
+    limited, angle = figures["joints"]["at_speed_limit_share"], figures["tracking"]["segment_angle_deg_mean"]
+    out = []
+    if limited > _OFTEN and angle > _OFF:
+        out.append(
+            f"segments are {angle:.1f} deg off, and in {100.0 * limited:.0f} % of the frames a joint is at its largest "
+            "speed: slow down the clip, or check the speed limits in the robot's file"
+        )
+    out += _posture(figures)
+    found = [(figures[group][name], most, text) for (group, name), (most, text) in _BOUNDS.items()]
+    out += [
+        f"a bound gave way: {text.format(value)}" for value, most, text in found if value is not None and value > most
+    ]
+    margin = figures["balance"]["com_margin_mm_min"]
+    if balance is not None and margin is not None and margin < 0.0:
+        out.append(f"a bound gave way: the centre of mass is {-margin:.1f} mm outside the feet")
+    share = figures["feet"]["contact_share"]
+    if share is not None and share < _LEAST_STANDING:
+        out.append(
+            f"feet stand in {100.0 * share:.0f} % of the frames, and nothing holds them elsewhere; where the person "
+            "walks or stands, check the unit, the up axis and the contact labels of the clip"
+        )
+    return out
+
+
+def _posture(figures: Mapping[str, Any]) -> list[str]:
+    """Return notes on a trunk that leans, and on joints that rest at an end."""
+    out, leans = [], figures["tracking"]["trunk_angle_deg"]["hips-shoulders"]
+    if leans is not None and leans > _LEANS:
+        out.append(
+            f"the trunk leans {leans:.0f} deg away from the person's: check which joint of the clip is the chest, and "
+            "the range of the waist"
+        )
+    share: Mapping[str, float] = figures["joints"]["at_end_share"]
+    rests = sorted((name for name in share if share[name] > _RESTS), key=lambda name: -share[name])
+    if rests:
+        named = ", ".join(f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests[:_MOST_JOINTS])
+        more = f" and {len(rests) - _MOST_JOINTS} more" if len(rests) > _MOST_JOINTS else ""
+        out.append(f"joints rest at an end of their range: {named}{more}")
+    return out

@@ -7,27 +7,61 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import starmap
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
 from .._progress import reported
 from ..execution._platform import cpu_is_default
 from ..execution._workers import cores
+from ..limits import Limit
 from ..numerics._arguments import check_count
 from ..robot import Robot
-from ._lanes import LENGTHS, Clip, Solved, as_lane, padded, shared_length, solve_lane, solve_side_by_side
+from ._body import TouchGoal
+from ._finish import follow
+from ._goals import Goals, Weights
 from ._motion import HumanMotion
 from ._on_robot import ACCELERATION, OnRobot
-from ._person import read_person, with_path
+from ._person import Person, read_person, with_path
+from ._plan import make_plan
 from ._profile import Limb, Profile
-from ._retargeted import Retargeted, as_retargeted
+from ._retargeted import Retargeted
 from ._source_motion import SourceMotion
+from ._terms import Body, Bounds
 
 Source = HumanMotion | SourceMotion
 _Checked = tuple[Source, Mapping[str, str]]
+LENGTHS = 16
+"""Programs are compiled for multiples of this number of frames."""
+
+
+class Solved(NamedTuple):
+    """Results of both passes; for several clips every leaf has a leading axis."""
+
+    q: Array
+    off_plan: Array
+    iterations: Array
+    cost: Array
+
+
+class Clip(NamedTuple):
+    """One clip as arrays for planning."""
+
+    person: Person
+    frames: int
+    goals: Goals
+    start: np.ndarray
+    bounds: Bounds
+    dt: float
+    touches: tuple[TouchGoal, ...] = ()
+
+    @property
+    def touching(self) -> tuple[Limb, ...]:
+        """Return the pairs that are held together."""
+        return tuple((touch.first, touch.second) for touch in self.touches)
 
 
 class Retargeter(OnRobot):
@@ -177,7 +211,7 @@ class Retargeter(OnRobot):
         batch = [as_lane(clip, length) for _, clip in clips]
         batch += batch[-1:] * (lanes - len(batch))
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *batch)
-        results = jax.tree.map(np.asarray, solve_side_by_side(stacked, *self._shared(clips[0][1].touching)))
+        results = jax.tree.map(np.asarray, solve_lanes(stacked, *self._shared(clips[0][1].touching)))
         for lane, (number, clip) in enumerate(clips):
             own = jax.tree.map(lambda leaf, lane=lane: leaf[lane], results)
             yield number, partial(self._finished, clip, own)
@@ -200,11 +234,58 @@ class Retargeter(OnRobot):
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
         cost = float(solved.cost[0]), float(solved.cost[1])
-        made = as_retargeted(self.robot, self.profile, clip.person, q, off)
         objects = self._build.objects(clip.person) if clip.person.objects else {}
-        return dataclasses.replace(
-            made, iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches
-        )
+        more: dict[str, Any] = dict(iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches)
+        return Retargeted.of(self.robot, self.profile, clip.person, q, off, **more)
+
+
+def as_lane(clip: Clip, length: int) -> _Lane:
+    """Return a clip as one lane of a batch, padded to ``length`` frames."""
+    goals, start = padded(clip.goals, clip.start, length - len(clip.start))
+    return jax.tree.map(np.asarray, (goals, start, clip.bounds, np.asarray(clip.dt)))
+
+
+def shared_length(clip: Clip) -> int:
+    """Return a padded length shared by clips of similar length: at most a quarter more, and few distinct values."""
+    # steps of an eighth of the next power of two: at most a quarter is padding, with four lengths per doubling
+    step = max(LENGTHS, (1 << (clip.frames - 1).bit_length()) // 8)
+    return -(-clip.frames // step) * step
+
+
+_Lane = tuple[Goals, Array, Bounds, Array]
+
+
+@jax.jit
+def solve_lane(
+    lane: _Lane,
+    body: Body,
+    weights: Weights,
+    limits: Sequence[Limit],
+    max_iterations: Array,
+    smoothness: Array | float = 0.0,
+) -> Solved:
+    goals, start, bounds, dt = lane
+    plan = make_plan(body, goals, weights.smoother(smoothness, dt), bounds, start, max_iterations)
+    q, off = follow(body.robot, plan.q, limits, dt)
+    return Solved(q, off, plan.iterations, plan.cost)
+
+
+@jax.jit
+def solve_lanes(lanes: _Lane, *shared: Any) -> Solved:
+    """Solve all lanes in one program; ``shared`` are the arguments of ``solve_lane`` after the lane."""
+    return jax.vmap(lambda lane: solve_lane(lane, *shared))(lanes)
+
+
+def padded(goals: Goals, start: Float[np.ndarray, "F nq"], more: int) -> tuple[Goals, Float[np.ndarray, "T nq"]]:
+    """Return goals and first guess with ``more`` frames appended that do not count (``present`` is 0)."""
+    frames = len(start)
+
+    def longer(leaf: np.ndarray) -> np.ndarray:
+        return np.concatenate([leaf, np.repeat(leaf[-1:], more, 0)])
+
+    goals, start = jax.tree.map(longer, (goals, start))
+    present = np.where(np.arange(frames + more) < frames, goals.present, 0.0).astype(start.dtype)
+    return dataclasses.replace(goals, present=present, contact=goals.contact * present[:, None]), start
 
 
 def _raise(error: Exception) -> NoReturn:

@@ -6,7 +6,7 @@ import dataclasses
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -33,11 +33,11 @@ class Retargeted:
         turns: forward, left and up axes of the person's pelvis and chest as columns. (F, 2, 3, 3)
         contact: whether left heel, left toe, right heel and right toe stand, or the points of ``Profile.standing`` of a
             robot of another shape. (F, 4)
+        off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
         iterations: iterations of the plan; 0 for a live stream.
         cost: final cost of the goals, and of the violated bounds; 0 for a live stream.
         objects: poses of the clip's objects in the robot's world. (F, 7) each
         touches: what the robot's joints hold.
-        off_plan: largest distance of a joint from the plan in each frame because of a limit [rad or m]. (F,)
     """
 
     robot: Robot
@@ -48,11 +48,27 @@ class Retargeted:
     human_names: tuple[str, ...]
     turns: Float[np.ndarray, "F 2 3 3"]
     contact: Bool[np.ndarray, "F 4"]
-    iterations: int
-    cost: tuple[float, float]
     off_plan: Float[np.ndarray, " F"]
+    iterations: int = 0
+    cost: tuple[float, float] = (0.0, 0.0)
     objects: Mapping[str, Float[np.ndarray, "F 7"]] = dataclasses.field(default_factory=dict)
     touches: tuple[TouchGoal, ...] = ()
+
+    @classmethod
+    def of(cls, robot: Robot, profile: Profile, person: Person, q: np.ndarray, off: np.ndarray, **more: Any) -> Self:
+        """Return the record of a motion (F, nq) made from a person's motion; ``off`` is ``off_plan`` (F,)."""
+        return cls(
+            robot=robot,
+            profile=profile,
+            motion=in_mujoco_order(robot, q, person.fps),
+            q=q,
+            human=np.stack([*person.points.values(), person.root], 1),
+            human_names=(*person.points, "root"),
+            turns=np.stack([person.pelvis, person.torso], 1),
+            contact=person.contact,
+            off_plan=off,
+            **more,
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an ``.npz`` file.
@@ -78,22 +94,3 @@ class Retargeted:
             ground=0.0,
             **objects,
         )
-
-
-def as_retargeted(
-    robot: Robot, profile: Profile, person: Person, q: Float[np.ndarray, "F nq"], off_plan: Float[np.ndarray, " F"]
-) -> Retargeted:
-    """Return the record of a motion made from a person's motion."""
-    return Retargeted(
-        robot=robot,
-        profile=profile,
-        motion=in_mujoco_order(robot, q, person.fps),
-        q=q,
-        human=np.stack([*person.points.values(), person.root], 1),
-        human_names=(*person.points, "root"),
-        turns=np.stack([person.pelvis, person.torso], 1),
-        contact=person.contact,
-        iterations=0,
-        cost=(0.0, 0.0),
-        off_plan=off_plan,
-    )

@@ -15,7 +15,7 @@ from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot._mujoco import model_qpos
 from ..robot._tree import FREE
-from ._keypoints import load_arrays
+from ._load import load_arrays
 from ._motion import check_rate, instants
 from ._rotations import slerp
 

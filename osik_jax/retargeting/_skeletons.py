@@ -6,7 +6,7 @@ import functools
 import itertools
 import re
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -42,7 +42,7 @@ _MIDDLE_WORDS = ("", "c", "center")
 _SUFFIX = re.compile(r"(joint|jnt|bone)$")
 _FIRST = re.compile(r"0*1(?=(left|l|左|right|r|右)?$)")
 """Number 1 of the first of several bones in a row, as in MakeHuman's ``upperleg01.L``."""
-_LONGEST_LIST = 400
+_MOST_NAMES = 20
 _SAME = 1e-3
 """Two joints closer to each other than this share of the clip's largest distance from the mean joint are at one point.
 """
@@ -221,15 +221,10 @@ def _check_complete(joint_names: tuple[str, ...], roles: Mapping[str, str], need
         others = [name for name in joint_names if name not in roles.values()]
         raise OsikValueError(
             f"the clip has no {', '.join(missing)} that can be told by name; found: {found}; other joints: "
-            f"{_shortened(others)}; say which joint is which with mapping={{role: joint}}"
+            f"{shortened(others, _MOST_NAMES) or 'none'}; say which joint is which with mapping={{role: joint}}"
         )
 
 
-def _shortened(names: Iterable[str]) -> str:
-    """Return names joined by commas, shortened to the length of a message."""
-    out, names = "", list(names)
-    for count, name in enumerate(names):
-        if len(out) + len(name) > _LONGEST_LIST:
-            return f"{out} and {len(names) - count} more"
-        out += f", {name}" if out else name
-    return out or "none"
+def shortened(names: Sequence[str], most: int = 8) -> str:
+    """Return names joined by commas, ``most`` of them and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -17,88 +17,56 @@ from ._skeletons import find_roles
 
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 UPS: tuple[Up, ...] = get_args(Up)
-_TO_Z_UP = {
-    "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
-    "y": ((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "-x": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
-    "-y": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),
-    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
-}
-"""Rotations that turn each axis up; facing z with y up becomes facing x with z up."""
 _NEAR_FLOOR, _LOW_SHARE, _FLOOR_WEIGHT = 0.05, 10.0, 1.5
 """Largest height of the lowest point in a frame that stands on the floor [m], percentile of lowest points that defines
 the floor, and weight of the share of such frames relative to how upright the person is.
 """
 _STANDS, _LEANS, _ON_FLOOR = 0.7, 0.1, 0.5
-_CLEARLY, _PERHAPS = 0.5, 0.1
-"""Score above the expected axis' at which another axis is taken, and at which a warning is given."""
+_CLEARLY = 0.5
+"""Score above the expected axis' at which another axis is taken."""
 
 
-class Evidence(NamedTuple):
-    """Evidence for each axis of ``UPS``. (6,) each."""
-
-    # component along the axis of the vector from ankles to shoulders relative to its length, mean over frames
-    upright: Float[np.ndarray, "6"]
-    grounded: Float[np.ndarray, "6"]  # share of frames in which the lowest point is within 5 cm of the floor
-    floor: Float[np.ndarray, "6"]  # height of the floor along the axis [m]
-
-    @property
-    def score(self) -> Float[np.ndarray, "6"]:
-        """Return a score per axis; the highest explains the motion best. (6,)."""
-        return self.upright + _FLOOR_WEIGHT * self.grounded
-
-
-def find_up(motion: HumanMotion, expected: Up, roles: Mapping[str, str] | None = None) -> tuple[Up, Up | None]:
-    """Return the up axis of a motion, and a second candidate, or None if there is no doubt.
+def find_up(motion: HumanMotion, expected: Up, roles: Mapping[str, str] | None = None) -> Up:
+    """Return the up axis of a motion in metres; the expected one if no joint is known as a shoulder or a foot.
 
     The person stands along the up axis, and the lowest point is near one height in most frames. The expected axis is
     kept if the person stands along it, if the person lies on a floor at height 0 along it (and on none along the other
-    axis), or if no other axis is clearly better. The clip is in metres.
+    axis), or if no other axis is clearly better.
     """
-    found = find_evidence(motion, roles)
-    if found is None:
-        return expected, None
-    own, score = UPS.index(expected), found.score
-    best = int(np.argmax(np.where(found.upright > _LEANS, score, -np.inf)))
-    more = score[best] - score[own]
-    if best == own or not more > _PERHAPS:
-        return expected, None
-    stands = found.upright[own] > _STANDS
-    at_floor = np.abs(found.floor) < _NEAR_FLOOR
-    lies = found.grounded[own] > _ON_FLOOR and at_floor[own] and not at_floor[best]
-    if more > _CLEARLY and not stands and not lies:
-        return UPS[best], None
-    return expected, UPS[best]
+    points = _tracks(motion, roles)
+    if points is None:
+        return expected
+    top, bottom, tracks = points
+    upright = _upright(top - bottom)
+    lowest = np.concatenate([tracks.min(1), -tracks.max(1)], -1)  # x, y, z, -x, -y, -z
+    floor = np.percentile(lowest, _LOW_SHARE, axis=0)
+    grounded = (np.abs(lowest - floor) < _NEAR_FLOOR).mean(0)
+    score, own = upright + _FLOOR_WEIGHT * grounded, UPS.index(expected)
+    best = int(np.argmax(np.where(upright > _LEANS, score, -np.inf)))
+    at_floor = np.abs(floor) < _NEAR_FLOOR
+    lies = grounded[own] > _ON_FLOOR and at_floor[own] and not at_floor[best]
+    stands = upright[own] > _STANDS
+    return UPS[best] if score[best] - score[own] > _CLEARLY and not stands and not lies else expected
 
 
 def find_rest_up(motion: HumanMotion) -> Up | None:
     """Return the axis along which the person stands in the rest pose; None if unknown."""
     if motion.rest_positions is None:
         return None
-    rest = dataclasses.replace(motion, positions=motion.rest_positions[None], rotations=None, contact=None)
-    found = find_evidence(rest, None)
-    stands = found is not None and found.upright.max() > _STANDS
-    return UPS[int(np.argmax(found.upright))] if found is not None and stands else None
+    points = _tracks(dataclasses.replace(motion, positions=motion.rest_positions[None], rotations=None, contact=None))
+    upright = np.zeros(6) if points is None else _upright(points[0] - points[1])
+    return UPS[int(np.argmax(upright))] if upright.max() > _STANDS else None
 
 
-def find_evidence(motion: HumanMotion, roles: Mapping[str, str] | None) -> Evidence | None:
-    """Return a motion's evidence for its up axis; None if no joint is known as a shoulder or a foot."""
-    points = _tracks(motion, roles)
-    if points is None:
-        return None
-    top, bottom, tracks = points
-    along = top - bottom
-    length = max(float(np.percentile(np.linalg.norm(along, axis=-1), 95)), 1e-9)
-    mean = along.mean(0) / length
-    lowest = np.stack([tracks.min(1), (-tracks).min(1)], -1).reshape(-1, 6)  # x, -x, y, -y, z, -z
-    floor = np.percentile(lowest, _LOW_SHARE, axis=0)
-    grounded = (np.abs(lowest - floor) < _NEAR_FLOOR).mean(0)
-    order = [0, 2, 4, 1, 3, 5]
-    return Evidence(np.concatenate([mean, -mean]), grounded[order], floor[order])
+def _upright(along: Float[np.ndarray, "F 3"]) -> Float[np.ndarray, "6"]:
+    """Return the mean components along each of ``UPS`` of the vector from ankles to shoulders over its length."""
+    mean = along.mean(0) / max(float(np.percentile(np.linalg.norm(along, axis=-1), 95)), 1e-9)
+    return np.concatenate([mean, -mean])
 
 
-def _tracks(motion: HumanMotion, roles: Mapping[str, str] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _tracks(
+    motion: HumanMotion, roles: Mapping[str, str] | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return points over time: middle of the shoulders, middle of the ankles, and all points that may touch the floor.
 
     Shapes (F, 3), (F, 3) and (F, k, 3). Without known joints, the head and the mean of the foot joints are taken; None
@@ -128,13 +96,19 @@ def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
     return [i for i, name in enumerate(joint_names) if any(word in name.lower() for word in words)]
 
 
+def _to_z_up(up: Up) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation that turns an axis up; facing z with y up becomes facing x with z up."""
+    turn = np.roll(np.eye(3), -1 - "xyz".index(up[-1]), 0)
+    return np.diag([1.0, -1.0, -1.0]) @ turn if up[0] == "-" else turn
+
+
 def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMotion:
     """Return a motion rotated so that ``up`` becomes z.
 
     Rotations are relative to the rest pose, which is rotated separately if it stands along another axis, ``rest_up``.
     """
     rest_up = up if rest_up is None else rest_up
-    turn, rest_turn = np.array(_TO_Z_UP[up], float), np.array(_TO_Z_UP[rest_up], float)
+    turn, rest_turn = _to_z_up(up), _to_z_up(rest_up)
     rotations, rest = motion.rotations, motion.rest_positions
     if rotations is not None:
         rotations = np.concatenate([rotations[..., :1], rotations[..., 1:] @ turn.T], -1)
@@ -165,7 +139,7 @@ def standing_up(source: str, motion: HumanMotion, up: Up | None, expected: Up, r
     ``up`` is the given axis, ``expected`` the one that this kind of file has up, ``rest_up`` that of the rest pose if
     it differs from the motion's. The warning names ``source``.
     """
-    own = find_up(motion, expected)[0] if up is None else up
+    own = find_up(motion, expected) if up is None else up
     if up is None and own != expected:
         warn(
             f"{source}: the person stands along {own} and not along {expected}, so {own} is taken to point up; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import jax
@@ -245,7 +246,9 @@ def test_files_and_command(ur5: osik.Robot, tmp_path, capsys: pytest.CaptureFixt
     options = ["--robot", "ur5", "--measurements", str(table), "--frame", "tool0", "--out", str(tmp_path / "out")]
     assert main(["calibrate", *options, "--sigma", "1e-4", "--unknowns", "joint_offset:elbow_joint"]) == 0
     assert "joint_offset[elbow_joint]: +10.0000" in capsys.readouterr().out
-    saved = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())
+    text = (tmp_path / "out" / "calibration.yaml").read_text()
+    saved = yaml.safe_load(text)
+    assert saved == json.loads(text)
     assert saved["unknowns"]["joint_offset[elbow_joint]"]["change"] == pytest.approx(0.01, abs=1e-9)
     assert saved["undetermined"] == [] and saved["frames"]["base"]["parent"] is None
     fitted = osik.Robot.from_urdf(tmp_path / "out" / "robot.urdf")
@@ -253,6 +256,20 @@ def test_files_and_command(ur5: osik.Robot, tmp_path, capsys: pytest.CaptureFixt
     assert (tmp_path / "out" / "residuals.png").stat().st_size > 10_000
     assert main(["calibrate", *options, "--unknowns", "lengths"]) == 2
     assert "no quantity 'lengths'" in capsys.readouterr().err
+
+
+def test_a_saved_file_has_numbers_for_readers_of_yaml_and_json(ur5: osik.Robot, tmp_path):
+    """PyYAML takes 1e-05 for text; a column of zeros says nothing of a joint, so that its deviation is infinite."""
+    q = np.zeros((3, 6))
+    frames = {"camera": cal.FixedFrame("tool0", position=(1e-5, -2e-7, 1.5e-5))}
+    readings = cal.Points("tool0", q, tips_of(ur5, q)[0])
+    found = cal.calibrate(ur5, readings, [cal.Unknown("joint_offset", "wrist_3_joint")], frames=frames)
+    found.save(tmp_path / "calibration.yaml")
+    text = (tmp_path / "calibration.yaml").read_text()
+    saved = yaml.safe_load(text)
+    assert saved == json.loads(text)
+    assert saved["frames"]["camera"]["position"] == [1e-5, -2e-7, 1.5e-5]
+    assert saved["unknowns"]["joint_offset[wrist_3_joint]"]["sigma"] is None
 
 
 @pytest.mark.parametrize(

@@ -213,15 +213,6 @@ def test_a_base_of_the_grid_gets_what_a_search_for_it_alone_gets(arm, found, poi
         assert found.stands_free[at] and found.reached[at] == alone.converged.sum()
 
 
-def test_pareto_bases_are_those_that_none_beats(found):
-    scores = np.stack([found.reached, np.nan_to_num(found.margin), np.nan_to_num(found.manipulability)], -1)
-    flat = scores.reshape(-1, 3)
-    beaten = [((flat >= own).all(1) & (flat > own).any(1)).any() for own in flat]
-    kept = {tuple(at) for at in found.pareto}
-    assert kept == {at for at, lost in zip(np.ndindex(found.reached.shape), beaten, strict=True) if not lost}
-    assert found.reached[tuple(found.pareto[0])] == found.reached.max()
-
-
 def test_a_pose_in_the_table_is_reached_by_no_base_and_the_answer_says_why(arm, scene, points):
     poses = np.concatenate([points[:2], [[0.5, 0.0, 0.25]]])
     found = place_base(arm, {"tip": poses}, x=[-0.1, 0.1], y=0.0, yaw=[0.0], scene=scene, refine=1)

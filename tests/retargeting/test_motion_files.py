@@ -145,13 +145,10 @@ def test_a_person_who_lies_or_crawls_stays_down(tmp_path):
     positions = standing.positions @ down.T
     positions += [0.5, 0.0, -positions[..., 2].min()]
     still = HumanMotion("lying", 30.0, standing.joint_names, positions)
-    assert find_up(still, "z") == ("z", "x")  # it may stand along x as well
     moving = dataclasses.replace(
         still, positions=positions + np.linspace(0.0, 2.0, len(positions))[:, None, None] * [1, 0, 0]
     )
-    assert find_up(moving, "z") == ("z", None)
-    with pytest.warns(OsikWarning, match="lying: z is taken to point up.*as if x did.*--up=x"):
-        measure(still, find_roles(still.joint_names))
+    assert find_up(still, "z") == find_up(moving, "z") == "z"
 
 
 def test_a_skeleton_of_no_persons_size_asks_for_the_unit(tmp_path):
@@ -165,50 +162,37 @@ def test_a_skeleton_of_no_persons_size_asks_for_the_unit(tmp_path):
 
 _SPINE = "\t\tOFFSET 0.0 0.25 0.0\n"
 _THREE = "\t\tCHANNELS 3 Zrotation Xrotation Yrotation\n"
+_END = "\tOFFSET 0 0 0\n"
 BROKEN = {
-    "no start": (lambda t: t.replace("HIERARCHY", "TREE"), r"line 1: a BVH file starts with HIERARCHY"),
-    "two offsets": (lambda t: t.replace("OFFSET 0.0 0.25 0.0", "OFFSET 0.0 0.25"), r"line 8: OFFSET has 2 numbers.*3"),
-    "no number": (lambda t: t.replace("OFFSET 0.0 0.25 0.0", "OFFSET 0.0 0.25 up"), r"line 8: OFFSET is not numbers"),
-    "no channel": (lambda t: t.replace("6 Xposition", "6 Wposition"), r"line 5: no channel Wposition; there are X"),
-    "count": (lambda t: t.replace("CHANNELS 6", "CHANNELS 5"), r"line 5: CHANNELS is followed by"),
-    "twice": (lambda t: t.replace("JOINT Neck", "JOINT Spine"), r"a second joint is called Spine"),
-    "open": (lambda t: t.replace("MOTION\n", "}\nMOTION\n"), r"} is not expected here"),
-    "frames": (lambda t: t.replace("Frames: 24", "Frames: 25"), r"says Frames: 25, and has 24"),
-    "time": (lambda t: t.replace("Frame Time: 0.03", "Frame Time: -0.03"), r"more than 0 s"),
-    "nan": (lambda t: t[: t.rindex(" ")] + " nan\n", r"a frame is not finite"),
-    "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line \d+: a frame has 56 numbers where there should be 57"),
-    "cut": (lambda t: t[: t.index("MOTION")], r"ends where .*MOTION should come"),
-    "no offset": (lambda t: t.replace("\t\tOFFSET 0.0 0.25 0.0\n", ""), r"Spine has no OFFSET"),
-    "two offsets of one": (lambda t: t.replace(_SPINE, 2 * _SPINE), r"line 9: Spine has an OFFSET already"),
-    "channels twice": (lambda t: t.replace(_SPINE, _SPINE + 2 * _THREE), r"line 10: Spine has CHANNELS already"),
-    "channels of an end": (
-        lambda t: t.replace("\tOFFSET 0 0 0\n", "\tOFFSET 0 0 0\n" + _THREE, 1),
-        r"line \d+: an End Site has no CHANNELS",
-    ),
-    "joint in an end": (
-        lambda t: t.replace("\tOFFSET 0 0 0\n", "\tOFFSET 0 0 0\nJOINT tip\n{\n}\n", 1),
-        r"nothing is inside an End Site but",
-    ),
-    "two roots": (lambda t: t.replace("MOTION\n", "ROOT Other\n{\nOFFSET 0 0 0\n}\nMOTION\n"), r"line 112: .*one ROOT"),
-    "no name": (lambda t: t.replace("ROOT Hips", "ROOT"), r"line 2: ROOT has no name"),
-    "no brace": (lambda t: t.replace("ROOT Hips\n{", "ROOT Hips"), r"line 3: \{ should follow Hips"),
-    "count in words": (lambda t: t.replace("Frames: 24", "Frames: many"), r"line 113: Frames: and their number"),
-    "no count": (lambda t: t.replace("Frames: 24\n", ""), r"line 113: Frames: and their number"),
-    "no frame time": (lambda t: t.replace("Frame Time: 0.033333333\n", ""), r"line 114: Frame Time: and seconds"),
-    "milliseconds": (lambda t: t.replace("Time: 0.033333333", "Time: 33.3"), r"line 114: the frame time is in seconds"),
-    "no frames": (
-        lambda t: t[: t.index("0.033333333")].replace(": 24", ": 0") + "0.03\n",
-        r"says Frames: 0, and has 0",
-    ),
-    "long": (lambda t: t.rstrip() + " 3.0\n", r"line 138: a frame has 58 numbers where there should be 57"),
-    "overflow": (lambda t: t[: t.rindex(" ")] + " 1e400\n", r"line 138: a frame is not finite"),
-    "decimal commas": (lambda t: t.replace("0.0 0.25 0.0", "0,0 0,25 0,0"), r"line 8: OFFSET is not numbers"),
-    "two motions": (lambda t: t + t[t.index("MOTION") :], r"line 139: a frame is not numbers; the line is 'MOTION'"),
-    "a page": (lambda t: "<!DOCTYPE html><html>404</html>", r"line 1: a BVH file starts with HIERARCHY"),
+    "no start": (lambda t: t.replace("HIERARCHY", "TREE"), r"line 1: HIERARCHY should come here"),
     "nothing": (lambda t: "", r"ends where HIERARCHY should come"),
-    "a huge frame": (lambda t: t[: t.rindex(" ")] + " 1e300\n", r"line 138: a frame has a number over 1e\+08"),
-    "a huge offset": (lambda t: t.replace("0.0 0.25 0.0", "0.0 -1e300 0.0"), r"line 8: OFFSET has a number over"),
-    "a huge rate": (lambda t: t.replace("Time: 0.033333333", "Time: 1e-300"), r"line 114: the frame time is 1e-300 s"),
+    "two numbers": (lambda t: t.replace("0.0 0.25 0.0", "0.0 0.25"), r"line 9: CHANNELS is no length"),
+    "no number": (lambda t: t.replace("0.0 0.25 0.0", "0.0 0.25 up"), r"line 8: UP is no length"),
+    "decimal commas": (lambda t: t.replace("0.0 0.25 0.0", "0,0 0,25 0,0"), r"line 8: 0,0 is no length"),
+    "a huge offset": (lambda t: t.replace("0.0 0.25 0.0", "0.0 -1e300 0.0"), r"line 8: -1E300 is no length.*1e\+08"),
+    "no offset": (lambda t: t.replace(_SPINE, ""), r"line 8: OFFSET should come here"),
+    "two offsets": (lambda t: t.replace(_SPINE, 2 * _SPINE), r"line 9: JOINT, End Site or } should come here"),
+    "channels twice": (lambda t: t.replace(_THREE, 2 * _THREE, 1), r"line 10: JOINT, End Site or } should come"),
+    "no channel": (lambda t: t.replace("6 Xposition", "6 Wposition"), r"line 5: CHANNELS is followed by.*xposition"),
+    "count of channels": (lambda t: t.replace("CHANNELS 6", "CHANNELS 7"), r"line 6: CHANNELS is followed by"),
+    "joint in an end": (lambda t: t.replace(_END, _END + "JOINT tip\n{\n}\n", 1), r"line \d+: } should come here"),
+    "no name": (lambda t: t.replace("ROOT Hips", "ROOT"), r"line 2: a joint has no name"),
+    "a name twice": (lambda t: t.replace("JOINT Neck", "JOINT Spine"), r"a second joint is called Spine"),
+    "two roots": (lambda t: t.replace("MOTION\n", "ROOT Other\n{\n}\nMOTION\n"), r"line 112: MOTION should come here"),
+    "cut": (lambda t: t[: t.index("MOTION")], r"ends where MOTION should come"),
+    "no frame time": (lambda t: t.replace("Frame Time: 0.033333333\n", ""), r"line 114: FRAME should come here"),
+    "milliseconds": (
+        lambda t: t.replace("Time: 0.033333333", "Time: 33.3"),
+        r"line 114: the frame time is 33.3; .*seconds",
+    ),
+    "negative time": (
+        lambda t: t.replace("Frame Time: 0.03", "Frame Time: -0.03"),
+        r"line 114: the frame time is -",
+    ),
+    "frames": (lambda t: t.replace("Frames: 24", "Frames: 25"), r"says Frames: 25, and has 24"),
+    "nan": (lambda t: t[: t.rindex(" ")] + " nan\n", r"line 138: nan is no length and no angle"),
+    "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line 138: a frame has 56 numbers where there should be 57"),
+    "long": (lambda t: t.rstrip() + " 3.0\n", r"line 138: a frame has 58 numbers where there should be 57"),
     "one line, a number less": (lambda t: " ".join(t.split()[:-1]), r"line 1: a frame has 1367 numbers.* 57"),
 }
 
@@ -300,60 +284,12 @@ def test_broken_keypoints_say_what_is_wrong(tmp_path, changes, message):
         load_motion(path)
 
 
-def _table(path, edit=lambda lines: lines):
-    time, rng = np.arange(5) / 50.0, np.random.default_rng(1)
-    positions = rng.normal(size=(5, 2, 3))
-    flags = rng.integers(0, 2, (5, 4))
-    headings = ["time", *(f"{joint}.{axis}" for joint in ("hip", "left.knee") for axis in "xyz")]
-    headings += [f"contact.{point}" for point in ("left_heel", "left_toe", "right_heel", "right_toe")]
-    rows = np.column_stack([time, positions.reshape(5, -1), flags])
-    lines = [",".join(headings), *(",".join(repr(float(x)) for x in row) for row in rows)]
-    path.write_text("\n".join(edit(lines)) + "\n")
-    return path, positions, flags
-
-
-def test_a_table_comes_back(tmp_path):
-    path, positions, flags = _table(tmp_path / "clip.csv")
-    motion = load_motion(path)
-    np.testing.assert_array_equal(motion.positions, positions)
-    np.testing.assert_array_equal(motion.contact, flags.astype(bool))
-    assert motion.fps == pytest.approx(50.0) and motion.joint_names == ("hip", "left.knee")
-
-
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (lambda t: [t[0].replace("hip.z", "hip.w"), *t[1:]], r"line 1: .*hip\.w, hip\.z"),
-        (lambda t: [t[0].replace("time", "seconds"), *t[1:]], "line 1: no column is called time"),
-        (lambda t: [*t[:3], t[3].replace(",", ";", 1), *t[4:]], "line 4: 10 values, but there are 11 headings"),
-        (lambda t: [*t[:3], t[3].rsplit(",", 1)[0] + ",yes", *t[4:]], "line 4, column contact.right_toe: 'yes'"),
-        (lambda t: [*t[:3], *t[4:]], "frame 2: the time steps by 0.04 s"),
-        (lambda t: t[:1], "a head with different names and at least one line of numbers"),
-        (lambda t: [], "a head with different names and at least one line of numbers"),
-        (lambda t: t[:2], "has one frame; it needs two"),
-        (lambda t: [line.replace(",", ";") for line in t], "line 2, column time;hip.x;"),
-        (lambda t: [*t[:3], '"' + t[3], *t[4:]], "line 4: 1 values, but there are 11 headings"),
-        (lambda t: [*t[:3], t[2], *t[4:]], "frame 2: the time steps by 0 s, elsewhere by 0.02 s"),
-    ],
-)
-def test_a_broken_table_says_which_line_and_column(tmp_path, edit, message):
-    path, _, _ = _table(tmp_path / "clip.csv", edit)
-    with pytest.raises(ValueError, match=message):
-        load_motion(path)
-
-
 def test_text_is_read_however_it_is_encoded(tmp_path):
     path = write_bvh(tmp_path / "clip.bvh", dancer())
     text, whole = path.read_text(), load_motion(path)
-    for content in (text.encode("utf-8-sig"), text.encode("utf-16"), text.replace("\n", "\r\n").encode()):
+    for content in (text.encode("utf-8-sig"), text.replace("\n", "\r\n").encode()):
         path.write_bytes(content)
         np.testing.assert_array_equal(load_motion(path).positions, whole.positions)
-    table, positions, _ = _table(tmp_path / "clip.csv")
-    table.write_bytes(table.read_text().encode("utf-8-sig"))
-    np.testing.assert_array_equal(load_motion(table).positions, positions)
-    table.write_bytes(table.read_text(encoding="utf-8-sig").encode("utf-16"))
-    with pytest.raises(ValueError, match=r"clip\.csv is no table in UTF-8: .*position 0"):
-        load_motion(table)
     (tmp_path / "folder.bvh").mkdir()
     with pytest.raises(FileNotFoundError, match=r"no such file: .*folder\.bvh"):
         load_motion(tmp_path / "folder.bvh")
@@ -369,7 +305,7 @@ def test_positions_in_millimetres_are_told(tmp_path):
 def test_files_that_are_not_there_and_options_that_do_not_go_with_them(tmp_path):
     with pytest.raises(FileNotFoundError):
         load_motion(tmp_path / "none.npz")
-    with pytest.raises(ValueError, match=r"none of \.bvh, \.npz, \.csv"):
+    with pytest.raises(ValueError, match=r"none of \.bvh, \.npz"):
         load_motion(tmp_path / "clip.fbx")
     with pytest.raises(FileNotFoundError, match="no such file: .*clips"):
         load_motion(tmp_path / "clips")
@@ -427,7 +363,6 @@ def test_a_rest_pose_before_the_motion_is_left_out(tmp_path, frames):
         motion = load_motion(path)
     np.testing.assert_allclose(motion.positions, alone.positions, atol=1e-14)
     np.testing.assert_allclose(known(motion.rotations), known(alone.rotations), atol=1e-14)
-    assert load_motion(path, trim=False).frames == 24 + frames
 
 
 def test_a_motion_that_begins_in_the_rest_pose_keeps_all_frames(tmp_path):

@@ -1,8 +1,7 @@
-"""Files of other programs, made here: poses of SMPL as AMASS has them, and tables that a spreadsheet saved."""
+"""Files of other programs, made here: poses of SMPL as AMASS has them, and a robot's table from a spreadsheet."""
 
 import numpy as np
 import pytest
-from motion_files import dancer
 from scipy.spatial.transform import Rotation
 
 from osik_jax.retargeting import RobotMotion, load_motion
@@ -91,33 +90,8 @@ def test_broken_poses_are_told(tmp_path, change, message):
         load_motion(tmp_path / "broken.npz")
 
 
-def as_saved_by_a_spreadsheet(lines):
-    """All lines with as many cells as the longest: empty lines are commas, also after the last."""
-    width = max(line.count(",") for line in lines)
-    return [line + "," * (width - line.count(",")) for line in [*lines, ""]]
-
-
-def test_tables_that_a_spreadsheet_saved(tmp_path):
-    file, figure = tmp_path / "take.csv", dancer(6)
-    lines = keypoint_table(figure)
-    file.write_text("\n".join(lines) + "\n")
-    motion = load_motion(file)
-    saved = as_saved_by_a_spreadsheet([*lines, ",,"])
-    assert any(line and not line.strip(",") for line in saved)
-    file.write_text("\r\n".join(saved) + "\r\n", encoding="utf-8-sig")
-    again = load_motion(file)
-    assert again.joint_names == motion.joint_names and again.fps == motion.fps
-    np.testing.assert_array_equal(again.positions, motion.positions)
+def test_a_robots_table_that_a_spreadsheet_saved(tmp_path):
+    file = tmp_path / "take.csv"
     robot = ["0,0,1,0,0,0,1,0.5", "0,0,1,0,0,0,1,0.6"]
     file.write_text("\r\n".join([*robot, ",,,,,,,"]) + "\r\n", encoding="utf-8-sig")
     np.testing.assert_array_equal(RobotMotion.load(file, joint_names=("knee",), fps=30.0).qpos[:, 7], [0.5, 0.6])
-
-
-def keypoint_table(figure):
-    """The lines of a table of keypoints."""
-    positions, _ = figure.forward()
-    headings = ["time", *(f"{name}.{axis}" for name, _, _ in figure.joints for axis in "xyz"), "", ""]
-    rows = np.column_stack(
-        [np.arange(len(positions)) / figure.fps, positions[..., [2, 0, 1]].reshape(len(positions), -1)]
-    )
-    return [",".join(headings), *(",".join(map(repr, row.tolist())) for row in rows)]

@@ -7,7 +7,7 @@ from motion_files import bent_forward, dancer, seen, write_bvh
 from scipy.spatial.transform import Rotation
 
 from osik_jax.retargeting import HumanMotion, Retargeter, _person, load_motion, report
-from osik_jax.retargeting._notes import notes
+from osik_jax.retargeting._report import notes
 
 FRAMES = 32
 
