@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from .._errors import OsikValueError
 from ..robot import Robot
-from ..robot.loading._meshes import unread_points
-from ..robot.loading._urdf_meshes import thickened
+from ..robot.loading._meshes import thickened, unread_points
 from ._geometry import qhull, round_polyhedron
 from ._table import ShapeKind, ShapeTable
 
@@ -77,12 +76,22 @@ def geom_shape(robot: Robot, number: int) -> ConvexShape:
     """
     leaves = robot.geom_size, robot.geom_position, robot.geom_rotation
     size, position, rotation = (np.asarray(leaf, float)[number] for leaf in leaves)
-    model, kind = robot.mj_model, robot.tree.geom_types[number]
+    kind = robot.tree.geom_types[number]
     if kind != mujoco.mjtGeom.mjGEOM_MESH:
         return _simple(kind, size, position, rotation)
+    return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, geom_hull(robot, number) * size)
+
+
+def geom_hull(robot: Robot, number: int) -> Float[np.ndarray, "v 3"]:
+    """Return the corners of the convex hull of a robot's mesh geom [m], in the geom's axes.
+
+    Raises:
+        FileNotFoundError, ValueError: the file of the mesh cannot be read.
+    """
+    model = robot.mj_model
     unread = number >= model.ngeom
     points = unread_points(robot.holder.meshes[number - model.ngeom]) if unread else _model_points(model, number)
-    return ConvexShape(ShapeKind.HULL, np.zeros(3), position, rotation, hull_vertices(points) * size)
+    return hull_vertices(points)
 
 
 def model_shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> ConvexShape:

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from .._errors import OsikError, OsikValueError, warn
 from ..robot import Robot
-from ..robot.loading._meshes import unread_points
-from ..robot.loading._urdf_meshes import thickened
-from ._geometry import Kind, UnitCore, convex_hull, mesh_hull
+from ._convex import geom_hull
+from ._geometry import Kind, UnitCore, convex_hull
 from ._pairs import Member
 from ._shape import CollisionShape
 
@@ -31,7 +30,8 @@ def read_hulls(
     lost: dict[int, str] = {}
     for k in sorted({k for pair in pairs for k in pair if scene[k].kind is Kind.HULL}):
         try:
-            hulls[k] = _hull(robot, k, shapes.get(scene[k].name))
+            own = shapes[scene[k].name].hull if scene[k].added else None
+            hulls[k] = convex_hull(geom_hull(robot, k)) if own is None else own
         except (OSError, OsikError) as error:
             lost[k] = f"{scene[k].label}: {error}"
     kept = [pair for pair in pairs if not lost.keys() & set(pair)]
@@ -43,17 +43,3 @@ def read_hulls(
             f"{'; '.join(lost.values())}. Name folders of packages in package_dirs, or add shapes for these links"
         )
     return hulls, kept
-
-
-def _hull(robot: Robot, number: int, shape: CollisionShape | None) -> UnitCore:
-    """Return the hull of an added shape, or of one of the robot's geoms."""
-    if shape is not None and shape.hull is not None:
-        return shape.hull
-    model = robot.mj_model
-    if number < model.ngeom:
-        return mesh_hull(model, number)
-    points = unread_points(robot.holder.meshes[number - model.ngeom])
-    try:
-        return convex_hull(points)
-    except OsikValueError:  # flat
-        return convex_hull(thickened(points))

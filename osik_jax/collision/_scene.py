@@ -120,9 +120,6 @@ class Scene(eqx.Module):
         Raises:
             FileNotFoundError: no such file.
             ValueError: a file of another kind, or broken, or more shapes than the capacity.
-
-        Warns:
-            OsikWarning: a mesh of a URDF is flat, or cannot be read.
         """
         from ._scene_files import read_scene  # readers that few programs need
 

@@ -13,6 +13,7 @@ from urdfs import INERTIAL
 
 import osik_jax as osik
 from osik_jax import Robot
+from osik_jax.collision import robot_shapes
 
 ARM = """<mujoco>{head}<worldbody>
   <body name="first"><joint name="a" axis="0 1 0" range="-90 90" {a}/><geom name="one" size=".1" {geom}/>
@@ -293,43 +294,33 @@ TETRA = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1
 TEXT_STL = "solid x\nfacet normal 0 0 1\nouter loop\n{}endloop\nendfacet\nendsolid\n"
 
 
-@pytest.mark.parametrize(
-    "text", [TEXT_STL.format("vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"), TEXT_STL.format(""), "solid facet 1 a"]
-)
-def test_text_files_without_a_body_do_not_stop_the_robot(tmp_path: Path, text: str):
-    """A single triangle, and nothing at all; MuJoCo does not read such files, so this package does."""
-    (tmp_path / "flat.stl").write_text(text)
-    shape = '<collision><geometry><mesh filename="flat.stl"/></geometry></collision>'
-    path = tmp_path / "robot.urdf"
-    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shape}'))
-    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
-    assert robot.tree.geom_types == () and notes(robot) == {("collision mesh", "l1")}
-    assert "flat.stl is left out: nothing in it has a surface" in told[0]
+def with_mesh(folder: Path, file: str, scale: str = "1 1 1") -> Robot:
+    """A robot whose first link has a collision mesh."""
+    mesh = f'<collision><geometry><mesh filename="{file}" scale="{scale}"/></geometry></collision>'
+    path = folder / "robot.urdf"
+    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{mesh}'))
+    return Robot.from_urdf(path, floating_base=False)
 
 
 @pytest.mark.parametrize(
-    ("mesh", "scale", "count", "message"),
-    [
-        (PLATE, "1 1 1", 2, "plate file.obj is flat, and 1 mm thick here"),
-        (TETRA, "1 0 1", 2, "plate file.obj is flat, and 1 mm thick here"),
-        (LINE, "1 1 1", 1, "plate file.obj is left out"),
-        (TETRA, "2 2 2", 2, None),
-    ],
+    "text",
+    [TEXT_STL.format("vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"), TEXT_STL.format(""), "solid facet 1 a", LINE],
 )
-def test_flat_meshes_do_not_stop_the_robot(tmp_path: Path, mesh: str, scale: str, count: int, message: str | None):
-    """One of two meshes is flat; the other stays as it is. The address is written with %20."""
+def test_meshes_without_a_body_do_not_stop_the_robot(tmp_path: Path, text: str):
+    """A single triangle, nothing at all, and a line; MuJoCo does not read such STL files, so this package does."""
+    name = "flat.obj" if text == LINE else "flat.stl"
+    (tmp_path / name).write_text(text)
+    robot = with_mesh(tmp_path, name)
+    message = "area is too small" if text == LINE else f"{name}: nothing in it has a surface"
+    refuses(ValueError, f"the collision mesh of l1.*{message}", robot_shapes, robot)
+
+
+@pytest.mark.parametrize(("mesh", "scale"), [(PLATE, "1 1 1"), (TETRA, "1 0 1"), (TETRA, "2 2 2")])
+def test_flat_meshes_are_thickened(tmp_path: Path, mesh: str, scale: str):
+    """A flat mesh gets 1 mm, another one stays as it is. The address is written with %20."""
     (tmp_path / "plate file.obj").write_text(mesh)
-    (tmp_path / "whole.obj").write_text(TETRA)
-    shape = '<collision><geometry><mesh filename="{}" scale="{}"/></geometry></collision>'
-    shapes = shape.format("plate%20file.obj", scale) + shape.format("whole.obj", "1")
-    path = tmp_path / "robot.urdf"
-    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shapes}'))
-    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
-    assert len(robot.tree.geom_types) == count
-    assert notes(robot) == ({("collision mesh", "l1")} if message else set())
-    assert not message or (message in told[0] and "'l1'" in told[0])
-    model = robot.mj_model
-    spans = [
-        np.ptp(model.mesh_vert[at : at + n], 0) for at, n in zip(model.mesh_vertadr, model.mesh_vertnum, strict=True)
-    ]
-    assert len(spans) == count and min(spans[0]) >= (0.9e-3 if message else 0.05)
+    robot = with_mesh(tmp_path, "plate%20file.obj", scale=scale)
+    table = robot_shapes(robot).table
+    (row,) = np.flatnonzero(table.count)
+    spans = np.ptp(table.vertices[table.first[row] :][: table.count[row]], axis=0)
+    assert min(spans) == pytest.approx(0.2 if scale == "2 2 2" else 1e-3, rel=1e-5)
