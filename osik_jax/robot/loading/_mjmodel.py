@@ -132,7 +132,7 @@ def from_mjmodel(
     _warn_of_frozen(tree, lower, upper, ranges)
     home = model.key_qpos[0] if model.nkey else model.qpos0
     q0 = inside(home, tree, lower, upper)
-    found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names, low, high, speeds)]
+    found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names)]
     if model.nkey and not options.has_home:
         found += home_notes(tree, keyframe_names(model)[0], home, q0)
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
