@@ -14,7 +14,7 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._made_for import check_robot
-from ..robot._plausible import first_of
+from ..robot._ranges import first_of
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
 from ._convex import ConvexShape, geom_shape, shape_table

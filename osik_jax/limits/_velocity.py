@@ -12,7 +12,7 @@ from .._errors import OsikValueError
 from ..numerics._arguments import concrete, entries
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
-from ..robot._plausible import warn_of_fast_joints
+from ..robot._ranges import warn_of_fast_joints
 from ._box import Kind, Limit
 
 

@@ -19,7 +19,7 @@ from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._model import RobotModel
-from ._plausible import warn_of_far_joints
+from ._ranges import warn_of_far_joints
 from ._replace import Factors, replaced_leaves, scaled_leaves
 from .loading import LoadOptions, LockedJoints, PositionLimits
 

@@ -15,7 +15,7 @@ from ...numerics._host import to_jax
 from .._load_report import LoadNote, LoadReport
 from .._look import UnreadLook
 from .._model import RobotModel
-from .._plausible import first_of, warn_of_fast_joints
+from .._ranges import first_of, inside, warn_of_fast_joints
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
@@ -27,7 +27,7 @@ from ._followers import (
     qpos_offset,
     resolve_followers,
 )
-from ._keyframes import home_notes, inside, keyframe_names
+from ._keyframes import home_notes, keyframe_names
 from ._model_notes import model_notes
 from ._options import LoadOptions, PositionLimits
 from ._robots import robot_trees
@@ -130,11 +130,10 @@ def from_mjmodel(
     accelerations = _rates(model, names, ACCELERATION_LIMIT_PREFIX, "acceleration", {})
     lower, upper = _position_limits(tree, followers, low, high)
     _warn_of_frozen(tree, lower, upper, ranges)
-    home = model.key_qpos[0] if model.nkey else model.qpos0
-    q0 = inside(home, tree, lower, upper)
+    home = (model.key_qpos[0] if model.nkey else model.qpos0)[tree.own_qpos]
     found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names)]
     if model.nkey and not options.has_home:
-        found += home_notes(tree, keyframe_names(model)[0], home, q0)
+        found += home_notes(tree, keyframe_names(model)[0], home, lower, upper)
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
     _warn_of_report(report)
     arrays = dict(
@@ -151,7 +150,7 @@ def from_mjmodel(
         position_upper=upper,
         velocity_limit=_rate_limits(tree, followers, speeds),
         acceleration_limit=_rate_limits(tree, followers, accelerations),
-        q0=q0,
+        q0=inside(tree, home, lower, upper),
     )
     holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look, path)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
