@@ -12,7 +12,7 @@ from .._errors import OsikKeyError, OsikValueError
 from .._whole_file import write_text
 from ..numerics._columns import read_columns
 from ..robot import Robot
-from ..robot.loading._mjmodel import rotation_matrix
+from ..robot.loading._poses import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
 from ._residuals import Combination, Residuals, root_mean_square
 from ._setup import FixedFrame

@@ -13,11 +13,11 @@ from .._errors import OsikValueError
 from ..robot.loading._meshes import unread_points
 from ..robot.loading._mjmodel import element_names
 from ..robot.loading._packages import Packages
+from ..robot.loading._poses import Pose
 from ..robot.loading._source import Source, check_root, parse_xml, read_source
 from ..robot.loading._urdf import unread_meshes, urdf_spec
-from ..robot.loading._urdf_elements import Pose, read_urdf
-from ._convex import ConvexShape, hull_vertices, model_shape
-from ._table import ShapeKind
+from ..robot.loading._urdf_elements import read_urdf
+from ._convex import ConvexShape, ShapeKind, hull_vertices, model_shape
 
 Objects = dict[str, list[ConvexShape]]
 

@@ -22,7 +22,7 @@ import osik_jax as osik
 from osik_jax import cli
 from osik_jax.execution import _backends
 from osik_jax.kinematics import forward_kinematics
-from osik_jax.kinematics._home import home_kinematics
+from osik_jax.kinematics._forward import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,

@@ -19,7 +19,7 @@ from urdfs import LIMIT, joint, link
 
 import osik_jax as osik
 from osik_jax import cli
-from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._guesses import guess_feet
 
 
 def chain(*links: str, limits: tuple[str, ...] = ()) -> str:

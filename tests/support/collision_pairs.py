@@ -8,7 +8,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax.robot.loading._meshes import unread_points
-from osik_jax.robot.loading._mjmodel import quaternion
+from osik_jax.robot.loading._poses import quaternion
 
 
 def named(limit: osik.CollisionAvoidanceLimit) -> set[frozenset[str]]:

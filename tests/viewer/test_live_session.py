@@ -13,7 +13,7 @@ from small_files import files_of_at_most
 
 import osik_jax as osik
 from osik_jax.control import _checks
-from osik_jax.robot._hands import find_hands
+from osik_jax.robot._guesses import find_hands
 from osik_jax.viewer import load_session
 from osik_jax.viewer.live._desk import Desk
 from osik_jax.viewer.live._open import default_session

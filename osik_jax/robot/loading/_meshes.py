@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 from ..._errors import OsikValueError
 from .._tree import UnreadMesh
 from ._collada import Triangles, read_collada
-from ._mjmodel import rotation_matrix
 from ._packages import Packages
+from ._poses import rotation_matrix
 
 _SUFFIXES = (".dae", ".stl", ".obj", ".msh")
 _THICKNESS = 1e-3

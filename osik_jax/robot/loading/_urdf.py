@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError, warn
-from .._feet import find_feet
+from .._guesses import find_feet
 from .._load_report import LoadNote
 from .._look import UnreadLook
 from .._model import RobotModel
@@ -27,13 +27,13 @@ from ._mjmodel import (
     NamedMesh,
     free_name,
     from_mjmodel,
-    quaternion,
 )
+from ._notes import urdf_notes
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
+from ._poses import IDENTITY, Pose, quaternion
 from ._source import check_root, parse_xml, read_source
-from ._urdf_elements import IDENTITY, Joint, Link, Pose, Urdf, read_urdf
-from ._urdf_notes import urdf_notes
+from ._urdf_elements import Joint, Link, Urdf, read_urdf
 
 WORLD = "world"
 FLOATING_BASE = "floating_base"

@@ -7,31 +7,18 @@ import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError, unknown_name
 from .._load_report import LoadNote
-from ._mjmodel import rotation_matrix
+from ._poses import IDENTITY, Pose, rotation_matrix
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
 SCALAR = ("revolute", "continuous", "prismatic")
 _Color = tuple[float, ...]
-
-
-class Pose(NamedTuple):
-    """Position (3,) [m] and rotation (3, 3) of a frame in another."""
-
-    position: np.ndarray
-    rotation: np.ndarray
-
-    def __matmul__(self, other: Pose) -> Pose:
-        return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
-
-
-IDENTITY = Pose(np.zeros(3), np.eye(3))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -23,11 +23,9 @@ from ._mjmodel import (
     VELOCITY_LIMIT_PREFIX,
     element_names,
     free_name,
-    quaternion,
-    rotation_matrix,
 )
+from ._poses import IDENTITY, Pose, quaternion, rotation_matrix
 from ._robots import ROBOT_ROOTS
-from ._urdf_elements import IDENTITY, Pose
 
 _TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
 _SHAPES = {

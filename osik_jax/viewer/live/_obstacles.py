@@ -12,10 +12,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...collision._convex import ConvexShape, table_shapes
+from ...collision._convex import ConvexShape, ShapeKind, table_shapes
 from ...collision._core import core_scene, gaps_at
 from ...collision._geometry import Kind
-from ...collision._table import ShapeKind
 from ...limits import CollisionAvoidanceLimit, Limit
 from .._parts import Part
 

@@ -16,7 +16,7 @@ from ...kinematics import forward_kinematics
 from ...limits import Limit
 from ...reachability import load_map
 from ...robot import Robot
-from ...robot._hands import find_hands
+from ...robot._guesses import find_hands
 from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
