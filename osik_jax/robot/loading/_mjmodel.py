@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -22,6 +22,7 @@ from ._followers import (
     as_mapping,
     asked_locks,
     equality_followers,
+    free_name,
     match_joints,
     number,
     qpos_offset,
@@ -167,13 +168,6 @@ def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "equalit
     count = dict(body=model.nbody, joint=model.njnt, equality=model.neq)[kind]
     given = [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) for k in range(count)]
     return tuple(name or free_name(f"{kind}{k}", given) for k, name in enumerate(given))
-
-
-def free_name(name: str, taken: Collection[str | None]) -> str:
-    """Return the name, followed by as many underscores as make it differ from those taken."""
-    while name in taken:
-        name += "_"
-    return name
 
 
 def equality_end_sites(model: mujoco.MjModel) -> set[int]:

@@ -18,6 +18,7 @@ from .._load_report import LoadNote
 from .._look import UnreadLook
 from .._model import RobotModel
 from .._tree import UnreadMesh
+from ._followers import free_name
 from ._look import GEOMS, geom_size, read_look
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
@@ -25,7 +26,6 @@ from ._mjmodel import (
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
     NamedMesh,
-    free_name,
     from_mjmodel,
 )
 from ._notes import urdf_notes
