@@ -29,7 +29,6 @@ LIMITS: dict[str, Any] = {
 }
 """Published limits of Franka's Panda."""
 _ALL = np.stack(list(LIMITS.values()))
-FRAME = "hand"
 _SLOW = 0.99
 """A speed below this share of the wanted one is too slow."""
 _ROW = 0.1
@@ -206,7 +205,7 @@ def own_speeds(robot: osik.Robot, motion: Followed, piece: int, site: int) -> tu
 
 def judge(robot: osik.Robot, motion: Followed, wanted: float) -> str:
     """Return the shares of the path with the wanted speed, beside the shares that the limits allow."""
-    site = mujoco.mj_name2id(robot.mj_model, mujoco.mjtObj.mjOBJ_SITE, FRAME)
+    site = mujoco.mj_name2id(robot.mj_model, mujoco.mjtObj.mjOBJ_SITE, motion.frame)
     splines = [(np.asarray(one.path.knots), np.asarray(one.path.coefficients)) for one in motion.timings]
     even, largest = largest_speeds([tool_way(robot, *spline, site) for spline in splines], wanted)
     own = np.array([np.interp(x, *own_speeds(robot, motion, i, site)) for i, x in enumerate(even)])
@@ -222,13 +221,14 @@ def judge(robot: osik.Robot, motion: Followed, wanted: float) -> str:
 def follow_raster(speed: float, cells: int | None) -> None:
     """Print how well a Panda follows the raster at a wanted speed."""
     arm = osik.load_robot("arm7")
-    motion = follow(arm, {FRAME: raster()}, speed=speed, cells=cells, **LIMITS)
+    motion = follow(arm, {"hand": raster()}, speed=speed, cells=cells, **LIMITS)
     times = np.arange(0.0, motion.duration, 1e-3)
     used = [float((np.abs(a) / limit).max()) for a, limit in zip(motion.at(times)[1:], LIMITS.values(), strict=True)]
+    slow = sum(part.end - part.start for part in motion.slow_parts())
     print(
         f"{speed} m/s: {motion.duration:.2f} s, {1e3 * motion.position_error:.1g} mm and "
         f"{np.degrees(motion.orientation_error):.1g} deg off; speed, acceleration, jerk by their limits "
-        f"{used[0]:.4f} {used[1]:.4f} {used[2]:.4f}; {judge(arm, motion, speed)}"
+        f"{used[0]:.4f} {used[1]:.4f} {used[2]:.4f}; slower than wanted for {slow:.2f} s; {judge(arm, motion, speed)}"
     )
 
 

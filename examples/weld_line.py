@@ -32,6 +32,8 @@ print(f"{motion.duration:.2f} s, {1e3 * motion.position_error:.4f} mm off its se
 print(
     f"at {wanted} m/s for {100 * at_speed:.0f} % of the time; joints up to {np.abs(sampled.velocity).max():.2f} rad/s"
 )
+for part in motion.slow_parts():
+    print(f"slower from {part.start:.2f} to {part.end:.2f} s: {part.limit} of {part.joint}")
 viewer.hero_picture(
     "weld_line.png",
     arm,

@@ -60,4 +60,6 @@ class Follow(InScene):
             f"{found.duration:.3f} s, at most {1e3 * found.position_error:.2g} mm and "
             f"{found.orientation_error:.2g} rad off the path; written to {self.out}"
         )
+        for part in found.slow_parts() if self.speed is not None else ():
+            print(f"slower from {part.start:.2f} to {part.end:.2f} s: {part.joint} is near its limit of {part.limit}")
         return 0

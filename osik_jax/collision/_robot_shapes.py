@@ -17,8 +17,8 @@ from ..robot._made_for import check_robot
 from ..robot._ranges import first_of
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
+from ._convex import ConvexShape, RobotShapes, geom_shape, shape_table
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
-from ._table import ConvexShape, RobotShapes, geom_shape, shape_table
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None

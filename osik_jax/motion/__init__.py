@@ -10,4 +10,5 @@ from ._motion import Motion as Motion
 from ._motion import load_motion as load_motion
 from ._pose_filter import PoseFilter as PoseFilter
 from ._retime import retime as retime
+from ._timing import SlowPart as SlowPart
 from ._timing import Timing as Timing

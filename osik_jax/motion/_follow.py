@@ -24,8 +24,8 @@ from ._joint_path import Free, PathSearch
 from ._motion import Motion, sample_times
 from ._obstacles import Obstacles, spline_curves
 from ._pose_path import Poses, corners, interpolated, lengths, read_poses
-from ._retime import Limit, checked_limits, checked_speed, resampled, retimed_pieces
-from ._timing import Timing, sampled
+from ._retime import Limit, checked_limits, checked_speed, frame_speeds, resampled, retimed_pieces
+from ._timing import SlowPart, Timing, sampled
 
 _PARTS = 32, 1024
 """Fewest and most parts of each piece of the path, between two corners."""
@@ -41,6 +41,7 @@ class Followed(NamedTuple):
         position_error: largest distance of a frame from the smooth curve through its poses, between samples too [m].
         orientation_error: largest angle from it [rad].
         robot: the robot.
+        frame: the first frame, whose speed is wanted.
     """
 
     timings: list[Timing]
@@ -48,6 +49,7 @@ class Followed(NamedTuple):
     position_error: float
     orientation_error: float
     robot: Robot
+    frame: str
 
     @property
     def duration(self) -> float:
@@ -68,6 +70,20 @@ class Followed(NamedTuple):
         time = sample_times(self.duration, dt)
         q, v, a, _ = self.at(time)
         return Motion(*map(jnp.asarray, (time, q, v, a)), joints=tuple(dof_names(self.robot)))
+
+    def slow_parts(self, dt: float = 0.005) -> list[SlowPart]:
+        """Return where the first frame is slower than wanted by 1 %, and the joint and limit that are nearest there.
+
+        Args:
+            dt: time between the samples that are looked at [s].
+        """
+        found = []
+        for start, timing in zip(self.starts, self.timings, strict=False):
+            time = np.arange(0.0, float(timing.duration), dt)
+            q, v = sampled(timing, time)[:2]
+            parts = timing.slow_parts(frame_speeds(self.robot, self.frame, q, v), time)
+            found += [part._replace(start=part.start + start, end=part.end + start) for part in parts]
+        return found
 
 
 def follow(
@@ -114,7 +130,7 @@ def follow(
             equal times; a slow, long piece needs more to reach the wanted speed as soon as joints allow.
 
     Returns:
-        The motion: ``at(time)``, ``sample(dt)``.
+        The motion: ``at(time)``, ``sample(dt)``, ``slow_parts()``.
 
     Raises:
         KeyError: no such frame or joint.
@@ -134,11 +150,12 @@ def follow(
     obstacles = None if scene is None else Obstacles.read(robot, scene, clearance, srdf, "follow with a scene")
     search = PathSearch(robot, free, lower, upper, start, key, obstacles)
     path, errors = _within_tolerance(search, read, along, (position_tolerance, orientation_tolerance))
-    timings = retimed_pieces(path, limits, robot, wanted, next(iter(read)), cells)
+    frame = next(iter(read))
+    timings = retimed_pieces(path, limits, robot, wanted, frame, cells)
     if obstacles is not None:
         _check_clear(robot, obstacles, timings)
     starts = np.append(0.0, np.cumsum([float(one.duration) for one in timings]))
-    return Followed(timings, starts, *errors, robot)
+    return Followed(timings, starts, *errors, robot, frame)
 
 
 def _check_clear(robot: Robot, obstacles: Obstacles, timings: list[Timing]) -> None:

@@ -84,7 +84,7 @@ def retime(
     smooth = jerk is not None
     path, progress, stretch, duration = _retimed(given, limits, robot, wanted, frame=frame, count=count, smooth=smooth)
     joints = () if robot is None else tuple(dof_names(robot))
-    return Timing(duration, path, progress, limits, stretch, joints)
+    return Timing(duration, path, progress, limits, stretch, wanted, joints)
 
 
 def _count(points: Array | np.ndarray) -> int:
@@ -109,7 +109,7 @@ def retimed_pieces(
     timings = []
     for i in range(len(pieces)):
         duration, path, progress, stretch = jax.tree.map(lambda a, i=i: jnp.asarray(a[i]), found)
-        timings.append(Timing(duration, path, progress, limits, stretch, joints))
+        timings.append(Timing(duration, path, progress, limits, stretch, wanted, joints))
     return timings
 
 
@@ -308,3 +308,18 @@ def _largest_ratio(
         sides = 6.0 * path.coefficients[:-1, 3], 6.0 * path.coefficients[1:, 3]
         inside = jnp.maximum(inside, ratio(progress.through(path.knots[1:-1]), sides))
     return jnp.maximum(inside, 1.0)
+
+
+@partial(jax.jit, static_argnames="frame")
+@full_precision
+def _frame_speeds(robot: Robot, q: Float[Array, "T n"], v: Float[Array, "T n"], *, frame: str) -> Float[Array, " T"]:
+    move = jax.vmap(lambda q, v: jax.jvp(lambda q: _origin(robot, q, frame), (q,), (v,))[1])(q, v)
+    return jnp.linalg.norm(move, axis=1)
+
+
+def frame_speeds(robot: Robot, frame: str, q: np.ndarray, v: np.ndarray) -> Float[np.ndarray, " T"]:
+    """Return the speeds of a frame's origin [m/s]; few lengths are compiled."""
+    count = len(q)
+    more = ((0, (1 << (count - 1).bit_length()) - count), (0, 0))
+    q, v = np.pad(q, more, mode="edge"), np.pad(v, more, mode="edge")
+    return np.asarray(_frame_speeds(robot, jnp.asarray(q), jnp.asarray(v), frame=frame))[:count]

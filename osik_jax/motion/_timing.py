@@ -2,16 +2,38 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._errors import OsikValueError
 from ..numerics._dense import full_precision
 from ._cells import Cells
 from ._motion import Motion, at_rest_outside, sample_times
 from ._spline import Spline
+
+_KINDS = "speed", "acceleration", "jerk"
+
+
+class SlowPart(NamedTuple):
+    """Part of a motion on which the tool is slower than wanted.
+
+    Attributes:
+        start, end: times [s].
+        slowest: least speed of the tool there [m/s].
+        joint: name or number of the joint that is nearest to a limit there, on average.
+        limit: "speed", "acceleration" or "jerk".
+    """
+
+    start: float
+    end: float
+    slowest: float
+    joint: str
+    limit: str
 
 
 class Timing(eqx.Module):
@@ -23,6 +45,7 @@ class Timing(eqx.Module):
         progress: s as a function of time.
         limits: of speed, acceleration and jerk, infinite where there is none. (3, n)
         stretch: factor by which times were multiplied to keep limits between the grid's points too.
+        wanted: wanted speed of the tool [m/s], None without one.
         joints: names of the joints (static).
     """
 
@@ -31,6 +54,7 @@ class Timing(eqx.Module):
     progress: Cells
     limits: Float[Array, "3 n"]
     stretch: Float[Array, ""]
+    wanted: Float[Array, ""] | None = None
     joints: tuple[str, ...] = eqx.field(default=(), static=True)
 
     def at(self, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
@@ -42,6 +66,25 @@ class Timing(eqx.Module):
         time = sample_times(float(self.duration), dt)
         q, v, a, _ = sampled(self, time)
         return Motion(*map(jnp.asarray, (time, q, v, a)), joints=self.joints)
+
+    def slow_parts(self, tool_speed: Float[np.ndarray, " T"], time: Float[np.ndarray, " T"]) -> list[SlowPart]:
+        """Return where the tool is slower than wanted by 1 %, and the limit that is nearest there.
+
+        Args:
+            tool_speed: of the tool [m/s].
+            time: of those speeds [s].
+        """
+        if self.wanted is None:
+            raise OsikValueError("no speed was wanted: give retime(..., speed=) or follow(..., speed=)")
+        slow = np.append(tool_speed < 0.99 * float(self.wanted), False)
+        ends = np.flatnonzero(np.diff(np.append(False, slow).astype(int)))
+        used = np.abs(sampled(self, time)[1:]) / np.asarray(self.limits)[:, None]
+        return [self._slow_part(used[:, a:b], tool_speed[a:b], time[a:b]) for a, b in ends.reshape(-1, 2)]
+
+    def _slow_part(self, used: np.ndarray, speed: np.ndarray, time: np.ndarray) -> SlowPart:
+        kind, joint = np.unravel_index(int(used.mean(axis=1).argmax()), used.shape[::2])
+        name = self.joints[joint] if self.joints else str(joint)
+        return SlowPart(float(time[0]), float(time[-1]), float(speed.min()), name, _KINDS[int(kind)])
 
 
 def by_progress(states: Float[Array, "4 T n"], progress: Float[Array, "4 T"]) -> Float[Array, "4 T n"]:

@@ -84,6 +84,8 @@ def test_the_wanted_speed_is_kept_on_rows(followed) -> None:
     place, _ = placed(followed.at(np.arange(0.0, followed.duration, 1e-3))[0])
     speed = np.linalg.norm(np.diff(place, axis=0), axis=1) / 1e-3
     assert speed.max() <= 0.3001 and (speed > 0.297).mean() > 0.6
+    slow = followed.slow_parts()
+    assert slow and all(part.limit in ("speed", "acceleration", "jerk") for part in slow)
 
 
 @pytest.mark.slow

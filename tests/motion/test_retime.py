@@ -176,6 +176,9 @@ def test_a_wanted_speed_is_kept_where_joints_allow() -> None:
     place = jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(arm, "hand")[0])(jnp.asarray(q))
     speed = np.linalg.norm(np.diff(np.asarray(place), axis=0), axis=1) / time[1]
     assert speed.max() <= 0.2001 and (speed > 0.199).mean() > 0.8
+    parts = timing.slow_parts(speed, time[:-1])
+    assert len(parts) == 2 and {part.limit for part in parts} == {"acceleration"}  # at both ends
+    assert parts[0].joint in timing.joints and parts[0].slowest < 0.05
 
 
 @pytest.mark.parametrize(
