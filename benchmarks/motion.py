@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from benchmarks.raster import LIMITS
-from osik_jax.motion import PoseFilter, chunk, retime
+from osik_jax.motion import PoseFilter, Stream, retime
 
 ROBOTS = {
     "Panda": (LIMITS["velocity"], LIMITS["acceleration"]),
@@ -104,30 +104,29 @@ def chunk_stream(step: float, streams: int = 10) -> None:
     """
     arm, latency = osik.load_robot("arm7"), 0.1
     limits: dict[str, Any] = {"velocity": 1.5, "acceleration": 4.0, "jerk": 40.0}
-    plan = jax.jit(lambda points, times, start, begin: chunk(arm, points, times, start=start, begin=begin, **limits))
-    rng, used, joins, kept, took = np.random.default_rng(0), np.zeros(4), 0.0, [], []
+    push, rng = jax.jit(Stream.push), np.random.default_rng(0)
+    used, joins, kept, took = np.zeros(4), 0.0, [], []
     for _ in range(streams):
-        begin, running = 0.0, chunk(arm, np.tile(arm.q0, (30, 1)), np.linspace(-1.0, 0.0, 30), **limits)
+        begin, stream = 0.0, Stream(arm, arm.q0, latency=latency, waypoints=30, **limits)
         for _ in range(4):
-            start = running.state(begin)
-            points = np.asarray(start[0]) + np.cumsum(step * rng.normal(size=(30, arm.nv)), axis=0)
-            given = points, begin - latency + np.linspace(0.0, 1.0, 30), start, begin
-            after = plan(*given)
-            took.append([_seconds(lambda given=given: jax.block_until_ready(plan(*given)), clock) for clock in _CLOCKS])
-            kept.append(bool(after.feasible.all()))
-            before, running = running, after if kept[-1] else running
-            q, *rates = np.asarray(running.at(np.linspace(begin, float(running.end), 1001)))
+            start = np.asarray(stream.at(np.array([begin])))[0, 0]
+            points = start + np.cumsum(step * rng.normal(size=(30, arm.nv)), axis=0)
+            given = stream, points, begin - latency + np.linspace(0.0, 1.0, 30), begin - latency
+            stream = push(*given)
+            took.append([_seconds(lambda given=given: jax.block_until_ready(push(*given)), clock) for clock in _CLOCKS])
+            kept.append(bool(stream.taken))
+            q, *rates = np.asarray(stream.at(np.linspace(begin, float(stream.after.end), 1001)))
             past = np.maximum(q - arm.position_upper, arm.position_lower - q).max()
             used = np.maximum(used, [past, *(np.abs(a).max() / b for a, b in zip(rates, limits.values(), strict=True))])
             if kept[-1]:
-                pairs = zip(before.state(begin), running.state(begin), strict=True)
+                pairs = zip(stream.running.state(begin), stream.after.state(begin), strict=True)
                 joins = max(joins, *(float(np.abs(a - b).max()) for a, b in pairs))
             begin += 0.4 + 0.3 * rng.random()
     medians = 1e3 * np.median(took, axis=0)
     print(
         f"steps of {step} rad: joins {joins:.1g}, past a range {max(used[0], 0.0):.2g} rad, speed, acceleration, jerk "
         f"by their limits {used[1]:.4f} {used[2]:.4f} {used[3]:.4f}; {kept.count(False)} of {len(kept)} chunks not "
-        f"feasible; a chunk: processor time {medians[0]:.0f} ms in the median, wall time {medians[1]:.0f} ms, "
+        f"feasible; a push: processor time {medians[0]:.0f} ms in the median, wall time {medians[1]:.0f} ms, "
         f"95 % {1e3 * np.quantile(took, 0.95, axis=0)[1]:.0f} ms"
     )
 

@@ -7,7 +7,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import osik_jax as osik
-from osik_jax.motion import chunk
+from osik_jax.motion import Stream
 
 jax.config.update("jax_enable_x64", True)
 arm, rng = osik.load_robot("so101"), np.random.default_rng(0)
@@ -21,32 +21,22 @@ def policy(now):
     return np.asarray(arm.q0) + wave + 0.03 * rng.normal(size=arm.nv) + 0.005 * rng.normal(size=(30, arm.nv))
 
 
-@jax.jit
-def plan(points, times, start, begin):
-    """Return the motion through a chunk, from the state that the running motion has when it takes over."""
-    return chunk(arm, points, times, start=start, begin=begin, smoothing=0.1, **limits)
-
-
-latency, begins = 0.05, period * np.arange(9)  # a chunk takes over when it is planned; till then the last one goes on
-running = chunk(arm, np.tile(arm.q0, (30, 1)), horizon - 1.0, **limits)  # at rest
-chunks, time, states = [], [], []
+begins, stream = period * np.arange(9), Stream(arm, arm.q0, latency=0.05, waypoints=30, smoothing=0.1, **limits)
+push, chunks, time, states = jax.jit(Stream.push), [], [], []
 for now in begins:
     chunks.append(policy(now))
-    after = plan(chunks[-1], now + horizon, running.state(now + latency), now + latency)
-    after = after if after.feasible.all() else running
+    stream = push(stream, chunks[-1], now + horizon, now)  # while it is planned, the last chunk goes on
     time.append(now + np.arange(round(period / dt)) * dt)
-    is_after = (time[-1] >= now + latency)[:, None]
-    states.append(np.where(is_after, after.at(time[-1]), running.at(time[-1])))
-    running = after
+    states.append(stream.at(time[-1]))
 time, states = np.concatenate(time), np.concatenate(states, axis=1)
 used = [np.abs(own).max() / limit for own, limit in zip(states[1:], limits.values(), strict=True)]
 print(f"{len(time)} samples; speed, acceleration and jerk by their limits: {used[0]:.2f}, {used[1]:.2f}, {used[2]:.2f}")
-lag = np.sqrt(np.mean(running.miss[5:] ** 2))
+lag = np.sqrt(np.mean(stream.after.miss[5:] ** 2))
 print(f"the last chunk is {lag:.4f} rad off its waypoints (root mean square), whose noise is 0.005 rad")
 figure, axes = plt.subplots(2, 1, figsize=(9, 5), sharex=True, layout="constrained")
 for now, waypoints in zip(begins, chunks, strict=True):
     axes[0].plot(now + horizon, waypoints[:, :3], ".", ms=2, color="gray")
-    axes[1].axvline(now + latency, color="gray", lw=0.5)
+    axes[1].axvline(now + stream.latency, color="gray", lw=0.5)
 axes[0].plot(time, states[0, :, :3], label=arm.joint_names[:3])
 axes[0].set(ylabel="[rad]", title="Waypoints of the chunks (dots), and the motion of three joints")
 axes[0].legend(ncols=3)

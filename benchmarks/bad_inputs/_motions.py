@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
-from osik_jax.motion import PoseFilter, chunk, connect, follow, retime
+from osik_jax.motion import PoseFilter, Stream, chunk, connect, follow, retime
 
 from ._given import FAR, Add, K, T, V, arm, nao
 from ._problems import ur5
@@ -28,6 +28,10 @@ def _retime(**more: Any) -> Any:
 
 def _chunk(**more: Any) -> Any:
     return chunk(**({"robot": arm(), "waypoints": _line(), "times": TIMES} | LIMITS | more))
+
+
+def _stream(**more: Any) -> Stream:
+    return Stream(**({"robot": arm(), "q": arm().q0, "latency": 0.1, "waypoints": 9} | LIMITS | more))
 
 
 def _connect(**more: Any) -> Any:
@@ -51,6 +55,8 @@ def motions(add: Add) -> None:
     add("a chunk from a start that is too fast", lambda: _chunk(start=(home, fast, rest)), V, "whose limit is")
     add("a chunk from a start outside of its range", lambda: _chunk(start=(home + 9.0, rest, rest)), V, "joint1")
     add("a chunk for a robot that stands on a free base", lambda: _chunk(robot=nao()), V, "floating_base; lock them")
+    add("a stream with a latency of 0", lambda: _stream(latency=0.0), V, "latency is 0")
+    add("a chunk of 5 waypoints in a stream of 9", lambda: _stream().push(_line(), TIMES, 0.0), V, "takes 9 waypoints")
     far = np.linspace(0.0, 2.0, 4)[:, None] * np.eye(3)[0] + FAR[0]
     add(
         "a path that leaves reach",

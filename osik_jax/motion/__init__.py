@@ -1,4 +1,4 @@
-"""From poses to a timed motion: paths of joints, their least time, chunks, and filtered poses."""
+"""From poses to a timed motion: paths of joints, their least time, chunks and streams of poses."""
 
 from ._chunk import Chunk as Chunk
 from ._chunk import chunk as chunk
@@ -10,5 +10,6 @@ from ._motion import Motion as Motion
 from ._motion import load_motion as load_motion
 from ._pose_filter import PoseFilter as PoseFilter
 from ._retime import retime as retime
+from ._stream import Stream as Stream
 from ._timing import SlowPart as SlowPart
 from ._timing import Timing as Timing

@@ -7,7 +7,9 @@ times. The spline nearest to the waypoints is the answer of a small quadratic pr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from .._errors import OsikValueError, warn
+from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
 from ..numerics._arguments import as_floats, check_count, concrete
 from ..numerics._dense import full_precision
@@ -25,17 +28,20 @@ from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..solvers import Status, solve_least_squares_qp
 from ._jerk import CUBIC
 from ._motion import Motion, at_rest_outside, sample_times
+from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
 from ._start import State, checked_start, rounding
 
-_FEWEST = 16
+FEWEST = 16
 _HELD = 4
 """Times after the last waypoint, while the motion comes to rest, at which it is to be there."""
 _ROOM = 1.5
 """Time to come to rest, by the shortest one."""
 _DAMPING = 1e-12
 """Weight of the coefficients beside the waypoints: where these are few, smoothing alone determines the rest."""
+_JUMP = 0.5
+"""Joint positions [rad or m] of two neighbouring poses that are farther apart are on different branches."""
 
 
 class Chunk(eqx.Module):
@@ -98,7 +104,7 @@ def _at(chunk: Chunk, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
 
 def chunk(
     robot: Robot,
-    waypoints: Float[ArrayLike, "N n"],
+    waypoints: Float[ArrayLike, "N n"] | Mapping[str, Any],
     times: Float[ArrayLike, " N"],
     *,
     start: State | None = None,
@@ -115,14 +121,15 @@ def chunk(
     The motion begins with the state ``start``, so chunks that overlap join without a step in position, velocity or
     acceleration: ``start=running.state(now), begin=now``. Each joint minimises the sum of its squared distances from
     the waypoints. Where limits do not let it reach them in time, it stays behind: ``miss`` and ``lag`` say by how much.
-    Works in ``jit``, ``vmap`` and ``grad``.
+    Works in ``jit``, ``vmap`` and ``grad`` with waypoints of the joints.
 
     Args:
         robot: the robot; hinges and slides alone.
-        waypoints: positions of the joints [rad or m]; of poses, those that ``inverse_kinematics(nearest=True)`` finds.
-            (N, n)
+        waypoints: positions of the joints (N, n) [rad or m]; or poses by frame as in ``follow`` (outside jit), which
+            become the configurations nearest to that of the start.
         times: increasing times of the waypoints [s]. (N,)
-        start: positions, velocities and accelerations at ``begin``, (n,) each. Default: at rest in the first waypoint.
+        start: positions, velocities and accelerations at ``begin``, (n,) each. Default: at rest in the first waypoint;
+            with poses, in the configuration nearest to ``robot.q0``.
         begin: time of the start [s], before the last waypoint; earlier waypoints do not count. Default: ``times[0]``.
         rest: whether the motion comes to rest after the last waypoint (static). False: it ends there, in motion.
         velocity: limits of the joints' speeds, as in ``retime``. Default: the robot's.
@@ -135,8 +142,9 @@ def chunk(
         The motion: ``at(time)``, ``state(time)``, ``sample(dt)``.
 
     Raises:
-        KeyError: no such joint.
-        ValueError: one waypoint; times that do not increase; a start outside its limits; limits that are not positive.
+        KeyError: no such frame or joint.
+        ValueError: one waypoint; times that do not increase; a start outside its limits; limits that are not positive;
+            poses that cannot be reached, or that lie on different branches.
 
     Warns:
         OsikWarning: the start cannot be stopped within the limits.
@@ -146,7 +154,7 @@ def chunk(
     begin = None if begin is None else as_floats(begin)
     time = _checked_times(as_floats(times), begin)
     state = None if start is None else checked_start(robot, start, limits)
-    points = as_floats(waypoints)
+    points = _points(robot, waypoints, None if state is None else state[0])
     if points.shape != (len(time), robot.nv):
         raise OsikValueError(f"waypoints have shape {points.shape}; {len(time)} times need ({len(time)}, {robot.nv})")
     seen = concrete(points)
@@ -154,7 +162,7 @@ def chunk(
         raise OsikValueError(f"waypoint {int(np.argmin(np.isfinite(seen).all(axis=1)))} is not finite")
     if state is None:
         state = jnp.stack([points[0], *jnp.zeros((2, robot.nv), points.dtype)])
-    count = max(_FEWEST, len(time)) if cells is None else cells
+    count = max(FEWEST, len(time)) if cells is None else cells
     check_count("cells", count, least=8)
     bounds = jnp.stack([jnp.asarray(end, points.dtype) for end in joint_box(robot, None)])
     given = (
@@ -188,6 +196,26 @@ def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
     if seen is not None and first is not None and not first < seen[-1]:
         raise OsikValueError(f"begin is {first:g}; it is before the last waypoint, which is at {seen[-1]:g}")
     return time
+
+
+def _points(robot: Robot, waypoints: Any, near: Array | None) -> Float[Array, "N n"]:
+    """Return waypoints of the joints; of poses the configurations nearest to that of the start."""
+    if not isinstance(waypoints, Mapping):
+        return as_floats(waypoints)
+    poses = read_poses(robot, waypoints)
+    targets = {name: one.position if one.rotation is None else tuple(one) for name, one in poses.items()}
+    found = inverse_kinematics(robot, targets, q0=near, nearest=True)
+    missed = np.flatnonzero(~np.asarray(found.converged))
+    if len(missed):
+        raise OsikValueError(f"pose {missed[0]} cannot be reached: {found.explain(int(missed[0]))}")
+    jump = np.abs(np.diff(np.asarray(found.q), axis=0)).max(axis=1)
+    if jump.max() > _JUMP:
+        first = int(jump.argmax())
+        raise OsikValueError(
+            f"the joints jump by {jump[first]:.3g} between poses {first} and {first + 1}: give poses that are closer "
+            "together, start nearer to them, or take follow, which looks for a continuous path"
+        )
+    return jnp.asarray(found.q)
 
 
 def _differences(cells: int, free: int) -> list[Float[np.ndarray, "D K3"]]:

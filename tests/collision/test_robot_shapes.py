@@ -86,8 +86,9 @@ def test_planes_and_shapes_fixed_to_the_world_do_not_meet_a_scene():
     assert named_pairs(shapes) == {"worldarm"}
 
 
-def test_an_srdf_allows_pairs_and_has_states():
+def test_an_srdf_allows_pairs_and_has_groups_and_states():
     rules = read_srdf(SRDF)
+    assert rules.groups == {"arm": ("a to d",), "all": ("arm", "j1")}
     assert rules.states == {"home": {"j1": 0.5, "j2": -1.0}}
     robot = chain(*map(ball, "abcd"))
     assert named_pairs(robot_shapes(robot)) == {"ac", "ad", "bd"}
@@ -96,10 +97,7 @@ def test_an_srdf_allows_pairs_and_has_states():
     untested = '<robot name="r"><disable_default_collisions link="d"/><enable_collisions link1="d" link2="a"/></robot>'
     assert named_pairs(robot_shapes(robot, read_srdf(untested))) == {"ac", "ad"}
     refuses(
-        ValueError,
-        "the XML text: a <group_state> lacks the attribute 'name'",
-        read_srdf,
-        '<robot name="r"><group_state/></robot>',
+        ValueError, "the XML text: a <group> lacks the attribute 'name'", read_srdf, '<robot name="r"><group/></robot>'
     )
 
 

@@ -61,7 +61,7 @@ def so101_teleoperation(names: Names) -> None:
 
 def so101_chunks(names: Names) -> None:
     position, velocity = names["states"][:2]
-    assert names["running"].feasible.all() and max(names["used"]) <= 1.0 + 1e-6
+    assert names["stream"].taken and max(names["used"]) <= 1.0 + 1e-6
     assert np.abs(np.diff(velocity, axis=0)).max() <= 20.0 * names["dt"] + 1e-9  # at joins too
     assert np.abs(np.diff(position, n=2, axis=0)).max() <= 20.0 * names["dt"] ** 2 + 1e-9
     assert names["lag"] < 0.02  # rad

@@ -123,14 +123,16 @@ def test_a_minimum_jerk_move_stays_calm() -> None:
 
     place, turn = osik.forward_kinematics(ARM, ARM.q0).frame_pose(ARM, "hand")
     poses = {"hand": (np.asarray(place) + along(share), np.tile(turn, (30, 1, 1)))}
-    points = osik.inverse_kinematics(ARM, poses, nearest=True).q
-    found = chunk(ARM, points, 4.0 * share, acceleration=5.0, jerk=50.0)
+    found = chunk(ARM, poses, 4.0 * share, acceleration=5.0, jerk=50.0)
     motion = found.sample(0.001)
     tool = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(ARM, q).frame_pose(ARM, "hand")[0]))(motion.position)
     assert np.linalg.norm(np.diff(tool, n=2, axis=0), axis=1).max() / 0.001**2 <= 0.15  # 0.1443 of the move itself
     wanted = np.asarray(place) + along(np.clip(np.asarray(motion.time) / 4.0, 0.0, 1.0))
     assert np.linalg.norm(tool - wanted, axis=1).max() < 1e-4
     assert found.lag.max() < 1e-4
+    poses["hand"][0][7] += 3.0
+    with pytest.raises(osik.OsikError, match="pose 7 cannot be reached"):
+        chunk(ARM, poses, 4.0 * share)
 
 
 def test_limits_that_are_too_low_make_it_lag() -> None:
@@ -221,6 +223,7 @@ def test_a_start_that_cannot_be_stopped_is_named() -> None:
         ({"start": (HOME, REST, REST - 5.0)}, "start has the acceleration -5 of 'joint1', whose limit is at most 4"),
         ({"jerk": 0.0}, "limits of jerk are positive"),
         ({"cells": 4}, "cells is 4; it is an integer, at least 8"),
+        ({"waypoints": {"hnd": np.zeros((12, 3))}}, "hnd"),
     ],
 )
 def test_what_cannot_be_is_refused(more, message) -> None:

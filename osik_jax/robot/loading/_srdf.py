@@ -1,4 +1,4 @@
-"""Reader of SRDF files: pairs of links that may touch, and named states."""
+"""Reader of SRDF files: pairs of links that may touch, groups of joints and links, and named states."""
 
 from __future__ import annotations
 
@@ -20,12 +20,14 @@ class Srdf(NamedTuple):
         disabled: pairs of links that may touch, each in alphabetical order.
         untested: links all of whose pairs may touch, but for those of ``enabled``.
         enabled: pairs of links that are kept apart although one of them is in ``untested``.
+        groups: names of the joints, links, chains (``"base to tip"``) and subgroups of each group.
         states: value [rad or m] of each joint in each named state; states of one name in several groups are one state.
     """
 
     disabled: frozenset[tuple[str, str]]
     untested: frozenset[str]
     enabled: frozenset[tuple[str, str]]
+    groups: Mapping[str, tuple[str, ...]]
     states: Mapping[str, Mapping[str, float]]
 
     @property
@@ -55,6 +57,7 @@ def read_srdf(given: str | os.PathLike[str]) -> Srdf:
             disabled=_pairs(root, "disable_collisions"),
             untested=frozenset(_attribute(e, "link") for e in root.findall("disable_default_collisions")),
             enabled=_pairs(root, "enable_collisions"),
+            groups={_attribute(group, "name"): _members(group) for group in root.findall("group")},
             states=_states(root),
         )
     except ValueError as error:
@@ -88,6 +91,16 @@ def _pair(first: str, second: str) -> tuple[str, str]:
 
 def _pairs(root: ElementTree.Element, kind: str) -> frozenset[tuple[str, str]]:
     return frozenset(_pair(_attribute(e, "link1"), _attribute(e, "link2")) for e in root.findall(kind))
+
+
+def _members(group: ElementTree.Element) -> tuple[str, ...]:
+    names = []
+    for part in group:
+        if part.tag == "chain":
+            names.append(f"{_attribute(part, 'base_link')} to {_attribute(part, 'tip_link')}")
+        elif part.tag in ("joint", "link", "group"):
+            names.append(_attribute(part, "name"))
+    return tuple(names)
 
 
 def _states(root: ElementTree.Element) -> dict[str, dict[str, float]]:
