@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import osik_jax as osik
-from osik_jax.motion import PoseFilter, Stream, chunk, connect, follow, retime
+from osik_jax.motion import Motion, PoseFilter, Stream, chunk, connect, film_motion, follow, move, retime
 
 from ._given import FAR, Add, K, T, V, arm, nao
 from ._problems import ur5
@@ -34,6 +34,10 @@ def _stream(**more: Any) -> Stream:
     return Stream(**({"robot": arm(), "q": arm().q0, "latency": 0.1, "waypoints": 9} | LIMITS | more))
 
 
+def _move(**more: Any) -> Any:
+    return move(**({"robot": arm(), "start": arm().q0, "goal": arm().q0} | LIMITS | more))
+
+
 def _connect(**more: Any) -> Any:
     scene = osik.Scene({"can": osik.CollisionShape.sphere(0.1, [0.3, 0.5, 0.2])})
     return connect(**({"robot": ur5(), "q_from": ur5().q0, "q_to": ur5().q0, "scene": scene} | more))
@@ -54,9 +58,19 @@ def motions(add: Add) -> None:
     add("a chunk that begins after its end", lambda: _chunk(begin=2.0), V, "begin is 2")
     add("a chunk from a start that is too fast", lambda: _chunk(start=(home, fast, rest)), V, "whose limit is")
     add("a chunk from a start outside of its range", lambda: _chunk(start=(home + 9.0, rest, rest)), V, "joint1")
+    add("a move from a start that is too fast", lambda: _move(start=(home, fast, rest)), V, "whose limit is")
+    add("a move to a goal outside of its range", lambda: _move(goal=home - 9.0), V, "goal has the position")
+    add("a move with a limit of 0", lambda: _move(velocity={"joint2": 0.0}), V, "joint2 0")
     add("a chunk for a robot that stands on a free base", lambda: _chunk(robot=nao()), V, "floating_base; lock them")
     add("a stream with a latency of 0", lambda: _stream(latency=0.0), V, "latency is 0")
     add("a chunk of 5 waypoints in a stream of 9", lambda: _stream().push(_line(), TIMES, 0.0), V, "takes 9 waypoints")
+    two = [jnp.zeros((2, 2))] * 3
+    add(
+        "a film of two joints with a robot of seven",
+        lambda: film_motion(Motion(jnp.arange(2.0), *two), arm(), "film.gif"),
+        V,
+        "2 joints",
+    )
     far = np.linspace(0.0, 2.0, 4)[:, None] * np.eye(3)[0] + FAR[0]
     add(
         "a path that leaves reach",

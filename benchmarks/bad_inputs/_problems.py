@@ -228,7 +228,7 @@ def limits(add: Add) -> None:
     add("an object that is not in the scene", lambda: osik.Scene({"can": ball}).moved("cam", np.eye(4)), K, "can")
     add("an object held twice", _held_twice, V, "detach")
     add("a box of words", lambda: osik.CollisionShape.box("abc"), T, "half_sizes is 'abc'")
-    add("a scene of another kind of file", lambda: osik.Scene.from_file("scene.stl"), V, ".urdf")
+    add("a scene of another kind of file", lambda: osik.Scene.from_file("scene.stl"), V, ".yaml")
     for size in ("a radius of -1", -1.0), ("a radius of 0", 0.0), ("a radius of NaN", np.nan):
         add(f"a ball with {size[0]}", lambda size=size: osik.CollisionShape.sphere(size[1]), V, "positive")
     add("a box of 2 sizes", lambda: osik.CollisionShape.box([0.1, 0.1]), V, "half_sizes has shape (2,)")

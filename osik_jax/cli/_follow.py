@@ -6,6 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 import tyro
 
 from ._messages import told
@@ -28,7 +29,11 @@ class Follow(InScene):
     frame: str
     """The frame: a link, body, site or geom."""
     out: Path = Path("motion.npz")
-    """File to write: .npz or .csv."""
+    """File to write: .npz, .csv or .parquet."""
+    film: Path | None = None
+    """Film to write: .gif, or .mp4 with ffmpeg."""
+    picture: Path | None = None
+    """Picture to write, of speeds and accelerations beside their limits."""
     dt: float = 0.001
     """Time between two samples [s]."""
     speed: float | None = None
@@ -42,7 +47,7 @@ class Follow(InScene):
 
     def run(self) -> int:
         """Run the command; return the exit code."""
-        from ..motion import follow
+        from ..motion import draw_motion, film_motion, follow
 
         robot = read_robot(self.robot, "auto")
         with told():
@@ -55,7 +60,12 @@ class Follow(InScene):
                 jerk=self.jerk,
                 **self.obstacles(),
             )
-            found.sample(self.dt).save(self.out)
+            motion, limits = found.sample(self.dt), np.asarray(found.timings[0].limits)
+            motion.save(self.out)
+            if self.picture is not None:
+                draw_motion(motion, self.picture, limits)
+            if self.film is not None:
+                film_motion(motion, robot, self.film, limits, trails=[self.frame])
         print(
             f"{found.duration:.3f} s, at most {1e3 * found.position_error:.2g} mm and "
             f"{found.orientation_error:.2g} rad off the path; written to {self.out}"

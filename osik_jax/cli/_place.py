@@ -40,7 +40,7 @@ class Place:
     height: float = 0.0
     """Height of the base above the world's origin [m]."""
     scene: Path | None = None
-    """Obstacles: MuJoCo XML or URDF."""
+    """Obstacles: MuJoCo XML, URDF, or MoveIt's .yaml or .scene."""
     clearance: float = 0.0
     """Smallest distance of all pairs of shapes [m]."""
     allow: tuple[str, ...] = ()

@@ -14,7 +14,7 @@ class InScene:
     """Obstacles, and what may touch."""
 
     scene: Path | None = None
-    """File of obstacles that the robot keeps off, and off itself: .xml or .urdf."""
+    """File of obstacles that the robot keeps off, and off itself: .xml, .urdf, .yaml or .scene."""
     srdf: Path | None = None
     """With --scene: an SRDF, whose pairs may touch."""
     clearance: float = 0.0

@@ -106,10 +106,10 @@ class Scene(eqx.Module):
     def from_file(
         cls, path: str | os.PathLike[str], *, capacity: int | None = None, vertex_capacity: int | None = None
     ) -> Scene:
-        """Read a MuJoCo XML or a URDF.
+        """Read a MuJoCo XML, a URDF, or a scene of MoveIt: ``.yaml``, or the text format ``.scene``.
 
-        All shapes that collide are read, each link or body an object, with joints where they are at the start (0, or
-        ``qpos0``).
+        XML: all shapes that collide, each link or body an object, with joints where they are at the start (0, or
+        ``qpos0``). MoveIt: the collision objects, and the pairs of an object and a link that may touch.
 
         Args:
             path: of the file; meshes are looked for beside it.
@@ -118,11 +118,17 @@ class Scene(eqx.Module):
 
         Raises:
             FileNotFoundError: no such file.
+            ImportError: a ``.yaml`` file without PyYAML (the extra ``scenes``).
             ValueError: a file of another kind, or broken, or more shapes than the capacity.
+
+        Warns:
+            OsikWarning: something of the file is not kept, such as attached objects.
         """
         from ._scene_files import read_scene  # readers that few programs need
 
-        return cls(read_scene(path), capacity=capacity, vertex_capacity=vertex_capacity)
+        objects, allowed = read_scene(path)
+        scene = cls(objects, capacity=capacity, vertex_capacity=vertex_capacity)
+        return scene.allow(*allowed) if allowed else scene
 
     @classmethod
     def stack(cls, scenes: Sequence[Scene]) -> Scene:

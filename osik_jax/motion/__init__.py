@@ -8,6 +8,10 @@ from ._follow import Followed as Followed
 from ._follow import follow as follow
 from ._motion import Motion as Motion
 from ._motion import load_motion as load_motion
+from ._move import Move as Move
+from ._move import move as move
+from ._pictures import draw_motion as draw_motion
+from ._pictures import film_motion as film_motion
 from ._pose_filter import PoseFilter as PoseFilter
 from ._retime import retime as retime
 from ._stream import Stream as Stream

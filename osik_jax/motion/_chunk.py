@@ -31,7 +31,7 @@ from ._motion import Motion, at_rest_outside, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
-from ._start import State, checked_start, rounding
+from ._start import State, checked_state, rounding
 
 FEWEST = 16
 _HELD = 4
@@ -153,7 +153,7 @@ def chunk(
     limits = checked_limits(robot, velocity, acceleration, jerk, least_time=False)
     begin = None if begin is None else as_floats(begin)
     time = _checked_times(as_floats(times), begin)
-    state = None if start is None else checked_start(robot, start, limits)
+    state = None if start is None else checked_state(robot, start, limits)
     points = _points(robot, waypoints, None if state is None else state[0])
     if points.shape != (len(time), robot.nv):
         raise OsikValueError(f"waypoints have shape {points.shape}; {len(time)} times need ({len(time)}, {robot.nv})")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._errors import OsikValueError
+from .._errors import OsikValueError, missing_extra
 from .._npz import open_npz
 from .._whole_file import whole_file, write_text
 from ..control import Trajectory
@@ -21,6 +21,7 @@ from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
 
 _KINDS = "position", "velocity", "acceleration"
+_LEROBOT = "observation.state", "action", "timestamp"
 
 
 class Motion(eqx.Module):
@@ -58,16 +59,23 @@ class Motion(eqx.Module):
 
         - ``.npz``: arrays ``time``, ``position``, ``velocity``, ``acceleration`` and ``joints``.
         - ``.csv``: a row a sample; columns ``time``, ``position.JOINT``, ``velocity.JOINT``, ``acceleration.JOINT``.
+        - ``.parquet``: LeRobot's columns ``observation.state`` (the positions), ``action`` (those of the next sample)
+          and ``timestamp``, beside the velocities and accelerations. It needs the extra ``motion``.
 
         Raises:
             ValueError: another end of the name.
+            ModuleNotFoundError: ``.parquet`` without pyarrow.
             OSError: the file cannot be written.
         """
-        if _kind(path) == ".csv":
+        kind = _kind(path)
+        if kind == ".csv":
             write_text(path, self._as_csv())
             return
         with whole_file(path) as file:
-            np.savez(file, joints=np.array(self._names(), str), time=self.time, **self._arrays())
+            if kind == ".npz":
+                np.savez(file, joints=np.array(self._names(), str), time=self.time, **self._arrays())
+            else:
+                _pyarrow("parquet").write_table(self._as_table(), file)
 
     def _names(self) -> list[str]:
         return list(self.joints) or [str(i) for i in range(self.position.shape[1])]
@@ -81,6 +89,16 @@ class Motion(eqx.Module):
         rows.writerow(["time", *(f"{kind}.{name}" for kind in _KINDS for name in self._names())])
         rows.writerows(np.column_stack([self.time, *self._arrays().values()]).tolist())
         return text.getvalue()
+
+    def _as_table(self) -> Any:
+        arrow, arrays = _pyarrow(), self._arrays()
+        state = arrays["position"]
+        columns = {_LEROBOT[0]: state, _LEROBOT[1]: np.concatenate([state[1:], state[-1:]])}
+        columns |= {kind: arrays[kind] for kind in _KINDS[1:]}
+        table = arrow.table(
+            {name: list(values) for name, values in columns.items()} | {_LEROBOT[2]: np.asarray(self.time)}
+        )
+        return table.replace_schema_metadata({"joints": "\n".join(self._names())})
 
 
 def at_rest_outside(
@@ -110,15 +128,16 @@ def sample_times(duration: float, dt: float) -> Float[np.ndarray, " T"]:
 
 
 def load_motion(path: str | os.PathLike[str]) -> Motion:
-    """Return a motion that ``Motion.save`` wrote; from other tables velocities may be missing.
+    """Return a motion that ``Motion.save`` wrote; from CSV and Parquet of others, velocities may be missing.
 
     Missing velocities and accelerations are those of differences.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: another kind of file, columns missing, or times that do not increase.
+        ModuleNotFoundError: ``.parquet`` without pyarrow.
     """
-    time, arrays, joints = (_from_csv if _kind(path) == ".csv" else _from_npz)(path)
+    time, arrays, joints = {".npz": _from_npz, ".csv": _from_csv, ".parquet": _from_parquet}[_kind(path)](path)
     if len(time) < 2 or not (np.diff(time) > 0.0).all():
         back = int(np.argmax(np.diff(time) <= 0.0)) + 1 if len(time) > 1 else 0
         raise OsikValueError(f"{os.fspath(path)}: times have to increase, two or more; sample {back} does not")
@@ -130,8 +149,8 @@ def load_motion(path: str | os.PathLike[str]) -> Motion:
 
 def _kind(path: str | os.PathLike[str]) -> str:
     kind = Path(path).suffix.lower()
-    if kind not in (".npz", ".csv"):
-        raise OsikValueError(f"{os.fspath(path)}: a motion's file ends in .npz or .csv")
+    if kind not in (".npz", ".csv", ".parquet"):
+        raise OsikValueError(f"{os.fspath(path)}: a motion's file ends in .npz, .csv or .parquet")
     return kind
 
 
@@ -162,3 +181,24 @@ def _from_csv(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
     columns = {kind: [head.index(f"{kind}.{name}") for name in joints if f"{kind}.{name}" in head] for kind in _KINDS}
     arrays = {kind: values[:, own] for kind, own in columns.items() if len(own) == len(joints)}
     return values[:, head.index("time")], arrays, joints
+
+
+def _from_parquet(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    table = _pyarrow("parquet").read_table(path)
+    for column in (_LEROBOT[0], _LEROBOT[2]):
+        if column not in table.column_names:
+            raise _missing(path, f"column {column}")
+    given = {"position": _LEROBOT[0], "velocity": "velocity", "acceleration": "acceleration"}
+    arrays = {k: np.stack(table[name].to_numpy()) for k, name in given.items() if name in table.column_names}
+    names = (table.schema.metadata or {}).get(b"joints", b"").decode()
+    return table[_LEROBOT[2]].to_numpy(), arrays, names.split("\n") if names else []
+
+
+def _pyarrow(part: str | None = None) -> Any:
+    """Return pyarrow, or a module of it."""
+    import importlib
+
+    try:
+        return importlib.import_module("pyarrow" if part is None else f"pyarrow.{part}")
+    except ModuleNotFoundError as error:
+        raise missing_extra("a .parquet file", "pyarrow", "motion") from error

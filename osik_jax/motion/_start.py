@@ -1,4 +1,4 @@
-"""States of joints to start from, checked to be within limits."""
+"""States of joints to start from and to end in, checked to be within limits."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ def rounding(numbers: Array | np.ndarray) -> tuple[float, float]:
     return _OUTSIDE[str(numbers.dtype)]
 
 
-def checked_start(robot: Robot, given: Any, limits: Array) -> Float[Array, "3 n"]:
-    """Return a start, checked to be within limits where its numbers are known.
+def checked_state(robot: Robot, given: Any, limits: Array, name: str = "start", kinds: int = 3) -> Float[Array, "k n"]:
+    """Return a state, checked to be within limits where its numbers are known.
 
     Args:
         robot: the robot.
-        given: positions, velocities and accelerations. (n,) each
+        given: positions, velocities and accelerations, or the first ``kinds`` of them. (n,) each
         limits: of speed, acceleration and jerk. (3, n)
+        name: of the argument, for messages.
+        kinds: number of arrays of the state.
     """
-    if not isinstance(given, tuple | list) or len(given) != 3 or any(np.shape(a) != (robot.nv,) for a in given):
-        raise OsikValueError(f"start is ({', '.join(_KINDS)}), of {robot.nv} joints each")
+    if not isinstance(given, tuple | list) or len(given) != kinds or any(np.shape(a) != (robot.nv,) for a in given):
+        raise OsikValueError(f"{name} is ({', '.join(_KINDS[:kinds])}), of {robot.nv} joints each")
     state = jnp.stack([as_floats(one) for one in given])
-    check_finite(state, "start")
+    check_finite(state, name)
     seen, most = concrete(state), concrete(limits)
     if seen is None or most is None:
         return state
@@ -53,7 +55,7 @@ def checked_start(robot: Robot, given: Any, limits: Array) -> Float[Array, "3 n"
             joint = int(where.argmax())
             allowed = f"{lower[joint]:g} to {upper[joint]:g}" if row == 0 else f"at most {most[row - 1, joint]:g}"
             raise OsikValueError(
-                f"start has the {_KINDS[row]} {seen[row, joint]:g} of {dof_names(robot)[joint]!r}, whose limit is "
+                f"{name} has the {_KINDS[row]} {seen[row, joint]:g} of {dof_names(robot)[joint]!r}, whose limit is "
                 f"{allowed}: stay within the limits, or give wider ones"
             )
     return state

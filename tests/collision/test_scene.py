@@ -1,4 +1,4 @@
-"""Scenes: shapes as arrays, capacity, names, things in hands, and files of MuJoCo and URDF."""
+"""Scenes: shapes as arrays, capacity, names, things in hands, and files of MuJoCo, URDF and MoveIt."""
 
 import sys
 import types
@@ -224,23 +224,155 @@ def test_meshes_that_are_not_convex_are_split_if_coacd_is_there(monkeypatch: pyt
     )
 
 
+YAML = """
+allowed_collision_matrix:
+  entry_names: [can, hand, arm]
+  entry_values: [[false, true, false], [true, false, true], [false, true, false]]
+robot_state: {attached_collision_objects: [{object: {id: cup}}]}
+world:
+  collision_objects:
+  - id: can
+    primitives: [{type: cylinder, dimensions: [0.2, 0.03]}]
+    primitive_poses: [{position: [1, 0, 0], orientation: [0, 0, 0, 1]}]
+  - id: shelf
+    pose: {position: {x: 0, y: 0, z: 1}, orientation: {x: 0, y: 0, z: 0.6, w: 0.8}}
+    primitives:
+    - {type: 1, dimensions: [1, 2, 3]}
+    - {type: sphere, dimensions: [0.5]}
+    - {type: cone, dimensions: [0.4, 0.1]}
+    primitive_poses:
+    - {position: [1, 0, 0], orientation: [0, 0, 0, 1]}
+    - {position: [0, 1, 0], orientation: [0, 0, 0, 1]}
+    - {position: [0, 0, 1], orientation: [0, 0, 0, 1]}
+  - id: ground
+    planes: [{coef: [0, 0, 2, 1]}]
+    plane_poses: [{position: [0, 0, 0], orientation: [0, 0, 0, 1]}]
+  - id: tent
+    meshes: [{vertices: [{x: 0, y: 0, z: 0}, [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+              triangles: [{vertex_indices: [0, 2, 1]}, [0, 1, 3], [0, 3, 2], [1, 2, 3]]}]
+    mesh_poses: [{position: [5, 0, 0], orientation: [0, 0, 0, 1]}]
+"""
+
+TEXT = """a scene
+* can
+1 0 0
+0 0 0 1
+1
+cylinder
+0.03 0.2
+0 0 0
+0 0 0 1
+0 0 0 0
+0
+* shelf of books
+0 0 1
+0 0 0.6 0.8
+3
+box
+1 2 3
+1 0 0
+0 0 0 1
+1 0 0 1
+sphere
+0.5
+0 1 0
+0 0 0 1
+0 0 0 0
+cone
+0.1 0.4
+0 0 1
+0 0 0 1
+0 0 0 0
+1
+front
+0 0 0
+0 0 0 1
+* ground
+0 0 0
+0 0 0 1
+1
+plane
+0 0 2 1
+0 0 0
+0 0 0 1
+0 0 0 0
+0
+* tent
+5 0 0
+0 0 0 1
+1
+mesh
+4 4
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+0 2 1
+0 1 3
+0 3 2
+1 2 3
+0 0 0
+0 0 0 1
+0 0 0 0
+0
+.
+"""
+OLD_TEXT = "old\n* can\n1\ncylinder\n0.03 0.2\n1 0 0\n0 0 0 1\n0 0 0 0\n.\n"
+
+
 def written(folder: Path, name: str, text: str) -> Path:
     path = folder / name
     path.write_text(text)
     return path
 
 
+def test_scenes_of_moveit(tmp_path: Path, panda):
+    with pytest.warns(osik.OsikWarning, match="objects attached to a robot are left out; use Scene.attach: cup"):
+        scene = osik.Scene.from_file(written(tmp_path, "a.yaml", YAML))
+    assert scene.names == ("can", "shelf:0", "shelf:1", "shelf:2", "ground", "tent")
+    found, ways, turn = supports(scene), directions(), pin.Quaternion(0.8, 0, 0, 0.6).matrix()
+    shelf = pin.SE3(turn, np.array([0, 0, 1.0]))
+    wanted = {
+        "can": (coal.Cylinder(0.03, 0.2), pin.SE3(np.eye(3), np.array([1.0, 0, 0]))),
+        "shelf:0": (coal.Box(1, 2, 3), shelf * pin.SE3(np.eye(3), np.array([1.0, 0, 0]))),
+        "shelf:1": (coal.Sphere(0.5), shelf * pin.SE3(np.eye(3), np.array([0, 1.0, 0]))),
+    }
+    for name, (geometry, pose) in wanted.items():
+        np.testing.assert_allclose(found[name], coal_support(geometry, pose, ways), atol=1e-6)
+    round_part = 0.1 * np.linalg.norm(ways[:, :2], axis=1) - 0.2 * ways[:, 2]
+    excess = found["shelf:2"] - (2.0 * ways[:, 2] + np.maximum(0.2 * ways[:, 2], round_part))
+    assert excess.min() > -1e-6 and excess.max() < 0.005 * 0.1
+    np.testing.assert_allclose(scene.table.position[4], [0, 0, -0.5], atol=1e-7)
+    corners = np.eye(4, 3) + np.array([5, 0, 0])
+    np.testing.assert_allclose(found["tent"], (ways @ corners.T).max(1), atol=1e-6)
+    assert scene.partners == ("hand",) and np.flatnonzero(scene.contact[:, 0]).tolist() == [0]
+    same = osik.Scene.from_file(written(tmp_path, "a.scene", TEXT))
+    assert same.names == tuple(name.replace("shelf", "shelf of books") for name in scene.names)
+    for own, other in zip(on_host(scene), on_host(same), strict=True):
+        np.testing.assert_allclose(own, other, atol=1e-7)
+    old = osik.Scene.from_file(written(tmp_path, "old.scene", OLD_TEXT))
+    np.testing.assert_allclose(supports(old)["can"], found["can"], atol=1e-7)
+
+
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
         ("a.stl", "", "is no scene: there are .xml"),
+        ("a.yaml", "a: [", "a.yaml: while parsing"),
+        ("a.yaml", "robot: 1", "a.yaml: it has no 'world'"),
+        ("a.yaml", YAML.replace("dimensions: [0.5]", "dimensions: [-1]"), "the sizes of a sphere are .* positive"),
+        ("a.yaml", YAML.replace("type: sphere", "type: torus"), "'torus' is no shape of MoveIt"),
+        ("a.yaml", YAML.replace("id: can", "name: can"), "'id' is missing"),
+        ("a.scene", TEXT.replace("1 0 0 1\nsphere", "1 0 0\nsphere"), "could not convert"),
+        ("a.scene", "x\n* a\n0 0 0\n0 0 0 1\n1\nbox\n1 1", "an object ends too early"),
+        ("a.scene", TEXT.replace("0 0 0.6 0.8", "0 0 0 0"), "no pose: position"),
         ("a.xml", "<mujoco><worldbody><geom type='box'/></worldbody></mujoco>", "a.xml: "),
         ("a.xml", "<sdf/>", "the root element is <sdf>, not <mujoco>"),
     ],
 )  # fmt: skip
 def test_broken_files_are_named(tmp_path: Path, name: str, text: str, message: str):
     refuses(ValueError, message, osik.Scene.from_file, written(tmp_path, name, text))
-    refuses(FileNotFoundError, "no scene file", osik.Scene.from_file, tmp_path / "lost.xml")
+    refuses(FileNotFoundError, "no scene file", osik.Scene.from_file, tmp_path / "lost.yaml")
 
 
 def test_scenes_of_mujoco(tmp_path: Path):

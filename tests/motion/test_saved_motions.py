@@ -1,21 +1,28 @@
 """Files of motions: what was written is read again, and what is no motion is refused."""
 
 import csv
+import sys
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.interop.ros2.dds import joint_trajectory
-from osik_jax.motion import Motion, load_motion, retime
+from osik_jax.motion import Motion, draw_motion, film_motion, load_motion, retime
 
 MOTION = retime(np.array([[0.0, 0.0], [1.0, 0.5], [1.5, 2.0]]), acceleration=5.0, velocity=2.0, cells=40).sample(0.02)
 MOTION = Motion(MOTION.time, MOTION.position, MOTION.velocity, MOTION.acceleration, joints=("lift", "turn"))
 
 
-@pytest.mark.parametrize("kind", ["npz", "csv"])
+@pytest.mark.parametrize("kind", ["npz", "csv", "parquet"])
 def test_a_file_gives_the_same_motion(tmp_path, kind) -> None:
+    if kind == "parquet":
+        pytest.importorskip("pyarrow")
     MOTION.save(tmp_path / f"motion.{kind}")
     found = load_motion(tmp_path / f"motion.{kind}")
     assert found.joints == MOTION.joints
@@ -46,6 +53,13 @@ def test_a_rollout_is_a_motion() -> None:
     assert motion.velocity.shape == motion.acceleration.shape == (5, 7) and motion.joints[0] == "joint1"
 
 
+def test_parquet_needs_its_extra(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install \".\[motion\]\""):
+        MOTION.save(tmp_path / "motion.parquet")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     "text, message",
     [
@@ -64,11 +78,37 @@ def test_what_is_no_motion_is_refused(tmp_path, text, message) -> None:
 
 
 def test_other_ends_of_names_are_refused(tmp_path) -> None:
-    with pytest.raises(osik.OsikError, match=r"ends in .npz or .csv"):
+    with pytest.raises(osik.OsikError, match=r"ends in .npz, .csv or .parquet"):
         MOTION.save(tmp_path / "motion.txt")
     np.savez(tmp_path / "other.npz", a=jnp.zeros(2))
     with pytest.raises(osik.OsikError, match="has no time"):
         load_motion(tmp_path / "other.npz")
+
+
+def test_a_picture_has_a_line_a_joint_and_its_limits(tmp_path, monkeypatch) -> None:
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"x")))
+    draw_motion(MOTION, tmp_path / "motion.png", np.array([[2.0, 2.0], [5.0, 5.0], [np.inf, np.inf]]))
+    speeds, accelerations = figures[0].axes
+    assert (tmp_path / "motion.png").read_bytes() == b"x" and len(speeds.lines) == len(accelerations.lines) == 4
+    np.testing.assert_array_equal(speeds.lines[1].get_ydata(), np.asarray(MOTION.velocity)[:, 1] / 2.0)
+
+
+def test_a_film_shows_the_motion_from_its_begin_to_its_end(tmp_path) -> None:
+    """At times that are not even; the last picture is the last sample."""
+    arm, time = osik.load_robot("arm7"), jnp.array([0.0, 0.1, 0.35, 0.5])
+    q = arm.q0 + jnp.array([0.0, 0.3, 0.7, 1.0])[:, None] * jnp.array([1.0, 0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    motion = Motion(time, q, 0.0 * q + 0.5, 0.0 * q)
+    options: Any = {"size": (160, 90)}
+    film_motion(motion, arm, tmp_path / "m.gif", np.full((3, 7), 2.0), **options)
+    with Image.open(tmp_path / "m.gif") as film:
+        assert getattr(film, "n_frames", 1) == 8  # seven in 0.5 s, and the end
+        film.seek(7)
+        last = np.asarray(film.convert("RGB"), float)
+        film.seek(0)
+        assert np.abs(last - np.asarray(film.convert("RGB"), float)).mean() > 1.0
+    refuses(ValueError, "the motion has 2 joints, and the robot 7", film_motion, MOTION, arm, tmp_path / "m.gif")
+    refuses(ValueError, "has to be .gif or .mp4", film_motion, motion, arm, tmp_path / "m.avi")
 
 
 def test_a_motion_is_a_message_of_ros() -> None:
