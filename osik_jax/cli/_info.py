@@ -28,6 +28,13 @@ class Info:
     base: Literal["auto", "floating", "fixed"] = "auto"
     """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
+    spheres: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the spheres that cover its collision shapes: how many, and how far they stick out."""
+    given: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
+    """With --spheres: spheres of your own, a .yaml of cuRobo or a URDF whose collision shapes are spheres."""
+    png: Annotated[str, tyro.conf.arg(metavar="FILE")] = ""
+    """With --spheres: write a picture of the robot and the spheres."""
+
     def run(self) -> int:
         """Run the command; return the exit code."""
         from rich.console import Console
@@ -41,6 +48,10 @@ class Info:
                 return 0
             raise CommandError("osik info needs a robot, as in osik info nao, or --system")
         robot = read_robot(self.robot, self.base)
+        if self.spheres:
+            return _print_spheres(console, robot, self.given, self.png)
+        if self.given or self.png:
+            raise CommandError("--given and --png go with --spheres")
         base = "floating base" if robot.floating_base else "bolted down"
         own = robot.body_mass[robot.tree.is_own] if len(robot.tree.robots) <= 1 else robot.body_mass
         size = f"{len(robot.joint_names)} joints, {base}, nq {robot.nq}, nv {robot.nv}, {float(own.sum()):.3f} kg"
@@ -72,6 +83,38 @@ def _print_system(console: Console) -> None:
     )
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _print_spheres(console: Console, robot: Robot, given: str, png: str) -> int:
+    """Print a table of the covering spheres of each collision shape; return the exit code."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ..collision import covering_spheres
+    from ..viewer._figures import sphere_picture
+
+    try:
+        spheres = covering_spheres(robot, given or None)
+    except (OSError, ValueError, KeyError, ImportError) as error:
+        raise CommandError(str(error)) from None
+    table = Table("shape", "spheres", "radii, mm", "stick out, mm")
+    for row, name in enumerate(spheres.names):
+        own = spheres.shape == row
+        if own.any():
+            radii, over = 1e3 * spheres.radius[own], 1e3 * spheres.overshoot[own]
+            span = f"{radii.min():.1f} to {radii.max():.1f}"
+            table.add_row(escape(name), str(own.sum()), span, f"{over.mean():.1f}, at most {over.max():.1f}")
+    console.print(table)
+    over = 1e3 * spheres.overshoot
+    console.print(
+        f"{len(over)} spheres stick out by {over.mean():.1f} mm in the mean and {over.max():.1f} mm at most; "
+        "no surface is uncovered",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if png:
+        console.print(f"{sphere_picture(png, robot, spheres)}: the robot, and its spheres", markup=False)
+    return 0
 
 
 def _print_report(console: Console, robot: Robot) -> None:

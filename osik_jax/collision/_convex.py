@@ -73,6 +73,26 @@ class RobotShapes(NamedTuple):
     touching: tuple[tuple[str, str], ...] = ()
 
 
+class CoveringSpheres(NamedTuple):
+    """Spheres that contain the collision shapes of a robot.
+
+    Attributes:
+        names: of the shapes, as in ``RobotShapes``.
+        shape: shape that each sphere belongs to. (s,)
+        body: moving body that it is fixed to. (s,)
+        center: in the axes of that body [m]. (s, 3)
+        radius: [m]. Together the spheres of a shape contain it. (s,)
+        overshoot: how far each sphere sticks out of its shape at most [m]. (s,)
+    """
+
+    names: tuple[str, ...]
+    shape: Int[np.ndarray, " s"]
+    body: Int[np.ndarray, " s"]
+    center: Float[np.ndarray, "s 3"]
+    radius: Float[np.ndarray, " s"]
+    overshoot: Float[np.ndarray, " s"]
+
+
 NO_VERTICES = np.zeros((0, 3))
 
 _HALVINGS = 3

@@ -1,4 +1,4 @@
-"""Collision shapes of a robot: exact convex shapes, and the pairs that are kept apart."""
+"""Collision shapes of a robot: exact convex shapes, the pairs that are kept apart, and covering spheres."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ..robot._ranges import first_of
+from ..robot._size import robot_size
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
-from ._convex import ConvexShape, RobotShapes, geom_shape, shape_table
+from ._convex import ConvexShape, CoveringSpheres, RobotShapes, geom_shape, shape_table
+from ._given_spheres import Spheres, cover_by_given, read_spheres
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
+from ._spheres import cover
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None
@@ -57,6 +60,32 @@ def robot_shapes(robot: Robot, srdf: Given = None) -> RobotShapes:
             return _made(robot, srdf)
         is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
         return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
+
+
+def covering_spheres(robot: Robot, given: Spheres | str | os.PathLike[str] | None = None) -> CoveringSpheres:
+    """Return spheres that contain the collision shapes of a robot; made once, and kept in the cache folder.
+
+    Args:
+        robot: the robot.
+        given: spheres of your own: a ``.yaml`` of cuRobo, a URDF whose collision shapes are spheres, or
+            ``{link: [{"center": (x, y, z), "radius": r}]}`` in the links' axes [m]. They are grown until they are sure
+            to cover their shapes.
+
+    Raises:
+        FileNotFoundError: no such file; a mesh is not found.
+        KeyError: spheres of a link without collision shapes.
+        TypeError: the robot is traced, or the spheres are none.
+        ValueError: as of ``robot_shapes``; a file without spheres.
+
+    Warns:
+        OsikWarning: given spheres were grown, or shapes have none.
+    """
+    shapes = robot_shapes(robot)
+    convex = _solid(robot)[2]
+    given = read_spheres(_stamped(given, "spheres")[0]) if isinstance(given, str | os.PathLike) else given
+    size = float(robot_size(robot))
+    owner, balls = cover(convex, size) if given is None else cover_by_given(robot, given, shapes.links, convex, size)
+    return CoveringSpheres(shapes.names, owner, shapes.bodies[owner], *balls)
 
 
 def _stamped(path: Any, kind: str) -> tuple[str, int]:

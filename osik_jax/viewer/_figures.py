@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import mujoco
 import numpy as np
 from jaxtyping import ArrayLike, Float
 from PIL import Image
 
 from ..collision import CollisionShape
+from ..collision._convex import CoveringSpheres
 from ..robot import Robot
-from ..robot._mujoco import mujoco_poses, robot_com
+from ..robot._mujoco import model_bodies, mujoco_poses, robot_com
 from ._animate import paint_over
 from ._outline import floor_height
 from ._overlay import BLUE, INK, ORANGE, Canvas, ComMark, polygon_layer
-from ._parts import fixed_parts, robot_parts
+from ._parts import Part, RobotParts, fixed_parts, robot_parts
 from ._raycast import RayCaster
 from ._stage import Camera, Stage, frame_camera
 
@@ -86,6 +88,34 @@ def hero_picture(
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(paint_over(base, canvas.picture())).save(path, optimize=True)
     return Path(path)
+
+
+def sphere_picture(path: str | Path, robot: Robot, spheres: CoveringSpheres) -> Path:
+    """Save a picture (.png) of a robot at home, and beside it the spheres that cover its collision shapes."""
+    size, azimuth = (1600, 900), 30.0
+    figures = [robot_parts(robot), _sphere_parts(robot, spheres)]
+    source = next(mujoco_poses(robot, robot.q0))
+    corners = [figure.corners(source) for figure in figures]
+    shifts = _side_by_side(corners, azimuth, None)
+    seen = np.concatenate([points + shift for points, shift in zip(corners, shifts, strict=True)])
+    camera = frame_camera(seen, size, azimuth, 14.0, lens=_LONG_LENS)
+    floor = float(seen[:, 2].min())
+    stage = Stage(figures)
+    picture = RayCaster(stage, camera, size, floor=floor).image(stage.pose([source, source], shifts))
+    Image.fromarray((255.0 * np.clip(picture, 0.0, 1.0)).astype(np.uint8)).save(path, optimize=True)
+    return Path(path)
+
+
+def _sphere_parts(robot: Robot, spheres: CoveringSpheres) -> RobotParts:
+    """Return the covering spheres as parts; neighbouring shapes have different colours."""
+    colors = np.array([[0.16, 0.45, 0.75, 1.0], [0.93, 0.55, 0.19, 1.0], [0.35, 0.65, 0.35, 1.0]])
+    parts = tuple(
+        Part(k, mujoco.mjtGeom.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), colors[shape % len(colors)])
+        for k, (radius, shape) in enumerate(zip(spheres.radius, spheres.shape, strict=True))
+    )
+    bodies = np.array(model_bodies(robot))[spheres.body]
+    turns = np.broadcast_to(np.eye(3), (len(parts), 3, 3))
+    return RobotParts(robot.mj_model, "geoms", parts, bodies, (spheres.center, turns))
 
 
 def _side_by_side(

@@ -10,6 +10,7 @@ import pytest
 from core_checks import needs_core
 from model_files import MJCF
 from mujoco_states import mujoco_at
+from PIL import Image
 from small_files import files_of_at_most
 from urdfs import joint, tree
 
@@ -67,6 +68,20 @@ def test_info_of_the_system_says_which_core_is_loaded(capsys):
     said = capsys.readouterr().out
     assert _library.core().reason in said and "jaxlib" in said and "NVRTC" in said
     assert "--system" in refused(capsys, "info")
+
+
+@pytest.mark.slow
+def test_info_tells_of_the_spheres_and_draws_them(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    picture = tmp_path / "spheres.png"
+    assert cli.main(["info", "ur5", "--spheres", "--png", str(picture)]) == 0
+    printed = capsys.readouterr().out
+    assert "upper_arm_link:0" in printed and "no surface is uncovered" in printed
+    pixels = np.asarray(Image.open(picture).convert("RGB"), int)
+    orange = (pixels[..., 0] > pixels[..., 2] + 60).mean(0)  # the spheres are in the right half
+    assert pixels.shape == (900, 1600, 3) and orange[800:].sum() > 5.0 > orange[:800].sum()
+    assert "--given and --png go with --spheres" in refused(capsys, "info", "ur5", "--png", "a.png")
+    assert "no spheres file 'lost.yaml'" in refused(capsys, "info", "ur5", "--spheres", "--given", "lost.yaml")
 
 
 def test_missing_and_broken_files_are_named(capsys, tmp_path):
