@@ -1,7 +1,5 @@
 """SO-101: a policy gives chunks of joint positions that overlap; they become one smooth motion within all limits."""
 
-from typing import Any
-
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -11,7 +9,7 @@ from osik_jax.motion import Stream
 
 jax.config.update("jax_enable_x64", True)
 arm, rng = osik.load_robot("so101"), np.random.default_rng(0)
-limits: Any = {"velocity": 3.0, "acceleration": 20.0, "jerk": 400.0}
+limits = {"velocity": 3.0, "acceleration": 20.0, "jerk": 400.0}
 period, horizon, dt = 0.4, np.arange(30) / 30.0, 0.01  # a new chunk every 0.4 s, 30 waypoints in 1 s
 
 

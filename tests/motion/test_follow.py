@@ -121,7 +121,9 @@ def test_a_command_follows_a_file(tmp_path, capsys) -> None:
     rows = np.column_stack([POSES[0], quaternion])
     np.savetxt(tmp_path / "path.csv", rows, delimiter=",", header="x,y,z,qw,qx,qy,qz", comments="")
     given = ["follow", str(tmp_path / "path.csv"), "--robot", "arm7", "--frame", "hand", "--dt", "0.01"]
-    assert cli.main([*given, "--out", str(tmp_path / "motion.npz")]) == 0
+    pictures = ["--film", str(tmp_path / "m.gif"), "--picture", str(tmp_path / "m.png")]
+    assert cli.main([*given, "--out", str(tmp_path / "motion.npz"), *pictures]) == 0
+    assert (tmp_path / "m.gif").stat().st_size > 1000 and (tmp_path / "m.png").stat().st_size > 1000
     assert "off the path" in capsys.readouterr().out
     place, _ = placed(np.asarray(load_motion(tmp_path / "motion.npz").position))
     np.testing.assert_allclose(place[[0, -1]], POSES[0][[0, -1]], atol=1e-4)
