@@ -16,7 +16,6 @@ from ..execution._computed import in_shared_lanes
 from ..kinematics import Kinematics, forward_kinematics
 from ..numerics._host import is_traced
 from ..robot import Robot
-from ._convex import RobotShapes
 from ._core import (
     CoreRobot,
     CoreScene,
@@ -31,6 +30,7 @@ from ._core import (
 )
 from ._robot_shapes import Given, robot_shapes
 from ._scene import Scene
+from ._table import RobotShapes
 
 
 class Clearance(eqx.Module):

@@ -19,11 +19,11 @@ from ..numerics._guarded import at_most_inverse
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ._clearance import shape_frames
-from ._convex import RobotShapes
 from ._core import CoreScene, core_robot, core_scene
 from ._distance import Nearest, nearest_points
 from ._pair_layout import separation_jacobian
 from ._scene import Scene
+from ._table import RobotShapes
 
 _GEOMETRY = 29
 """Numbers of a pair in ``NearRows::put_geometry``."""

@@ -19,11 +19,11 @@ from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose_poses, cross
 from ..robot import Robot
 from ..robot._tree import KinematicTree, cached_arrays
-from ._convex import geom_hull
 from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
 from ._geometry import Kind, UnitCore, convex_hull, padded, unit_core, world_cores
 from ._pairs import Member
 from ._shape import CollisionShape
+from ._table import geom_hull
 
 _ROUNDS = 4
 """Searches for the depth of an overlap of shapes whose edges are not all known."""

@@ -21,10 +21,10 @@ from ..kinematics._rigid import compose, compose_poses, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
-from ._convex import ConvexShape, RobotShapes, ShapeKind, ShapeTable, shape_table, table_shapes
 from ._geometry import Kind
 from ._pairs import members
 from ._shape import CollisionShape
+from ._table import ConvexShape, RobotShapes, ShapeKind, ShapeTable, shape_table, table_shapes
 
 _Shape = CollisionShape | ConvexShape
 

@@ -20,8 +20,8 @@ from ..robot.loading._poses import IDENTITY, Pose, rotation_matrix
 from ..robot.loading._source import Source, check_root, parse_xml, read_source
 from ..robot.loading._urdf import unread_meshes, urdf_spec
 from ..robot.loading._urdf_elements import read_urdf
-from ._convex import ConvexShape, ShapeKind, hull_vertices, model_shape
 from ._mesh_parts import convex_parts
+from ._table import ConvexShape, ShapeKind, hull_vertices, model_shape
 
 Objects = dict[str, list[ConvexShape]]
 """Shapes of each object in the world."""

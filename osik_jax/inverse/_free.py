@@ -14,7 +14,6 @@ from jaxtyping import Array, Int
 
 from .._errors import OsikError, OsikValueError
 from ..collision._clearance import differentiable, distances, shape_names
-from ..collision._convex import RobotShapes
 from ..collision._core import (
     CoreRobot,
     CoreScene,
@@ -27,6 +26,7 @@ from ..collision._core import (
 )
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
+from ..collision._table import RobotShapes
 from ..execution._blocks import first_axes_as_one
 from ..execution._platform import cuda_is_default
 from ..limits import CollisionAvoidanceLimit, Limit

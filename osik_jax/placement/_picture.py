@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import ConvexHull
 
 from ..collision import Scene
-from ..collision._convex import ShapeKind
+from ..collision._table import ShapeKind
 from ..reachability._slices import NOTHING, cell_edges, share_colors
 
 _INK, _GREY, _BEST = "#2b2f36", "#5b636d", "#f08c3a"

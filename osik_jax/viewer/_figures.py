@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Float
 from PIL import Image
 
 from ..collision import CollisionShape
-from ..collision._convex import CoveringSpheres
+from ..collision._table import CoveringSpheres
 from ..robot import Robot
 from ..robot._mujoco import model_bodies, mujoco_poses, robot_com
 from ._animate import paint_over

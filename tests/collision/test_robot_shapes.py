@@ -9,8 +9,8 @@ from refusals import no_warnings, refuses
 from robot_support import beside_pinocchio, directions, table_support
 
 import osik_jax as osik
-from osik_jax.collision._convex import ShapeKind
 from osik_jax.collision._robot_shapes import robot_shapes
+from osik_jax.collision._table import ShapeKind
 from osik_jax.robot.loading._named import EXAMPLES
 from osik_jax.robot.loading._srdf import read_srdf
 

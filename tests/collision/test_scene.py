@@ -16,8 +16,8 @@ from refusals import no_warnings, refuses
 from robot_support import coal_support, directions, pinocchio_geometry, table_support
 
 import osik_jax as osik
-from osik_jax.collision._convex import ShapeKind, ShapeTable
 from osik_jax.collision._robot_shapes import robot_shapes
+from osik_jax.collision._table import ShapeKind, ShapeTable
 
 SHAPE = osik.CollisionShape
 TURN = np.array([0.6, 0.0, 0.8, 0.0])  # w x y z

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 import osik_jax as osik
-from osik_jax.collision._convex import RobotShapes, ShapeKind, ShapeTable
+from osik_jax.collision._table import RobotShapes, ShapeKind, ShapeTable
 
 
 def directions(count: int = 200) -> np.ndarray:

@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...collision._convex import ConvexShape, ShapeKind, table_shapes
 from ...collision._core import core_scene, gaps_at
 from ...collision._geometry import Kind
+from ...collision._table import ConvexShape, ShapeKind, table_shapes
 from ...limits import CollisionAvoidanceLimit, Limit
 from .._parts import Part
 
