@@ -114,7 +114,7 @@ def test_a_home_outside_is_kept_with_a_warning(arm, home):
 
 @pytest.mark.parametrize("home", ["outside", 1], ids=["keyframe", "its number"])
 def test_a_keyframe_outside_is_brought_inside_with_a_warning(arm, home):
-    with pytest.warns(osik.OsikWarning, match="b is 1, its range is .*0\.785398"):
+    with pytest.warns(osik.OsikWarning, match=r"b is 1, its range is .*0\.785398"):
         moved = arm.with_home(home)
     np.testing.assert_allclose(moved.q0, [0.0, np.pi / 4, 0.0])
     with pytest.warns(osik.OsikWarning, match="b is 1, its"):
