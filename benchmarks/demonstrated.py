@@ -12,8 +12,7 @@ from osik_jax.demo._motion import GAIN, MARGIN, Motion, Rows, Stance, along, tra
 from osik_jax.kinematics import forward_kinematics
 from osik_jax.physics._world import contact_corners
 from osik_jax.robot import Robot
-from osik_jax.robot._feet import guess_feet
-from osik_jax.robot._hands import find_hands
+from osik_jax.robot._guesses import find_hands, guess_feet
 from osik_jax.tasks import ComTask, FrameTask, PostureTask, Task, support_polygon
 from osik_jax.viewer._crouch import crouched
 

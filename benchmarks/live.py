@@ -22,7 +22,7 @@ import numpy as np
 
 import osik_jax as osik
 from osik_jax.cli import read_robot
-from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._guesses import guess_feet
 from osik_jax.runtime import configure_cpu
 from osik_jax.viewer.live import _open
 from osik_jax.viewer.live._loop import Stopwatch

@@ -28,7 +28,7 @@ place = jax.jit(jax.vmap(lambda q: osik.forward_kinematics(arm, q).frame_pose(ar
 drawn = np.asarray(place(sampled.position))
 speed = np.linalg.norm(np.diff(drawn, axis=0), axis=1) / 0.001
 at_speed = np.mean(np.abs(speed - wanted) < 0.01 * wanted)
-print(f"{motion.duration:.2f} s, {1e3 * motion.position_error:.4f} mm off its seam; ", end="")
+print(f"{motion.duration:.2f} s, {1e3 * motion.position_error:.4f} mm off its seam")
 print(
     f"at {wanted} m/s for {100 * at_speed:.0f} % of the time; joints up to {np.abs(sampled.velocity).max():.2f} rad/s"
 )

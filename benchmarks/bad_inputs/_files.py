@@ -11,7 +11,6 @@ from ._given import Add, F, K, T, V, arm
 from ._models import (
     JOINT_IN_MJCF,
     LIMIT,
-    MESH,
     MESH_IN_MJCF,
     bomb,
     folder,
@@ -83,12 +82,6 @@ def files(add: Add) -> None:
         "negative",
     )
     add("an axis of zeros", lambda: one_joint(inner='<axis xyz="0 0 0"/>' + LIMIT), V, "axis is zero")
-    add(
-        "a mesh that is not there, asked for",
-        lambda: urdf(link("a", MESH), link("b"), joint("j", "a", "b"), collision_meshes=True),
-        F,
-        "package_dirs",
-    )
     add("no joint", lambda: urdf(link("a")), V, "no joint")
     add("fixed joints alone", lambda: one_joint(kind="fixed", inner=""), V, "no joint")
     add("all joints locked", lambda: two_joints(locked_joints=("*",)), V, "j1, j2, all locked")

@@ -10,7 +10,7 @@ import numpy as np
 from .._errors import OsikKeyError, OsikValueError
 from ..numerics._columns import read_columns
 from ..robot import Robot
-from ..robot.loading._mjmodel import rotation_matrix
+from ..robot.loading._poses import rotation_matrix
 from ._measurements import Distances, Measurement, Pixels, PlaneContacts, Points, Poses
 
 _POSITION, _QUATERNION, _PIXEL = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("u", "v")

@@ -103,6 +103,6 @@ def _keeps_off(robot: Robot, scene: Scene, srdf: Path | None, clearance: float) 
 
 def _feet(robot: Robot) -> tuple[str, ...]:
     """Return frames on the ground, of a robot that moves freely."""
-    from ..robot._feet import guess_feet
+    from ..robot._guesses import guess_feet
 
     return guess_feet(robot) if robot.floating_base else ()

@@ -22,9 +22,8 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._tree import KinematicTree
-from ._convex import bounding_ball, table_shapes
 from ._scene import Scene
-from ._table import RobotShapes, ShapeKind, ShapeTable
+from ._table import RobotShapes, ShapeKind, ShapeTable, bounding_ball, table_shapes
 
 _SPREAD = 32
 """Vertices of a hull in all directions, from which the core begins to look for the farthest one."""

@@ -124,18 +124,6 @@ def convex_hull(points: np.ndarray) -> UnitCore:
     )
 
 
-def mesh_hull(model: mujoco.MjModel, geom: int) -> UnitCore:
-    """Return the hull of a mesh geom: MuJoCo's own if it has one, so no finer than its ``maxhullvert``."""
-    mesh = model.geom_dataid[geom]
-    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    points = model.mesh_vert[start : start + count]
-    graph = model.mesh_graphadr[mesh]
-    if graph >= 0:
-        number = model.mesh_graph[graph]
-        points = points[model.mesh_graph[graph + 2 + number : graph + 2 + 2 * number]]
-    return convex_hull(points)
-
-
 def qhull(points: np.ndarray) -> scipy.spatial.ConvexHull:
     """Return the convex hull of points; ValueError if they lie in a plane or are not finite."""
     try:

@@ -12,11 +12,11 @@ from jaxtyping import Float, Int
 
 from .._errors import OsikTypeError, OsikValueError, missing_extra, unknown_name, warn
 from ..robot import Robot
-from ..robot._plausible import first_of
+from ..robot._ranges import first_of
 from ..robot.loading._source import check_root, parse_xml, read_source
 from ..robot.loading._urdf_elements import read_urdf
-from ._convex import ConvexShape
 from ._spheres import Balls, covering_balls, needed_radii, overshoots
+from ._table import ConvexShape
 
 Spheres = Mapping[str, Sequence[Mapping[str, Any]]]
 """``{link: [{"center": (x, y, z), "radius": r}, ...]}`` in the axes of the link [m], as in cuRobo's files."""

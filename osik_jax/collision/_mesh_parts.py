@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from .._errors import OsikTypeError, OsikValueError, warn
 from ..robot.loading._meshes import joined, read_mesh
 from ..robot.loading._packages import Packages
-from ._convex import hull_vertices
 from ._geometry import qhull
+from ._table import hull_vertices
 
 _CONVEX = 0.99
 """A closed mesh that fills this share of its hull is taken for convex."""

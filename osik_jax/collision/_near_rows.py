@@ -14,7 +14,7 @@ from ..core import _library
 from ..execution._computed import in_shared_lanes
 from ..execution._rules import custom_jvp
 from ..kinematics import Kinematics
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics
 from ..numerics._guarded import at_most_inverse
 from ..numerics._remembered import remembered
 from ..robot import Robot

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,13 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._errors import OsikError, OsikValueError, warn
 from ..kinematics import Kinematics
 from ..kinematics._forward import independent_columns
 from ..kinematics._rigid import compose_poses, cross
 from ..robot import Robot
 from ..robot._tree import KinematicTree, cached_arrays
 from ._distance import Core, Nearest, between_polytopes, between_segments, from_plane
-from ._geometry import Kind, UnitCore, padded, unit_core, world_cores
+from ._geometry import Kind, UnitCore, convex_hull, padded, unit_core, world_cores
+from ._pairs import Member
+from ._shape import CollisionShape
+from ._table import geom_hull
 
 _ROUNDS = 4
 """Searches for the depth of an overlap of shapes whose edges are not all known."""
@@ -168,3 +172,37 @@ def separation_jacobian(
     moves = tree.moves if isinstance(bodies, np.ndarray) else jnp.asarray(tree.moves)
     rate = along(near.point_b, moves[bodies[:, 1]]) - along(near.point_a, moves[bodies[:, 0]])
     return independent_columns(tree, rate)
+
+
+Hulls = dict[int, UnitCore]
+"""Convex hulls of shapes, by the number of the member."""
+
+
+def read_hulls(
+    robot: Robot, scene: Sequence[Member], shapes: Mapping[str, CollisionShape], pairs: Sequence[tuple[int, int]]
+) -> tuple[Hulls, list[tuple[int, int]]]:
+    """Return the hulls of the members of these pairs, and the pairs without members whose file cannot be read.
+
+    Raises:
+        ValueError: no pair is left.
+
+    Warns:
+        OsikWarning: collision meshes that cannot be read take no part.
+    """
+    hulls: Hulls = {}
+    lost: dict[int, str] = {}
+    for k in sorted({k for pair in pairs for k in pair if scene[k].kind is Kind.HULL}):
+        try:
+            own = shapes[scene[k].name].hull if scene[k].added else None
+            hulls[k] = convex_hull(geom_hull(robot, k)) if own is None else own
+        except (OSError, OsikError) as error:
+            lost[k] = f"{scene[k].label}: {error}"
+    kept = [pair for pair in pairs if not lost.keys() & set(pair)]
+    if lost and not kept:
+        raise OsikValueError(f"no collision mesh of the robot can be read: {'; '.join(lost.values())}")
+    if lost:
+        warn(
+            f"{len(lost)} collision meshes cannot be read, so nothing keeps away from them: "
+            f"{'; '.join(lost.values())}. Name folders of packages in package_dirs, or add shapes for these links"
+        )
+    return hulls, kept

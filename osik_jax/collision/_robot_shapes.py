@@ -14,15 +14,14 @@ from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ..robot._made_for import check_robot
-from ..robot._plausible import first_of
+from ..robot._ranges import first_of
 from ..robot._size import robot_size
 from ..robot.loading._source import read_source
 from ..robot.loading._srdf import Srdf, read_srdf, srdf_beside
-from ._convex import ConvexShape, geom_shape, shape_table
 from ._given_spheres import Spheres, cover_by_given, read_spheres
 from ._pairs import Member, members, moves, own_pairs, refuse_without_distance
 from ._spheres import cover
-from ._table import CoveringSpheres, RobotShapes
+from ._table import ConvexShape, CoveringSpheres, RobotShapes, geom_shape, shape_table
 from ._touching import SAMPLES, always_touching
 
 Given = str | os.PathLike[str] | Srdf | Literal[True] | None

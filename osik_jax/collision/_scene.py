@@ -15,17 +15,16 @@ from jaxtyping import Array, Bool, Int
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name
-from ..kinematics._home import kinematics_on_host
+from ..kinematics._forward import kinematics_on_host
 from ..kinematics._pose_forms import Pose, PoseLike, as_pose
 from ..kinematics._rigid import compose, compose_poses, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
-from ._convex import ConvexShape, shape_table, table_shapes
 from ._geometry import Kind
 from ._pairs import members
 from ._shape import CollisionShape
-from ._table import RobotShapes, ShapeKind, ShapeTable
+from ._table import ConvexShape, RobotShapes, ShapeKind, ShapeTable, shape_table, table_shapes
 
 _Shape = CollisionShape | ConvexShape
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,14 +13,15 @@ import numpy as np
 from jaxtyping import Float
 
 from .._errors import OsikValueError, missing_extra, warn
-from ..robot.loading._mjmodel import element_names, rotation_matrix
+from ..robot.loading._meshes import unread_points
+from ..robot.loading._mjmodel import element_names
 from ..robot.loading._packages import Packages
+from ..robot.loading._poses import IDENTITY, Pose, rotation_matrix
 from ..robot.loading._source import Source, check_root, parse_xml, read_source
-from ..robot.loading._urdf import compiled_with_meshes
-from ..robot.loading._urdf_elements import IDENTITY, Pose, read_urdf
-from ._convex import ConvexShape, model_shape
+from ..robot.loading._urdf import unread_meshes, urdf_spec
+from ..robot.loading._urdf_elements import read_urdf
 from ._mesh_parts import convex_parts
-from ._table import ShapeKind
+from ._table import ConvexShape, ShapeKind, hull_vertices, model_shape
 
 Objects = dict[str, list[ConvexShape]]
 """Shapes of each object in the world."""
@@ -65,10 +67,29 @@ def _xml(path: Path) -> SceneFile:
     source = read_source(path, "scene")
     root = parse_xml(source)
     if root.tag == "robot":
-        model = _urdf_model(root, source)
-    else:
-        check_root(root, "mujoco", source)
-        model = mujoco.MjModel.from_xml_path(str(path))
+        return SceneFile(_urdf_objects(root, source))
+    check_root(root, "mujoco", source)
+    return SceneFile(_objects(mujoco.MjModel.from_xml_path(str(path))))
+
+
+def _urdf_objects(root: ElementTree.Element, source: Source) -> Objects:
+    """Return the collision shapes of a URDF; meshes are their convex hulls."""
+    urdf = read_urdf(root)
+    model = urdf_spec(urdf).compile()
+    data, objects = mujoco.MjData(model), _objects(model)
+    mujoco.mj_kinematics(model, data)
+    for name, mesh in unread_meshes(urdf, Packages(), source.path):
+        is_root = mesh.link == urdf.root
+        body = 0 if is_root else model.body(mesh.link).id
+        carrier = Pose(data.xpos[body], data.xmat[body].reshape(3, 3))
+        pose = carrier @ Pose(np.array(mesh.position), np.array(mesh.rotation))
+        shape = ConvexShape(ShapeKind.HULL, np.zeros(3), *pose, hull_vertices(unread_points(mesh)))
+        objects.setdefault(name or "world" if is_root else mesh.link, []).append(shape)
+    return objects
+
+
+def _objects(model: mujoco.MjModel) -> Objects:
+    """Return the shapes of a model that collide, by link or body; those of the world by their own names."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     bodies, objects = element_names(model, "body"), Objects()
@@ -76,14 +97,7 @@ def _xml(path: Path) -> SceneFile:
         body, name = model.geom_bodyid[geom], mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
         shape = model_shape(model, data, int(geom))
         objects.setdefault(bodies[body] if body or not name else name, []).append(shape)
-    return SceneFile(objects)
-
-
-def _urdf_model(root: Any, source: Source) -> mujoco.MjModel:
-    model, notes = compiled_with_meshes(read_urdf(root), Packages(), source.path)
-    for note in notes:
-        warn(f"{source.label}: {note}")
-    return model
+    return objects
 
 
 def _yaml(path: Path) -> SceneFile:

@@ -22,9 +22,8 @@ from jaxtyping import Float, Int
 from .._npz import open_npz
 from .._whole_file import whole_file
 from ..core._cuda import cache_folder
-from ._convex import ConvexShape
 from ._geometry import prism, qhull, reach_outside, thinned
-from ._table import ShapeKind
+from ._table import ConvexShape, ShapeKind
 
 LEAST = 0.008
 """Overshoot that is small enough for any shape, as a share of the robot's size."""

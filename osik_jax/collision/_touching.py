@@ -12,9 +12,8 @@ from jaxtyping import Float
 from ..kinematics._forward import kinematics_at
 from ..robot import Robot
 from ..robot._tree import HINGE, SLIDE
-from ..robot.loading._mjmodel import quaternion
-from ._convex import ConvexShape, bounding_ball
-from ._table import ShapeKind
+from ..robot.loading._poses import quaternion
+from ._table import ConvexShape, ShapeKind, bounding_ball
 
 SAMPLES = 1000
 """Number of configurations; a pair that is apart in 1 % of all is taken for always touching with a chance of 4e-5."""

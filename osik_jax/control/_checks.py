@@ -24,7 +24,7 @@ from ..numerics._host import float_now, is_traced
 from ..robot import Robot
 from ..robot._configuration import check_configuration
 from ..robot._made_for import check_made_for, check_robot
-from ..robot._plausible import warn_of_far_joints
+from ..robot._ranges import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
 from ..schemes._default import priorities
 from ..tasks import Task, TaskRows

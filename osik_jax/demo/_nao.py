@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics
 from ..physics._world import contact_corners
 from ..robot import Robot, load_robot
 from ..tasks import ComTask, PostureTask, Task, support_polygon

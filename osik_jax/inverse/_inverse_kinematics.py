@@ -24,7 +24,7 @@ from ..numerics._host import is_traced, untraced
 from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
 from ..robot._configuration import check_configuration
-from ..robot._plausible import warn_of_far_joints
+from ..robot._ranges import warn_of_far_joints
 from ..schemes import Scheme
 from ..tasks import Task
 from ._advice import advice

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..kinematics import integrate
 from ..limits import ConfigurationLimit, limit_box
-from ..robot._balls import independent_balls
+from ..robot._ranges import independent_balls
 from ..schemes import WeightedQP
 from ._minimum import inverse_hessian, minimum
 

@@ -16,8 +16,8 @@ from ..kinematics import difference, forward_kinematics
 from ..limits import CollisionAvoidanceLimit, ConfigurationLimit, Limit, limit_box, with_own_limits
 from ..numerics._host import is_traced, on_host
 from ..robot import Robot
-from ..robot._balls import ball_rotation, independent_balls, with_balls_inside
 from ..robot._joint_selection import dof_names, dofs_of
+from ..robot._ranges import ball_rotation, independent_balls, with_balls_inside
 from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
 from ..tasks import FrameTask, Task

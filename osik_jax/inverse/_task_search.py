@@ -16,8 +16,8 @@ from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..numerics._arguments import numbers_for
 from ..robot import Robot
-from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
+from ..robot._ranges import independent_balls, with_balls_inside
 from ..schemes import Scheme, VelocityProblem
 from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of

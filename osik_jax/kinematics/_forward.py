@@ -341,3 +341,19 @@ def _frames_by_kernel(
 _bodies = by_kernel(_fields, _kernels.bodies)
 _moving_frames = by_kernel(_frames, _frames_by_kernel)
 _moving_center = by_kernel(_center_and_jacobian, _kernels.center_of_mass)
+
+
+def home_kinematics(robot: Robot) -> Kinematics:
+    """Return the kinematics at the robot's home configuration: arrays of NumPy, unless the robot is traced."""
+    return kinematics_on_host(robot, robot.q0)
+
+
+def kinematics_on_host(robot: Robot, q: Float[Numbers, " nq"]) -> Kinematics:
+    """Return ``forward_kinematics`` as arrays of NumPy, or of JAX if the robot or q is traced."""
+    if is_traced((robot, q)):
+        return forward_kinematics(robot, q)
+    check_robot(robot, "forward_kinematics(robot, q)")
+    check_configuration(robot, q, "q")
+    host = jax.tree.map(lambda leaf: np.asarray(leaf, float), robot)
+    found = kinematics_at(host, np.asarray(q, float))
+    return jax.tree.map(lambda leaf: leaf.astype(robot.q0.dtype), found)

@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 
 from ..numerics._guarded import rate_of_way
 from ..robot import Robot
-from ..robot._balls import ball_rotation, independent_balls
 from ..robot._joint_selection import dofs_of
+from ..robot._ranges import ball_rotation, independent_balls
 from ._box import Time
 
 MARGIN = 0.002

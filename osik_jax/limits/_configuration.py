@@ -17,8 +17,8 @@ from ..numerics._constants import RANGE_ROUNDOFF
 from ..numerics._guarded import rate_of_way
 from ..numerics._host import Numbers, module_of, on_host, to_jax
 from ..robot import Robot
-from ..robot._balls import independent_balls
 from ..robot._joint_selection import dof_names, dof_values, dofs_of, scalar_layout
+from ..robot._ranges import independent_balls
 from ._ball import MARGIN, SHORTEST, BallRates, ball_rates
 from ._box import Box, Kind, Limit, LimitRows, Time
 

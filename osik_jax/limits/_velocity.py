@@ -16,7 +16,7 @@ from ..kinematics import Kinematics
 from ..numerics._arguments import as_vector, concrete, entries
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
-from ..robot._plausible import warn_of_fast_joints
+from ..robot._ranges import warn_of_fast_joints
 from ..robot._tree import FREE
 from ._box import Box, Kind, Limit, LimitRows, Time
 

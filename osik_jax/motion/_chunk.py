@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -218,18 +218,13 @@ def _points(robot: Robot, waypoints: Any, near: Array | None) -> Float[Array, "N
     return jnp.asarray(found.q)
 
 
-class _Rows(NamedTuple):
-    """Linear maps from the coefficients of a spline. D is the number of rows, K3 that of coefficients."""
+def _differences(cells: int, free: int) -> list[Float[np.ndarray, "D K3"]]:
+    """Return maps from coefficients to their three differences, as far as these depend on the ``free`` ones.
 
-    matrix: Float[np.ndarray, "D K3"]
-    order: np.ndarray
-    """Order of the difference that each row is: 1 to 3. (D,)"""
-
-
-def _rows(cells: int, free: int) -> _Rows:
-    """Return the differences of coefficients that depend on free ones, those from the fourth to ``3 + free``."""
-    parts = [np.diff(np.eye(cells + 3), n=order, axis=0)[3 - order :][: free + order - 1] for order in (1, 2, 3)]
-    return _Rows(np.concatenate(parts), np.repeat([1, 2, 3], [len(part) for part in parts]))
+    Those are the coefficients from the fourth to ``3 + free``.
+    """
+    every = [np.diff(np.eye(cells + 3), n=order, axis=0) for order in (1, 2, 3)]
+    return [rows[3 - order :][: free + order - 1] for order, rows in enumerate(every, 1)]
 
 
 @partial(jax.jit, static_argnames=("cells", "rest"))
@@ -260,11 +255,13 @@ def _fitted(
     free = cells - 2 if rest else cells
     spread = np.eye(cells + 3, free, -3)
     spread[3 + free :, -1] = 1.0  # equal coefficients at the end: rest
-    rows = _rows(cells, free)
+    parts = _differences(cells, free)
+    rows, kind = np.concatenate(parts), np.repeat([0, 1, 2], [len(part) for part in parts])
+    place = np.concatenate([np.arange(len(part)) for part in parts])
     third = np.diff(np.eye(cells + 3), n=3, axis=0)
     cost = jnp.concatenate([fit, jnp.asarray(third, fit.dtype)])
     weight = jnp.concatenate([jnp.ones(len(fit), fit.dtype), jnp.full(len(third), smoothing)])
-    moved = rows.matrix @ spread
+    moved = rows @ spread
 
     def solved(joint: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
         """Return the coefficients of one joint, and whether limits hold."""
@@ -274,8 +271,8 @@ def _fitted(
         first = _first_coefficients(state, width)
         fixed = jnp.zeros(cells + 3, first.dtype).at[:3].set(first)
         box, spans = _spans(first, width, bounds, limits, cells)
-        lower, upper = spans[rows.order - 1, :, np.concatenate([np.arange(n) for n in _counts(rows)])].T
-        shift = rows.matrix @ fixed
+        lower, upper = spans[kind, :, place].T
+        shift = rows @ fixed
         target = jnp.concatenate([wanted, jnp.zeros(len(third), first.dtype)]) - cost @ fixed
         answer = solve_least_squares_qp(
             cost @ spread, target, weight, *box[:, :free], moved, lower - shift, upper - shift, damping=_DAMPING
@@ -287,10 +284,6 @@ def _fitted(
     miss = jnp.where(is_ahead[:, None], weights @ found.T - points, 0.0)
     is_inside = _is_inside(jax.lax.stop_gradient(found.T), width, bounds, limits)
     return begin, width, found.T, miss, feasible & is_inside & is_finite
-
-
-def _counts(rows: _Rows) -> list[int]:
-    return [int((rows.order == order).sum()) for order in (1, 2, 3)]
 
 
 def _basis(time: Array, begin: Array, width: Array, cells: int) -> tuple[Float[Array, "T K3"], Bool[Array, " T"]]:

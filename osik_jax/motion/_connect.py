@@ -20,6 +20,7 @@ from ..numerics._arguments import check_count
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names, dofs_of, select_all
+from ._jerk import CUBIC
 from ._obstacles import Obstacles
 from ._retime import Limit, retime
 from ._spline import Spline
@@ -262,9 +263,7 @@ def _rounded(vertices: Float[np.ndarray, "k n"], radii: Float[np.ndarray, " k"],
 
 def _cubic(points: Float[np.ndarray, "4 n"], width: float) -> Float[np.ndarray, "4 n"]:
     """Return the coefficients of a piece of the uniform cubic B-spline."""
-    a, b, c, d = points
-    rows = [(a + 4 * b + c) / 6, (c - a) / 2, (a - 2 * b + c) / 2, (d - a + 3 * (b - c)) / 6]
-    return np.stack([row / width**power for power, row in enumerate(rows)])
+    return CUBIC @ points / width ** np.arange(4)[:, None]
 
 
 def _halves(width: float, own: Float[np.ndarray, "4 n"]) -> list[tuple[float, np.ndarray]]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._forward import body_masses
 from ..robot import Robot
-from ..robot._feet import with_corners
+from ..robot._guesses import with_corners
 from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose
 from ..robot._tree import BALL, FREE
 from ..robot.loading._mjmodel import element_names

@@ -12,11 +12,10 @@ from jaxtyping import Float, Int
 
 from .._errors import OsikTypeError, OsikValueError
 from ..collision import Scene
-from ..collision._convex import ConvexShape, shape_table
 from ..collision._core import core_robot, core_scene, gaps_at
 from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Labels, _with
-from ..collision._table import RobotShapes
+from ..collision._table import ConvexShape, RobotShapes, shape_table
 from ..kinematics._rigid import compose, rotate
 from ..numerics._host import Numbers, module_of
 from ..robot import Robot

@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 from .._errors import OsikValueError, unknown_name
 from ..collision import Scene
-from ..collision._convex import ConvexShape, table_shapes
 from ..collision._robot_shapes import robot_shapes
 from ..collision._scene import with_objects
-from ..collision._table import RobotShapes
+from ..collision._table import ConvexShape, RobotShapes, table_shapes
 from ..kinematics import forward_kinematics
 from ..kinematics._rigid import compose_poses
 from ._bases import base_poses, grid_bases, shape_clearances

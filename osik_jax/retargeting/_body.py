@@ -14,8 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from .._errors import OsikValueError
-from ..kinematics._forward import independent_columns
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics, independent_columns
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._contact import stretches

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics
 from ..robot import Robot
 
 _LEFT = re.compile(r"(?i:left)|^[lL](?=[_A-Z0-9])|[_.][lL](?:$|[_.])")

@@ -13,8 +13,8 @@ from ..kinematics import difference, integrate
 from ..limits import AccelerationLimit, Limit, limit_box
 from ..limits._acceleration import stopping_speed
 from ..robot import Robot
-from ..robot._balls import independent_balls, with_balls_inside
 from ..robot._joint_selection import scalar_layout
+from ..robot._ranges import independent_balls, with_balls_inside
 
 _SPARE = 0.1
 """Share of the acceleration limit that is used to return to the plan."""

@@ -11,10 +11,10 @@ import numpy as np
 
 from .._errors import OsikValueError, warn
 from ..kinematics import Kinematics
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics
 from ..physics._world import contact_corners, sole_points
 from ..robot import Robot
-from ..robot._feet import find_feet
+from ..robot._guesses import find_feet
 from ..robot._mujoco import own_masses
 from ..robot._tree import BALL, FREE, HINGE
 from ._facing import by_name, facing_x

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..kinematics import Kinematics, forward_kinematics
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._goals import Weights

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from .._errors import OsikError
 from ..robot import Robot
 from ..robot.loading._meshes import unread_points
-from ..robot.loading._mjmodel import rotation_matrix
+from ..robot.loading._poses import rotation_matrix
 
 _LIGHTEST, _DENSEST = 200.0, 20_000.0
 """Accepted link densities [kg/m^3]. The lightest link of G1, NAO, Talos, GR1T2 and GR3 has 210 (a Talos' head); no

@@ -13,8 +13,7 @@ from jaxtyping import Array, Float
 
 from ..collision._distance import Nearest, _across, _parameters, _rounded, _segment_parameters
 from ..kinematics import Kinematics, forward_kinematics
-from ..kinematics._forward import independent_columns
-from ..kinematics._home import home_kinematics
+from ..kinematics._forward import home_kinematics, independent_columns
 from ..kinematics._rigid import cross, rotate
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
-from ._balls import ball_rotation, with_balls_inside
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
-from ._tree import BALL, HINGE, QPOS_WIDTH, SLIDE
+from ._ranges import inside, joints_outside
+from ._tree import QPOS_WIDTH
 from .loading._keyframes import keyframe_home, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
@@ -92,27 +92,14 @@ def _without_roundings(robot: RobotModel, q: np.ndarray) -> Float[Array, " nq"]:
     """Return the configuration with roundoff beyond ranges removed; warn of joints farther outside."""
     if isinstance(robot.position_lower, Tracer):
         return to_jax(q)
-    lower, upper = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
-    out, inside = [], q.copy()
-    turned_back = with_balls_inside(robot.tree, q, upper)
-    for joint, start in robot.tree.qpos_address.items():
-        if robot.tree.joint_types[joint] in (HINGE, SLIDE):
-            low, high = (bound[robot.tree.dof_address[joint]] for bound in (lower, upper))
-            nearest = np.clip(q[start], low, high)
-            if abs(nearest - q[start]) > _OUTSIDE:
-                out.append(f"{robot.tree.joint_names[joint]} is {q[start]:g}, its range is [{low:g}, {high:g}]")
-            else:
-                inside[start] = nearest
-        elif robot.tree.joint_types[joint] == BALL:
-            angle = float(ball_rotation(q[start : start + 4])[0])
-            greatest = upper[robot.tree.dof_address[joint]]
-            if angle > greatest + _OUTSIDE:
-                out.append(f"{robot.tree.joint_names[joint]} is turned by {angle:g}, its range is [0, {greatest:g}]")
-            else:
-                inside[start : start + 4] = turned_back[start : start + 4]
+    ranges = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    kept, out = inside(robot.tree, q, *ranges), joints_outside(robot.tree, q, *ranges, _OUTSIDE)
+    for joint in out:
+        part = slice(start := robot.tree.qpos_address[joint], start + QPOS_WIDTH[robot.tree.joint_types[joint]])
+        kept[part] = q[part]
     if out:
         warn(
-            f"home is outside the joints' ranges (radians, metres): {'; '.join(out)}. It is kept as given; the robot "
-            "returns from there at the return_speed of ConfigurationLimit"
+            f"home is outside the joints' ranges (radians, metres): {'; '.join(out.values())}. It is kept as given; "
+            "the robot returns from there at the return_speed of ConfigurationLimit"
         )
-    return to_jax(inside)
+    return to_jax(kept)

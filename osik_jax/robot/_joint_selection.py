@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import fnmatch
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from .._errors import OsikTypeError, OsikValueError, unknown_name
+from .._errors import OsikTypeError, OsikValueError
 from ..numerics._arguments import as_array
 from ..numerics._host import on_host, replaced_at, to_jax
 from ._robot import Robot
 from ._tree import DOF_WIDTH, FREE, HINGE, SLIDE
+from .loading._followers import match_names
 
 
 def select_joints(robot: Robot, pattern: str) -> list[int]:
     """Return the independent joints named ``pattern``, else those (except free joints) that match it as a glob."""
-    names = {robot.tree.joint_names[j]: j for j in robot.tree.independent}
-    if pattern in names:
-        return [names[pattern]]
-    matches = [j for name, j in names.items() if fnmatch.fnmatchcase(name, str(pattern))]
-    found = [j for j in matches if robot.tree.joint_types[j] != FREE]
-    if not found:
-        raise unknown_name("joint", pattern, tuple(names))
-    return found
+    names, kinds = robot.tree.joint_names, robot.tree.joint_types
+    own = [j for j in robot.tree.independent if kinds[j] != FREE or names[j] == pattern]
+    return [own[k] for k in match_names("joint", pattern, tuple(names[j] for j in own))]
 
 
 def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:

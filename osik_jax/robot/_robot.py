@@ -19,7 +19,7 @@ from ._configuration import check_configuration, with_joints
 from ._describe import described
 from ._home_configuration import Home, home_configuration
 from ._model import RobotModel
-from ._plausible import warn_of_far_joints
+from ._ranges import warn_of_far_joints
 from ._replace import Factors, replaced_leaves, scaled_leaves
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
@@ -71,11 +71,12 @@ class Robot(RobotModel):
         position_limits: PositionLimits | None = None,
         locked_joints: LockedJoints = (),
         home: Home | None = None,
-        collision_meshes: bool = False,
         package_dirs: Iterable[str | os.PathLike[str]] = (),
         root: str | Sequence[str] | None = None,
     ) -> Robot:
-        """Load a URDF. Boxes, spheres, cylinders and capsules are kept as geoms; no mesh file is read unless asked.
+        """Load a URDF. Boxes, spheres, cylinders and capsules are kept as geoms.
+
+        Mesh files (DAE, STL, OBJ, MSH) are read when a picture or an avoidance of collisions needs them.
 
         Every link is a frame, with or without a joint of its own. Limits come from ``<limit>``: no ``<limit>`` means
         none, an absent ``lower`` or ``upper`` is 0 as the format has it, and a velocity of 0 or none means unknown,
@@ -97,15 +98,12 @@ class Robot(RobotModel):
             locked_joints: names or globs of joints to freeze at 0, or a mapping from them to the values to freeze at
                 [rad or m]. A mimic joint is locked by locking its leader.
             home: what ``q0`` is, see ``with_home``. Default: zeros, brought inside the joints' ranges.
-            collision_meshes: read the collision shapes that are meshes (DAE, STL, OBJ, MSH) into ``mj_model``. Without,
-                their files are read when a ``CollisionAvoidanceLimit`` needs them.
             package_dirs: folders that are ROS packages or hold some, for ``package://`` addresses. Then
                 ``ROS_PACKAGE_PATH`` and ``AMENT_PREFIX_PATH`` are looked through, then the folders above the file.
             root: as in ``from_mjcf``.
 
         Raises:
-            FileNotFoundError: no such file, or with ``collision_meshes`` a mesh is not found; the message says where it
-                was looked for.
+            FileNotFoundError: no such file; the message says where it was looked for.
             ValueError: the XML or the model in it is broken or cannot be represented (``planar`` joints, several root
                 links), or ``home`` does not fit; the message says where.
             KeyError: a mapping or ``locked_joints`` names a joint that does not exist.
@@ -119,7 +117,6 @@ class Robot(RobotModel):
             velocity_limits=velocity_limits,
             position_limits=position_limits,
             locked_joints=locked_joints,
-            collision_meshes=collision_meshes,
             package_dirs=package_dirs,
             root=root,
             has_home=home is not None,

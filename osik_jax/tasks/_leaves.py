@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from ..kinematics._home import home_kinematics as home_kinematics
+from ..kinematics._forward import home_kinematics as home_kinematics
 from ..numerics._arguments import as_array as as_array
 from ..numerics._arguments import as_bounds as as_bounds
 from ..numerics._arguments import as_scalar as as_scalar

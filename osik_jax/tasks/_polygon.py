@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
-from ..kinematics._home import kinematics_on_host
+from ..kinematics._forward import kinematics_on_host
 from ..numerics._guarded import greatest
 from ..numerics._host import to_jax
 from ..robot import Robot

@@ -19,7 +19,7 @@ from ..collision._geometry import Kind
 from ..robot import Robot
 from ..robot._look import Look
 from ..robot._mujoco import home_poses, model_bodies
-from ..robot.loading._mjmodel import rotation_matrix
+from ..robot.loading._poses import rotation_matrix
 
 _GEOM = mujoco.mjtGeom
 _DRAWN = range(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_MESH) + 1)

@@ -11,7 +11,7 @@ from benchmarks.demonstrated import file_motion, guess_moving_frame
 from benchmarks.swaying import JointPath
 from osik_jax.demo._figures import figures
 from osik_jax.demo._run import run_scheme
-from osik_jax.robot._feet import guess_feet
+from osik_jax.robot._guesses import guess_feet
 from osik_jax.robot._mujoco import mujoco_frame_pose
 from osik_jax.viewer._crouch import crouched
 

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import coal
 import jax
-import mujoco
 import numpy as np
 import pytest
 import scipy.spatial
 import urdfs
-from collision_pairs import coal_hull, named, pair_set
+from collision_pairs import coal_hull, mujoco_distances, named, pair_set
 from example_files import example_file
 from refusals import no_warnings, refuses
 
 import osik_jax as osik
 from osik_jax.collision._geometry import MOST_VERTICES, convex_hull
+from osik_jax.collision._pairs import members
 
 EMITTERS = "xla_cpu_use_fusion_emitters"  # conftest.py switches them off, where batches of loops in loops may not end
 
@@ -202,17 +202,15 @@ def meshed(tmp_path):
 
 @pytest.mark.slow
 def test_meshes_are_read_when_a_limit_needs_them(meshed):
-    """With the same distances as meshes that MuJoCo has read, for longer links too."""
-    late, early = (osik.Robot.from_urdf(meshed, floating_base=False, collision_meshes=read) for read in (False, True))
-    assert (late.mj_model.ngeom, early.mj_model.ngeom) == (0, 3)
-    assert early.tree.geom_names == late.tree.geom_names == ("a:0", "b:0", "c:0")
+    """With MuJoCo's distances, for longer links too."""
+    late = osik.Robot.from_urdf(meshed, floating_base=False)
+    assert late.mj_model.ngeom == 0 and late.tree.geom_names == ("a:0", "b:0", "c:0")
     q = np.array([0.4, -1.2])
-    for change in (lambda r: r, lambda r: r.scaled(length={"c": 1.5})):
-        one, other = change(late), change(early)
-        limits = osik.CollisionAvoidanceLimit(one), osik.CollisionAvoidanceLimit(other)
-        assert limits[0].pairs == limits[1].pairs == (("a:0", "c:0"),)
-        got, want = (distances(*both, q) for both in zip(limits, (one, other), strict=True))
-        np.testing.assert_allclose(got, want, atol=1e-6)  # MuJoCo's vertices have single precision
+    for one in (late, late.scaled(length={"c": 1.5})):
+        limit = osik.CollisionAvoidanceLimit(one)
+        assert limit.pairs == (("a:0", "c:0"),)
+        # MuJoCo's vertices have single precision
+        np.testing.assert_allclose(distances(limit, one, q), mujoco_distances(one, q, limit.pairs), atol=1e-6)
 
 
 def test_a_mesh_that_is_missing_is_told_and_left_out(meshed):
@@ -277,20 +275,12 @@ ROBOTS = {
 def test_the_default_call_works_on_known_robots(name):
     """With shapes of all links that have some; distances at home are MuJoCo's, or up to 4 mm less."""
     path, floats, (one, other) = ROBOTS[name]
-    loaded = osik.Robot.from_urdf(example_file(path), floating_base=floats, collision_meshes=True)
+    loaded = osik.Robot.from_urdf(example_file(path), floating_base=floats)
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         limit = osik.CollisionAvoidanceLimit(loaded)
     assert len([w for w in seen if issubclass(w.category, osik.OsikWarning)]) == bool(limit.left_out)
-    model, data = loaded.mj_model, mujoco.MjData(loaded.mj_model)
-    data.qpos[:] = np.asarray(loaded.mujoco_qpos(loaded.q0))
-    mujoco.mj_kinematics(model, data)
-    got = distances(limit, loaded, loaded.q0)
-    index = {geom: k for k, geom in enumerate(loaded.tree.geom_names)}
-    want = np.array([mujoco.mj_geomDistance(model, data, index[a], index[b], 9.0, None) for a, b in limit.pairs])
+    got, want = distances(limit, loaded, loaded.q0), mujoco_distances(loaded, np.asarray(loaded.q0), limit.pairs)
     assert len(want) > 10 and (got < want + 1e-4).all() and (want - got).max() < 0.004
-    links = {frozenset((model.body(model.geom_bodyid[index[a]]).name, model.body(model.geom_bodyid[index[b]]).name))
-             for a, b in limit.pairs}  # fmt: skip
-    assert frozenset((one, other)) in links
-    unread = osik.Robot.from_urdf(example_file(path), floating_base=floats)
-    assert len(unread.tree.geom_names) == len(loaded.tree.geom_names)
+    links = {member.name: member.aliases[0] for member in members(loaded, {})}
+    assert {one, other} in [{links[a], links[b]} for a, b in limit.pairs]

@@ -7,9 +7,8 @@ from robot_support import directions, table_support
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from osik_jax.collision._convex import NO_VERTICES, ConvexShape, shape_table
 from osik_jax.collision._core import gaps_between
-from osik_jax.collision._table import ShapeKind
+from osik_jax.collision._table import NO_VERTICES, ConvexShape, ShapeKind, shape_table
 from osik_jax.core import _library
 
 pytestmark = pytest.mark.skipif(not _library.installed(), reason="no compiled core")

@@ -8,9 +8,8 @@ from robot_support import directions, mesh_vertices, pinocchio_geometry, table_s
 
 import osik_jax as osik
 from osik_jax.collision import covering_spheres, robot_shapes
-from osik_jax.collision._convex import ConvexShape, shape_table
 from osik_jax.collision._spheres import LEAST, MOST, covering_balls
-from osik_jax.collision._table import CoveringSpheres, ShapeKind
+from osik_jax.collision._table import ConvexShape, CoveringSpheres, ShapeKind, shape_table
 from osik_jax.robot._size import robot_size
 from osik_jax.robot.loading._named import EXAMPLES
 

@@ -114,10 +114,10 @@ def test_a_home_outside_is_kept_with_a_warning(arm, home):
 
 @pytest.mark.parametrize("home", ["outside", 1], ids=["keyframe", "its number"])
 def test_a_keyframe_outside_is_brought_inside_with_a_warning(arm, home):
-    with pytest.warns(osik.OsikWarning, match="b is 1 there, outside its range, and 0.7854 in q0"):
+    with pytest.warns(osik.OsikWarning, match=r"b is 1, its range is .*0\.785398"):
         moved = arm.with_home(home)
     np.testing.assert_allclose(moved.q0, [0.0, np.pi / 4, 0.0])
-    with pytest.warns(osik.OsikWarning, match="b is 1 there"):
+    with pytest.warns(osik.OsikWarning, match="b is 1, its"):
         np.testing.assert_allclose(osik.Robot.from_mjcf(ARM, home=home, floating_base=False).q0, moved.q0)
 
 

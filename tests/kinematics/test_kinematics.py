@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.kinematics import _composition
-from osik_jax.kinematics._home import kinematics_on_host
+from osik_jax.kinematics._forward import kinematics_on_host
 
 NAMES = ("toy", "nao", "arm7")
 

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
-from osik_jax.robot._balls import ball_rotation, with_balls_inside
+from osik_jax.robot._ranges import ball_rotation, with_balls_inside
 
 LENGTH, CENTER = 0.3, np.array([0.0, 0.0, 0.5])
 
@@ -114,7 +114,7 @@ def test_home_keyframe_and_options():
     """q0 is inside, a home outside is refused, and ``position_limits`` replaces the range."""
     wide = " ".join(map(str, Rotation.from_rotvec([0.0, 1.0, 0.0]).as_quat(scalar_first=True)))
     text = mjcf(30.0, f'<keyframe><key name="wide" qpos="{wide} 0"/></keyframe>')
-    with pytest.warns(osik.OsikWarning, match="keyframe 'wide': ball is .* there, outside its range, and .* in q0"):
+    with pytest.warns(osik.OsikWarning, match="keyframe 'wide': ball is turned by .*: in q0 it is at the end"):
         robot = osik.Robot.from_mjcf(text)
     assert angles(robot.q0)[0] == pytest.approx(np.radians(30.0))
     with pytest.warns(osik.OsikWarning, match="ball is turned by 1, its range is"):

@@ -21,7 +21,7 @@ import osik_jax as osik
 from osik_jax import cli
 from osik_jax.execution import _backends
 from osik_jax.kinematics import forward_kinematics
-from osik_jax.kinematics._home import home_kinematics
+from osik_jax.kinematics._forward import home_kinematics
 from osik_jax.retargeting import (
     HumanMotion,
     Retargeter,
@@ -50,6 +50,7 @@ from osik_jax.retargeting._roles import NEEDED, SIDES
 from osik_jax.retargeting._skeletons import find_roles
 from osik_jax.retargeting._terms import Body, frame_rows
 from osik_jax.robot.loading import example_urdf
+from osik_jax.robot.loading._meshes import unread_points
 
 FPS = 30.0
 
@@ -632,22 +633,14 @@ def outside_capsules(robot, capsules, points):
 
 @pytest.mark.parametrize("name", ["g1", "talos"])
 def test_guessed_capsules_cover_the_meshes_of_limbs(name):
-    """The vertices of the collision meshes that MuJoCo reads, beside capsules out of masses alone."""
-    plain, meshed = (
-        osik.Robot.from_urdf(example_urdf(name), floating_base=True, collision_meshes=meshes)
-        for meshes in (False, True)
-    )
-    model, vertices = meshed.mj_model, []
-    data = mujoco.MjData(model)
-    data.qpos[:] = np.asarray(meshed.mujoco_qpos(meshed.q0))
-    mujoco.mj_kinematics(model, data)
-    for geom in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH):
-        if re.search(r"gripper|leg_.*_[56]|ankle", model.body(model.geom_bodyid[geom]).name):
+    """The vertices of the collision meshes, beside capsules out of masses alone."""
+    plain = osik.Robot.from_urdf(example_urdf(name), floating_base=True)
+    places, vertices = home_kinematics(plain), []
+    for mesh in plain.holder.meshes:
+        if re.search(r"gripper|leg_.*_[56]|ankle", mesh.link):
             continue  # feet have their corners, and fingers are too light
-        mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        turn = data.geom_xmat[geom].reshape(3, 3)
-        vertices.append(model.mesh_vert[first : first + count] @ turn.T + data.geom_xpos[geom])
+        position, turn = (np.asarray(part) for part in places.frame_pose(plain, mesh.link))
+        vertices.append((unread_points(mesh) @ np.array(mesh.rotation).T + mesh.position) @ turn.T + position)
     outside = np.maximum(outside_capsules(plain, guess_profile(plain).capsules, np.concatenate(vertices)), 0.0)
     assert 1e3 * outside.mean() < {"g1": 0.3, "talos": 3.0}[name]
 

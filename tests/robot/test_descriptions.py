@@ -14,7 +14,6 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.cli import CommandError, read_robot
-from osik_jax.robot.loading import urdf_of_description
 
 MODULES = {
     "toy_mj_description": 'MJCF_PATH = os.path.join(PACKAGE_PATH, "toy.xml")',
@@ -120,10 +119,3 @@ def test_the_command_line_takes_their_names():
     assert read_robot("toy_mj_description").nv == 7
     assert read_robot("toy_description", base="fixed").nv == 1
     refuses(CommandError, r"no robot 'toi_description'; did you mean 'toy_description'", read_robot, "toi_description")
-
-
-def test_pictures_find_the_files_of_urdfs_by_name():
-    found = urdf_of_description("toy_description")
-    assert found is not None and Path(found[0]).read_text() == URDF
-    assert Path(found[0]).parents[1] in map(Path, found[1])
-    assert urdf_of_description("toy_mj_description") is None

@@ -6,7 +6,7 @@ from motion_files import dancer, write_bvh
 from small_robots import LEG
 
 import osik_jax as osik
-from osik_jax.kinematics._home import home_kinematics
+from osik_jax.kinematics._forward import home_kinematics
 from osik_jax.retargeting import guess_profile, load_motion, report, retarget
 
 UPPER, FOREARM = 0.3, 0.28

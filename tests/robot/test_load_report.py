@@ -13,6 +13,7 @@ from urdfs import INERTIAL
 
 import osik_jax as osik
 from osik_jax import Robot
+from osik_jax.collision import robot_shapes
 
 ARM = """<mujoco>{head}<worldbody>
   <body name="first"><joint name="a" axis="0 1 0" range="-90 90" {a}/><geom name="one" size=".1" {geom}/>
@@ -22,7 +23,6 @@ ARM = """<mujoco>{head}<worldbody>
     <geom name="three" size=".1" contype="0" conaffinity="0"/></body>
 </worldbody>{more}</mujoco>"""
 TIED = '<equality><{} name="e" {}/></equality>'
-SERVO = '<actuator><position name="m" joint="a" {}/></actuator>'
 FIXED = '<tendon><fixed name="t" {}><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>'
 
 
@@ -53,25 +53,15 @@ def assert_named(robot: Robot, told: list[str], expected: tuple[str, str] | None
     [
         (dict(more=FIXED.format("") + '<equality><tendon name="e" tendon1="t"/></equality>'), ("tendon equality", "e")),
         (dict(more=FIXED.format('limited="true" range="0 1"')), ("tendon range", "t")),
-        (dict(more=FIXED.format('stiffness="3"')), ("tendon stiffness", "t")),
         (dict(more=FIXED.format("") + '<actuator><motor name="m" tendon="t"/></actuator>'), ("tendon actuator", "t")),
-        (dict(a='stiffness="5" springref="10"'), ("joint stiffness", "a")),
-        (dict(a='margin="0.1"'), ("joint margin", "a")),
-        (dict(more=SERVO.format('ctrlrange="-1 1"')), ("actuator range", "m")),
-        (dict(more=SERVO.format('gear="2" ctrlrange="-3 3"')), ("actuator range", "m")),
-        (dict(more='<actuator><intvelocity name="m" joint="c" actrange="-1 1"/></actuator>'), ("actuator range", "m")),
-        (dict(more='<actuator><velocity name="m" joint="a" ctrlrange="-2 2"/></actuator>'), ("actuator range", "m")),
         (dict(more=TIED.format("connect", 'body1="second" body2="other" anchor="0 0 0"')), ("connect equality", "e")),
         (dict(more=TIED.format("weld", 'body1="second" body2="other"')), ("weld equality", "e")),
         (dict(more=TIED.format("joint", 'joint1="a" joint2="b" polycoef="0 1 2 0 0"')), ("joint equality", "e")),
-        (dict(head='<option><flag limit="disable"/></option>'), ("option flag", "limit")),
-        (dict(geom='margin="0.02"'), ("geom margin", "one")),
-        (dict(more='<contact><pair geom1="one" geom2="three"/></contact>'), ("contact pair", "one, three")),
         (dict(more='<keyframe><key name="k" qpos="2 0 0"/></keyframe>'), ("keyframe", "k")),
         # kept, or a force
         (dict(a='damping="3" frictionloss="1" armature="0.1" actuatorfrclimited="true" actuatorfrcrange="-1 1"'), None),
         (dict(more='<actuator><motor joint="a" ctrlrange="-1 1" forcerange="-2 2"/></actuator>'), None),
-        (dict(more='<actuator><position joint="a" ctrlrange="-1.571 1.571"/></actuator>'), None),
+        (dict(more='<actuator><position joint="a" ctrlrange="-1 1"/></actuator>', geom='margin="0.02"'), None),
         (dict(more='<equality><joint joint1="a" joint2="b" polycoef="0 2 0 0 0"/></equality>'), None),
         (dict(more='<equality><weld body1="second" body2="other" active="false"/></equality>'), None),
         (dict(more='<contact><exclude body1="first" body2="other"/><pair geom1="one" geom2="two"/></contact>'), None),
@@ -87,11 +77,6 @@ def test_embedded_robots_keep_everything():
     for name in ("nao", "arm7"):
         robot, told = loaded(osik.load_robot, name)
         assert (robot.load_report, told) == ((), [])
-
-
-def test_notes_on_locked_joints_are_left_out():
-    text = ARM.format(head="", a='stiffness="5"', geom="", more="")
-    assert loaded(Robot.from_mjcf, text, locked_joints=["a"])[0].load_report == ()
 
 
 def test_geoms_without_their_files_are_named():
@@ -148,8 +133,6 @@ def test_a_file_without_masses_is_kinematics_alone():
 
 
 SAFETY = '<safety_controller k_velocity="1" k_position="1" soft_lower_limit="{}" soft_upper_limit="{}"/>'
-CONTROL = '<ros2_control name="c" type="system"><joint name="a">{}</joint></ros2_control>'
-BOUNDED = '<command_interface name="{}"><param name="min">{}</param><param name="max">{}</param></command_interface>'
 
 
 @pytest.mark.parametrize(
@@ -162,13 +145,6 @@ BOUNDED = '<command_interface name="{}"><param name="min">{}</param><param name=
         (urdf(joint='<spring k="3"/>'), ("spring", "a")),
         (urdf(more='<loop_joint name="closing" type="revolute"/>'), ("loop_joint", "closing")),
         (urdf(more='<drake:ball_constraint name="x"/>'), ("ball_constraint", "x")),
-        (urdf(more='<gazebo><joint name="c" type="revolute"/></gazebo>'), ("gazebo joint", "c")),
-        (urdf(more="<gazebo><joint>b</joint><mimicJoint>a</mimicJoint></gazebo>"), ("gazebo mimic", "a")),
-        (urdf(more='<gazebo reference="a"><springStiffness>7</springStiffness></gazebo>'), ("gazebo spring", "a")),
-        (urdf(more='<transmission><passive_joint name="a"/></transmission>'), ("transmission passive_joint", "a")),
-        (urdf(more=CONTROL.format(BOUNDED.format("position", -0.5, 0.5))), ("ros2_control position", "a")),
-        (urdf(more=CONTROL.format(BOUNDED.format("velocity", -1, 1))), ("ros2_control velocity", "a")),
-        (urdf(more=CONTROL.format('<param name="mimic">b</param>')), ("ros2_control mimic", "a")),
         (urdf(more='<link name="x"><collision><geometry><cylinder radius="1"/></geometry></collision></link>'
               '<joint name="y" type="fixed"><parent link="tip"/><child link="x"/></joint>'), ("collision", "x")),
         (urdf(more=f'<link name="x">{INERTIAL.replace("value", "worth")}</link>'
@@ -177,14 +153,18 @@ BOUNDED = '<command_interface name="{}"><param name="min">{}</param><param name=
         (urdf(joint='<dynamics damping="abc" friction="2"/><calibration rising="0"/>' + SAFETY.format(-1, 1)), None),
         (urdf('lower="-7" upper="7" velocity="0" effort="nan"'), None),
         (urdf('lower="-1e9" upper="1e9"', kind="continuous"), None),
-        (urdf(more=CONTROL.format(BOUNDED.format("position", -1, 1) + BOUNDED.format("effort", -1, 1))), None),
-        (urdf(more='<transmission name="g"><mechanicalReduction>50</mechanicalReduction></transmission>'), None),
+        (urdf(more='<transmission><passive_joint name="a"/></transmission><ros2_control name="c"/>'), None),
         (urdf(more='<gazebo reference="base"><material>Red</material></gazebo>', joint='<mimic joint="b"/>'), None),
         (urdf('lower="-1" upper="1" acceleration="5"'), None),
     ],
 )  # fmt: skip
 def test_each_element_of_a_urdf_is_named(text: str, expected: tuple[str, str] | None):
     assert_named(*loaded(Robot.from_urdf, text, floating_base=False), expected)
+
+
+def test_notes_on_locked_joints_are_left_out():
+    text = urdf(joint=SAFETY.format(-0.5, 1))
+    assert loaded(Robot.from_urdf, text, floating_base=False, locked_joints=["a"])[0].load_report == ()
 
 
 def test_a_long_report_is_shortened_in_the_warning():
@@ -293,43 +273,33 @@ TETRA = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1
 TEXT_STL = "solid x\nfacet normal 0 0 1\nouter loop\n{}endloop\nendfacet\nendsolid\n"
 
 
-@pytest.mark.parametrize(
-    "text", [TEXT_STL.format("vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"), TEXT_STL.format(""), "solid facet 1 a"]
-)
-def test_text_files_without_a_body_do_not_stop_the_robot(tmp_path: Path, text: str):
-    """A single triangle, and nothing at all; MuJoCo does not read such files, so this package does."""
-    (tmp_path / "flat.stl").write_text(text)
-    shape = '<collision><geometry><mesh filename="flat.stl"/></geometry></collision>'
-    path = tmp_path / "robot.urdf"
-    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shape}'))
-    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
-    assert robot.tree.geom_types == () and notes(robot) == {("collision mesh", "l1")}
-    assert "flat.stl is left out: nothing in it has a surface" in told[0]
+def with_mesh(folder: Path, file: str, scale: str = "1 1 1") -> Robot:
+    """A robot whose first link has a collision mesh."""
+    mesh = f'<collision><geometry><mesh filename="{file}" scale="{scale}"/></geometry></collision>'
+    path = folder / "robot.urdf"
+    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{mesh}'))
+    return Robot.from_urdf(path, floating_base=False)
 
 
 @pytest.mark.parametrize(
-    ("mesh", "scale", "count", "message"),
-    [
-        (PLATE, "1 1 1", 2, "plate file.obj is flat, and 1 mm thick here"),
-        (TETRA, "1 0 1", 2, "plate file.obj is flat, and 1 mm thick here"),
-        (LINE, "1 1 1", 1, "plate file.obj is left out"),
-        (TETRA, "2 2 2", 2, None),
-    ],
+    "text",
+    [TEXT_STL.format("vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"), TEXT_STL.format(""), "solid facet 1 a", LINE],
 )
-def test_flat_meshes_do_not_stop_the_robot(tmp_path: Path, mesh: str, scale: str, count: int, message: str | None):
-    """One of two meshes is flat; the other stays as it is. The address is written with %20."""
+def test_meshes_without_a_body_do_not_stop_the_robot(tmp_path: Path, text: str):
+    """A single triangle, nothing at all, and a line; MuJoCo does not read such STL files, so this package does."""
+    name = "flat.obj" if text == LINE else "flat.stl"
+    (tmp_path / name).write_text(text)
+    robot = with_mesh(tmp_path, name)
+    message = "area is too small" if text == LINE else f"{name}: nothing in it has a surface"
+    refuses(ValueError, f"the collision mesh of l1.*{message}", robot_shapes, robot)
+
+
+@pytest.mark.parametrize(("mesh", "scale"), [(PLATE, "1 1 1"), (TETRA, "1 0 1"), (TETRA, "2 2 2")])
+def test_flat_meshes_are_thickened(tmp_path: Path, mesh: str, scale: str):
+    """A flat mesh gets 1 mm, another one stays as it is. The address is written with %20."""
     (tmp_path / "plate file.obj").write_text(mesh)
-    (tmp_path / "whole.obj").write_text(TETRA)
-    shape = '<collision><geometry><mesh filename="{}" scale="{}"/></geometry></collision>'
-    shapes = shape.format("plate%20file.obj", scale) + shape.format("whole.obj", "1")
-    path = tmp_path / "robot.urdf"
-    path.write_text(urdf().replace(f'<link name="l1">{INERTIAL}', f'<link name="l1">{INERTIAL}{shapes}'))
-    robot, told = loaded(Robot.from_urdf, path, floating_base=False, collision_meshes=True)
-    assert len(robot.tree.geom_types) == count
-    assert notes(robot) == ({("collision mesh", "l1")} if message else set())
-    assert not message or (message in told[0] and "'l1'" in told[0])
-    model = robot.mj_model
-    spans = [
-        np.ptp(model.mesh_vert[at : at + n], 0) for at, n in zip(model.mesh_vertadr, model.mesh_vertnum, strict=True)
-    ]
-    assert len(spans) == count and min(spans[0]) >= (0.9e-3 if message else 0.05)
+    robot = with_mesh(tmp_path, "plate%20file.obj", scale=scale)
+    table = robot_shapes(robot).table
+    (row,) = np.flatnonzero(table.count)
+    spans = np.ptp(table.vertices[table.first[row] :][: table.count[row]], axis=0)
+    assert min(spans) == pytest.approx(0.2 if scale == "2 2 2" else 1e-3, rel=1e-5)

@@ -18,6 +18,8 @@ from scipy.spatial.transform import Rotation
 from urdfs import INERTIAL, joint
 
 from osik_jax import Robot
+from osik_jax.collision import robot_shapes
+from osik_jax.robot.loading._meshes import unread_points
 
 
 @pytest.mark.parametrize("quirk", sorted(path.stem for path in (MJCF / "quirks").glob("*.xml")))
@@ -154,26 +156,19 @@ def package(tmp_path: Path) -> Path:
     return package
 
 
-def vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """The corners of a mesh in its body's frame."""
-    mesh = model.geom_dataid[geom]
-    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    rotation = np.zeros(9)
-    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
-    return model.mesh_vert[start : start + count] @ rotation.reshape(3, 3).T + model.geom_pos[geom]
+def vertices(robot: Robot, geom: int) -> np.ndarray:
+    """The corners of a mesh in its link's frame."""
+    mesh = robot.holder.meshes[geom - robot.mj_model.ngeom]
+    return unread_points(mesh) @ np.array(mesh.rotation).T + mesh.position
 
 
-def test_collision_meshes_are_read_where_asked_for(package: Path):
-    path = package / "urdf" / "bot.urdf"
-    assert Robot.from_urdf(path, floating_base=False).mj_model.ngeom == 0
-    robot = Robot.from_urdf(path, floating_base=False, collision_meshes=True)
-    model = robot.mj_model
-    assert (model.ngeom, model.nmesh) == (3, 2)
+def test_collision_meshes_are_placed_and_scaled(package: Path):
+    robot = Robot.from_urdf(package / "urdf" / "bot.urdf", floating_base=False)
+    assert (robot.mj_model.ngeom, len(robot.tree.geom_names)) == (0, 3)
     corners = np.array(CORNERS, float) * [1.0, 2.0, 1.0]
     for geom in range(3):
-        ours = vertices(model, geom)
+        ours = vertices(robot, geom)
         np.testing.assert_allclose(ours[np.lexsort(ours.T.round(3))], corners[np.lexsort(corners.T)], atol=1e-6)
-    assert model.body_mass.sum() == 3.0
 
 
 @pytest.mark.parametrize("slash", ["", "/"])
@@ -193,8 +188,8 @@ def test_packages_are_found(package: Path, where: str, slash: str, monkeypatch: 
         share.mkdir(parents=True)
         package.rename(share / package.name)
         monkeypatch.setenv(where, f"/not/there:{share.parent}")
-    robot = Robot.from_urdf(address, package_dirs=folders, floating_base=False, collision_meshes=True)
-    assert (robot.joint_names, robot.mj_model.ngeom) == (("j",), 3)
+    robot = Robot.from_urdf(address, package_dirs=folders, floating_base=False)
+    assert robot.joint_names == ("j",) and all(len(vertices(robot, geom)) == 4 for geom in range(3))
 
 
 @pytest.mark.parametrize(
@@ -212,14 +207,14 @@ def test_packages_are_found(package: Path, where: str, slash: str, monkeypatch: 
             "../meshes/other.obj",
             "bot.urdf",
             ValueError,
-            r"link 'tip': the mesh .*bot.urdf' is of no kind .*\.dae, \.stl",
+            r"the collision mesh of tip.*bot.urdf: a mesh has to be one of \.dae, \.stl",
         ),
     ],
 )
 def test_meshes_that_cannot_be_read_are_named(package: Path, old: str, new: str, error: type, message: str):
     path = package / "urdf" / "bot.urdf"
     path.write_text(path.read_text().replace(old, new))
-    refuses(error, message, Robot.from_urdf, path, collision_meshes=True)
+    refuses(error, message, robot_shapes, Robot.from_urdf(path, floating_base=False))
 
 
 def corners_of_stl(path: Path) -> np.ndarray:
@@ -231,8 +226,8 @@ def corners_of_stl(path: Path) -> np.ndarray:
 def test_collision_meshes_of_a_known_robot():
     """Every STL of a G1 lies in its link's frame where the URDF puts it: the same box around its corners."""
     path = example_file("g1_description/urdf/g1_29dof_rev_1_0.urdf")
-    model = Robot.from_urdf(path, floating_base=False, collision_meshes=True).mj_model
-    geoms = iter(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).tolist())
+    robot = Robot.from_urdf(path, floating_base=False)
+    geoms = iter(range(robot.mj_model.ngeom, len(robot.tree.geom_names)))
     shapes = ElementTree.parse(path).getroot().findall("link/collision")
     meshes = [(shape, mesh) for shape in shapes if (mesh := shape.find("geometry/mesh")) is not None]
     assert len(meshes) > 20
@@ -242,7 +237,7 @@ def test_collision_meshes_of_a_known_robot():
         position, angles = (np.fromstring(origin.get(key, "0 0 0"), sep=" ") for key in ("xyz", "rpy"))
         rotation = Rotation.from_euler("xyz", angles).as_matrix()
         expected = corners_of_stl(path.parent.parent / "meshes" / name) @ rotation.T + position
-        ours = vertices(model, next(geoms))
+        ours = vertices(robot, next(geoms))
         np.testing.assert_allclose([ours.min(0), ours.max(0)], [expected.min(0), expected.max(0)], atol=1e-5)
 
 

@@ -12,7 +12,7 @@ import pytest
 
 import osik_jax as osik
 from osik_jax.control import _checks
-from osik_jax.robot._hands import find_hands
+from osik_jax.robot._guesses import find_hands
 from osik_jax.saving._controller import read_controller
 from osik_jax.viewer import serve
 from osik_jax.viewer.live._desk import Desk, Session

@@ -19,8 +19,7 @@ from ...limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimi
 from ...limits._own import keeps_own
 from ...numerics._guarded import clipped
 from ...robot import Robot
-from ...robot._feet import guess_feet
-from ...robot._hands import find_hands
+from ...robot._guesses import find_hands, guess_feet
 from ...robot._joint_selection import scalar_layout
 from ...saving import load_controller
 from ...schemes import Scheme, WeightedQP

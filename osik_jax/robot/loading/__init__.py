@@ -8,7 +8,6 @@ from ._named import NAMES as NAMES
 from ._named import ROBOTS as ROBOTS
 from ._named import example_urdf as example_urdf
 from ._named import named as named
-from ._named import urdf_of_description as urdf_of_description
 from ._options import LoadOptions as LoadOptions
 from ._options import LockedJoints as LockedJoints
 from ._options import PositionLimits as PositionLimits

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from ._mjmodel import element_names, equality_end_sites, rotation_matrix
+from ._mjmodel import element_names, equality_end_sites
+from ._poses import rotation_matrix
 
 KINDS = {
     int(mujoco.mjtEq.mjEQ_CONNECT): "connect",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import mujoco
@@ -63,6 +63,13 @@ def match_names(kind: str, pattern: str, names: tuple[str, ...]) -> list[int]:
     if not found:
         raise unknown_name(kind, pattern, names)
     return found
+
+
+def free_name(name: str, taken: Collection[str | None]) -> str:
+    """Return the name, followed by as many underscores as make it differ from those taken."""
+    while name in taken:
+        name += "_"
+    return name
 
 
 def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[str, Any]) -> dict[int, Lock]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -13,30 +12,29 @@ from jaxtyping import Float, Int
 from ..._errors import OsikValueError
 from .._tree import UnreadMesh
 from ._collada import Triangles, read_collada
-from ._mjmodel import rotation_matrix
 from ._packages import Packages
+from ._poses import rotation_matrix
 
-SUFFIXES = (".dae", ".stl", ".obj", ".msh")
+_SUFFIXES = (".dae", ".stl", ".obj", ".msh")
+_THICKNESS = 1e-3
+"""Thickness given to a flat mesh [m]."""
+_LINE = 1e-6
+"""A mesh whose extent in a second direction is less than this share of its extent in the first is a line."""
 
 
 def read_mesh(path: Path) -> list[Triangles]:
     """Return the triangles of a mesh file, in the file's axes."""
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(SUFFIXES)}")
-    if is_read_by_mujoco(path):
-        parts = [_by_mujoco(path)]
+    if suffix not in _SUFFIXES:
+        raise OsikValueError(f"{path}: a mesh has to be one of {', '.join(_SUFFIXES)}")
+    if suffix == ".dae":
+        parts = read_collada(path)
     else:
-        parts = read_collada(path) if suffix == ".dae" else [_text_stl(path)]
+        parts = [_text_stl(path) if suffix == ".stl" and _is_text(path) else _by_mujoco(path)]
     solid = [part for part in parts if _has_area(part)]
     if not solid:
         raise OsikValueError(f"{path}: nothing in it has a surface")
     return solid
-
-
-def is_read_by_mujoco(path: Path) -> bool:
-    """Return whether MuJoCo reads a mesh file itself: neither COLLADA nor STL as text."""
-    return path.suffix.lower() != ".dae" and not (path.suffix.lower() == ".stl" and _is_text(path))
 
 
 def joined(parts: Sequence[Triangles]) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "m 3"]]:
@@ -51,6 +49,15 @@ def unread_points(mesh: UnreadMesh) -> Float[np.ndarray, "k 3"]:
     beside = None if mesh.beside is None else Path(mesh.beside)
     path = Packages(mesh.folders).path(mesh.file, beside=beside)
     return joined(read_mesh(path))[0] * np.array(mesh.scale)
+
+
+def thickened(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """Return points on both sides of the plane that the given ones are in; ValueError where they are on one line."""
+    _, extents, axes = np.linalg.svd(points - points.mean(0), full_matrices=False)
+    if not extents[1] > _LINE * extents[0]:
+        raise OsikValueError("the points are on one line")
+    aside = 0.5 * _THICKNESS * axes[2]
+    return np.concatenate([points + aside, points - aside])
 
 
 def _has_area(part: Triangles) -> bool:
@@ -78,23 +85,11 @@ def _text_stl(path: Path) -> Triangles:
 
 
 def _by_mujoco(path: Path) -> Triangles:
-    return Triangles(*shell(name="mesh", file=str(path.absolute())), None)
-
-
-def shell(**mesh: Any) -> tuple[Float[np.ndarray, "k 3"], Int[np.ndarray, "m 3"]]:
-    """Return vertices and triangles as MuJoCo reads them, moved back from the mesh's own centre and axes.
-
-    The mesh may be open or flat. The arguments are those of ``MjSpec.add_mesh``.
-    """
-    open_surface = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    model = compiled_mesh(mesh | {"inertia": open_surface}, collides=False)
-    return model.mesh_vert @ rotation_matrix(model.mesh_quat[0]).T + model.mesh_pos[0], model.mesh_face.copy()
-
-
-def compiled_mesh(mesh: dict[str, Any], *, collides: bool) -> mujoco.MjModel:
-    """Return a model of one mesh; one that collides gets its hull, which a flat mesh has not."""
+    """Return vertices and triangles as MuJoCo reads them, moved back from the mesh's own centre and axes."""
     spec = mujoco.MjSpec()
-    spec.add_mesh(**mesh)
-    kind = mujoco.mjtGeom.mjGEOM_MESH
-    spec.worldbody.add_geom(type=kind, meshname=mesh["name"], contype=int(collides), conaffinity=int(collides))
-    return spec.compile()
+    # as a shell that collides with nothing, a mesh may be open or flat
+    spec.add_mesh(name="mesh", file=str(path.absolute()), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0)
+    model = spec.compile()
+    vertices = model.mesh_vert @ rotation_matrix(model.mesh_quat[0]).T + model.mesh_pos[0]
+    return Triangles(vertices, model.mesh_face.copy(), None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,21 +15,23 @@ from ...numerics._host import to_jax
 from .._load_report import LoadNote, LoadReport
 from .._look import UnreadLook
 from .._model import RobotModel
-from .._plausible import first_of, warn_of_fast_joints
+from .._ranges import first_of, inside, warn_of_fast_joints
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, UnreadMesh
 from ._followers import (
     Follower,
     as_mapping,
     asked_locks,
     equality_followers,
+    free_name,
     match_joints,
     number,
     qpos_offset,
     resolve_followers,
 )
-from ._keyframes import home_notes, inside, keyframe_names
-from ._model_notes import model_notes
+from ._keyframes import home_notes, keyframe_names
+from ._notes import model_notes
 from ._options import LoadOptions, PositionLimits
+from ._poses import IDENTITY, Pose, quaternion, rotation_matrix
 from ._robots import robot_trees
 
 VELOCITY_LIMIT_PREFIX = "velocity_limit/"
@@ -63,8 +65,11 @@ class Placement(NamedTuple):
     """The moving body (its number in the tree) that a body of the model is fixed to, and the body's pose in it."""
 
     body: int
-    position: np.ndarray
-    rotation: np.ndarray
+    pose: Pose
+
+    def carrying(self, pose: Pose) -> Placement:
+        """Return where something with a pose in the body is."""
+        return Placement(self.body, self.pose @ pose)
 
 
 class NamedMesh(NamedTuple):
@@ -104,7 +109,9 @@ def from_mjmodel(
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
-    mesh_places = [_mesh_place(placement[body_names.index(named.mesh.link)], named.mesh) for named in meshes]
+    mesh_poses = [Pose(np.array(mesh.position), np.array(mesh.rotation)) for _, mesh in meshes]
+    carriers = [placement[body_names.index(mesh.link)] for _, mesh in meshes]
+    mesh_places = [on.carrying(pose) for on, pose in zip(carriers, mesh_poses, strict=True)]
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
         body_parents=tuple(placement[model.body_parentid[b]].body for b in bodies),
@@ -130,11 +137,10 @@ def from_mjmodel(
     accelerations = _rates(model, names, ACCELERATION_LIMIT_PREFIX, "acceleration", {})
     lower, upper = _position_limits(tree, followers, low, high)
     _warn_of_frozen(tree, lower, upper, ranges)
-    home = model.key_qpos[0] if model.nkey else model.qpos0
-    q0 = inside(home, tree, lower, upper)
-    found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names, low, high, speeds)]
+    home = (model.key_qpos[0] if model.nkey else model.qpos0)[tree.own_qpos]
+    found = [*notes, *_mass_notes(model, body_names), *model_notes(model, names)]
     if model.nkey and not options.has_home:
-        found += home_notes(tree, keyframe_names(model)[0], home, q0)
+        found += home_notes(tree, keyframe_names(model)[0], home, lower, upper)
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
     _warn_of_report(report)
     arrays = dict(
@@ -143,15 +149,15 @@ def from_mjmodel(
         joint_axis=model.jnt_axis,
         dof_armature=model.dof_armature,
         joint_reference=model.qpos0,
-        frame_position=[frame.position for frame in frames.values()],
-        frame_rotation=[frame.rotation for frame in frames.values()],
+        frame_position=[frame.pose.position for frame in frames.values()],
+        frame_rotation=[frame.pose.rotation for frame in frames.values()],
         **_geom_arrays(model, placement, mesh_places),
         qpos_offset=qpos_offset(model, followers, locked),
         position_lower=lower,
         position_upper=upper,
         velocity_limit=_rate_limits(tree, followers, speeds),
         acceleration_limit=_rate_limits(tree, followers, accelerations),
-        q0=q0,
+        q0=inside(tree, home, lower, upper),
     )
     holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look, path)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
@@ -162,13 +168,6 @@ def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "equalit
     count = dict(body=model.nbody, joint=model.njnt, equality=model.neq)[kind]
     given = [mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), k) for k in range(count)]
     return tuple(name or free_name(f"{kind}{k}", given) for k, name in enumerate(given))
-
-
-def free_name(name: str, taken: Collection[str | None]) -> str:
-    """Return the name, followed by as many underscores as make it differ from those taken."""
-    while name in taken:
-        name += "_"
-    return name
 
 
 def equality_end_sites(model: mujoco.MjModel) -> set[int]:
@@ -182,20 +181,6 @@ def equality_end_sites(model: mujoco.MjModel) -> set[int]:
     return found
 
 
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Return the unit quaternion (w, x, y, z) of a rotation matrix."""
-    out = np.zeros(4)
-    mujoco.mju_mat2Quat(out, np.asarray(rotation, float).ravel())
-    return out
-
-
-def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix (3, 3) of a unit quaternion (w, x, y, z)."""
-    out = np.zeros(9)
-    mujoco.mju_quat2Mat(out, np.asarray(quaternion, float))
-    return out.reshape(3, 3)
-
-
 def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str, ...]) -> None:
     if model.njnt == 0:
         raise OsikValueError(f"the model has no joint, so nothing can move; bodies: {', '.join(body_names)}")
@@ -207,13 +192,13 @@ def _check(model: mujoco.MjModel, names: tuple[str, ...], body_names: tuple[str,
 
 def _moving_bodies(model: mujoco.MjModel) -> tuple[list[int], list[Placement]]:
     """Return the world and the bodies with joints, and on which of these each body of the model sits, and where."""
-    bodies, placement = [0], [Placement(0, np.zeros(3), np.eye(3))]
+    bodies, placement = [0], [Placement(0, IDENTITY)]
     for b in range(1, model.nbody):
         if model.body_jntnum[b]:
-            placement.append(Placement(len(bodies), np.zeros(3), np.eye(3)))
+            placement.append(Placement(len(bodies), IDENTITY))
             bodies.append(b)
         else:
-            placement.append(_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]))
+            placement.append(placement[model.body_parentid[b]].carrying(_pose(model.body_pos[b], model.body_quat[b])))
     return bodies, placement
 
 
@@ -232,8 +217,8 @@ def _robots(
     return tuple(tuple(placement[b].body for b in topmost if model.body_rootid[b] in trees) for trees in found)
 
 
-def _placed(on: Placement, position: np.ndarray, quaternion: np.ndarray) -> Placement:
-    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation_matrix(quaternion))
+def _pose(position: np.ndarray, quaternion: np.ndarray) -> Pose:
+    return Pose(position, rotation_matrix(quaternion))
 
 
 def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[Placement]) -> dict[str, Placement]:
@@ -245,7 +230,7 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 
     def add(kind: str, name: str | None, body: int, position: np.ndarray, quaternion: np.ndarray) -> None:
         if name:
-            out[name if name not in out else f"{kind}:{name}"] = _placed(placement[body], position, quaternion)
+            out[name if name not in out else f"{kind}:{name}"] = placement[body].carrying(_pose(position, quaternion))
 
     for s in sorted(set(range(model.nsite)) - equality_end_sites(model)):
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_SITE, s)
@@ -259,29 +244,26 @@ def _frames(model: mujoco.MjModel, body_names: tuple[str, ...], placement: list[
 def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Placement]) -> dict[str, ArrayLike]:
     """Return the poses of moving bodies in their parents, and their inertial properties with all fixed to them."""
     mass, moment, inertia = np.zeros(len(bodies)), np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3, 3))
-    parts = [(b, place, place.position + place.rotation @ model.body_ipos[b]) for b, place in enumerate(placement)]
+    parts = [
+        (b, place, place.pose.position + place.pose.rotation @ model.body_ipos[b]) for b, place in enumerate(placement)
+    ]
     parts = [part for part in parts if part[1].body]  # what is fixed to the world is no part of what moves
     for b, place, center in parts:
         mass[place.body] += model.body_mass[b]
         moment[place.body] += model.body_mass[b] * center
     centers = moment / np.where(mass > 0.0, mass, 1.0)[:, None]
     for b, place, center in parts:
-        axes, arm = place.rotation @ rotation_matrix(model.body_iquat[b]), center - centers[place.body]
+        axes, arm = place.pose.rotation @ rotation_matrix(model.body_iquat[b]), center - centers[place.body]
         inertia[place.body] += axes * model.body_inertia[b] @ axes.T
         inertia[place.body] += model.body_mass[b] * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    poses = [_placed(placement[model.body_parentid[b]], model.body_pos[b], model.body_quat[b]) for b in bodies]
+    poses = [placement[model.body_parentid[b]].carrying(_pose(model.body_pos[b], model.body_quat[b])) for b in bodies]
     return dict(
-        body_position=[pose.position for pose in poses],
-        body_quaternion=[quaternion(pose.rotation) for pose in poses],
+        body_position=[place.pose.position for place in poses],
+        body_quaternion=[quaternion(place.pose.rotation) for place in poses],
         body_mass=mass,
         body_com=centers,
         body_inertia=inertia,
     )
-
-
-def _mesh_place(on: Placement, mesh: UnreadMesh) -> Placement:
-    position, rotation = np.array(mesh.position), np.array(mesh.rotation)
-    return Placement(on.body, on.position + on.rotation @ position, on.rotation @ rotation)
 
 
 def _geom_names(model: mujoco.MjModel, body_names: Sequence[str], meshes: Sequence[NamedMesh]) -> tuple[str, ...]:
@@ -308,11 +290,14 @@ def _geom_arrays(
 ) -> dict[str, ArrayLike]:
     """Return the poses of the geoms in the moving bodies, and their sizes; meshes that the model does not hold last."""
     described = zip(model.geom_bodyid, model.geom_pos, model.geom_quat, strict=True)
-    poses = [*(_placed(placement[body], position, quaternion) for body, position, quaternion in described), *meshes]
+    poses = [
+        *(placement[body].carrying(_pose(position, quaternion)) for body, position, quaternion in described),
+        *meshes,
+    ]
     size = np.where(model.geom_type[:, None] == mujoco.mjtGeom.mjGEOM_MESH, 1.0, model.geom_size)
     return dict(
-        geom_position=np.array([pose.position for pose in poses]).reshape(-1, 3),
-        geom_rotation=np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
+        geom_position=np.array([place.pose.position for place in poses]).reshape(-1, 3),
+        geom_rotation=np.array([place.pose.rotation for place in poses]).reshape(-1, 3, 3),
         geom_size=np.concatenate([size, np.ones((len(meshes), 3))]),
     )
 

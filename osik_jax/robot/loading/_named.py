@@ -109,14 +109,6 @@ def described(name: str, options: LoadOptions) -> RobotModel:
     raise OsikValueError(f"robot {name!r} comes as xacro: run xacro on {xacro!r} and load what it writes")
 
 
-def urdf_of_description(name: str) -> tuple[str, list[str]] | None:
-    """Return the file of a robot that comes as URDF, and the folders of its packages; ``None``: it comes otherwise."""
-    module = importlib.import_module(f"robot_descriptions.{name}")
-    if hasattr(module, "MJCF_PATH") or not hasattr(module, "URDF_PATH"):
-        return None
-    return module.URDF_PATH, _package_dirs(module)
-
-
 def _known(name: str) -> tuple[str, ...]:
     """Return the robots that the package lists; empty without the package, unless a full name is given."""
     try:

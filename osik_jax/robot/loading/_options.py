@@ -26,7 +26,6 @@ class LoadOptions(NamedTuple):
     velocity_limits: Mapping[str, float] | None = None
     position_limits: PositionLimits | None = None
     locked_joints: LockedJoints = ()
-    collision_meshes: bool = False
     package_dirs: Iterable[str | os.PathLike[str]] = ()
     root: str | Sequence[str] | None = None
     has_home: bool = False

@@ -8,17 +8,17 @@ import os
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError, warn
-from .._feet import find_feet
+from .._guesses import find_feet
 from .._load_report import LoadNote
 from .._look import UnreadLook
 from .._model import RobotModel
 from .._tree import UnreadMesh
+from ._followers import free_name
 from ._look import GEOMS, geom_size, read_look
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
@@ -26,16 +26,14 @@ from ._mjmodel import (
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
     NamedMesh,
-    free_name,
     from_mjmodel,
-    quaternion,
 )
+from ._notes import urdf_notes
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
+from ._poses import IDENTITY, Pose, quaternion
 from ._source import check_root, parse_xml, read_source
-from ._urdf_elements import IDENTITY, Joint, Link, Pose, Shape, Urdf, read_urdf
-from ._urdf_meshes import meshes_of
-from ._urdf_notes import urdf_notes
+from ._urdf_elements import Joint, Link, Urdf, read_urdf
 
 WORLD = "world"
 FLOATING_BASE = "floating_base"
@@ -43,7 +41,6 @@ FLOATING_BASE = "floating_base"
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3
 _BALANCED = 1e-6
 """Relative change of a link's moments of inertia from which a note tells of it: less is roundoff."""
-_Compiled = tuple[mujoco.MjModel, list[LoadNote]]
 
 
 def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
@@ -55,16 +52,12 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     check_root(root, "robot", source)
     try:
         read = read_urdf(root)
-        description, unread = _with_base(read, options.floating_base, source.label), ()
-        if options.collision_meshes:
-            model, notes = compiled_with_meshes(description, packages, source.path)
-        else:
-            model, notes = urdf_spec(description).compile(), []
-            unread = tuple(_unread_meshes(description, packages, source.path))
+        description = _with_base(read, options.floating_base, source.label)
+        model = urdf_spec(description).compile()
     except ValueError as error:
         raise OsikValueError(f"{source.label}: {error}") from None
+    notes = [*urdf_notes(root, {joint.name: joint for joint in read.joints}), *read.notes]
     notes += _inertia_notes(description, model)
-    notes = [*urdf_notes(root, {joint.name: joint for joint in read.joints}), *read.notes, *notes]
     floating = [joint.name for joint in description.joints if joint.kind == "floating"]
     one_sided = {
         joint.name: (joint.lower, joint.upper)
@@ -74,6 +67,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
     look = UnreadLook(partial(read_look, description, packages, source.path))
+    unread = tuple(unread_meshes(description, packages, source.path))
     return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look, path=source.path)
 
 
@@ -203,47 +197,25 @@ def _add_body(parent: mujoco.MjsBody, pose: Pose, link: Link, *, moving: bool) -
 
 def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
     for shape in link.shapes:
-        if shape.kind in GEOMS:
-            _add_geom(body, shape, type=GEOMS[shape.kind], size=geom_size(shape))
+        if shape.kind not in GEOMS:
+            continue
+        color = {} if shape.color is None else {"rgba": shape.color}
+        meets = 0 if shape.visual else 1
+        body.add_geom(
+            name="" if shape.visual else shape.name,
+            type=GEOMS[shape.kind],
+            size=geom_size(shape),
+            pos=shape.pose.position,
+            quat=quaternion(shape.pose.rotation),
+            group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
+            contype=meets,
+            conaffinity=meets,
+            mass=0.0,
+            **color,
+        )
 
 
-def _add_geom(body: mujoco.MjsBody, shape: Shape, **form: Any) -> None:
-    color = {} if shape.color is None else {"rgba": shape.color}
-    meets = 0 if shape.visual else 1
-    body.add_geom(
-        name="" if shape.visual else shape.name,
-        pos=shape.pose.position,
-        quat=quaternion(shape.pose.rotation),
-        group=_VISUAL_GROUP if shape.visual else _COLLISION_GROUP,
-        contype=meets,
-        conaffinity=meets,
-        mass=0.0,
-        **form,
-        **color,
-    )
-
-
-def _compiled(urdf: Urdf, packages: Packages, beside: Path | None, *, checked: bool) -> _Compiled:
-    """Return the model with the collision shapes that are meshes, and notes on those; see ``meshes_of``."""
-    spec = urdf_spec(urdf)
-    found, notes = meshes_of(urdf, packages, beside, checked=checked)
-    for form in {form["name"]: form for _, _, form in found}.values():
-        spec.add_mesh(**form)
-    for link, shape, form in found:
-        body = spec.worldbody if link == urdf.root else spec.body(link)
-        _add_geom(body, shape, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=form["name"])
-    return spec.compile(), notes
-
-
-def compiled_with_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> _Compiled:
-    """Compile the model with its meshes as they are; if one of them cannot be taken, try each mesh alone."""
-    try:
-        return _compiled(urdf, packages, beside, checked=False)
-    except ValueError:
-        return _compiled(urdf, packages, beside, checked=True)
-
-
-def _unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Iterator[NamedMesh]:
+def unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Iterator[NamedMesh]:
     """Yield the collision shapes that are meshes, without a look at their files."""
     urdf_path, folders = None if beside is None else str(beside.absolute()), tuple(map(str, packages.folders))
     for link in urdf.links.values():

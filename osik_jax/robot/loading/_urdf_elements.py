@@ -3,35 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import mujoco
 import numpy as np
 
 from ..._errors import OsikValueError, unknown_name
 from .._load_report import LoadNote
-from ._mjmodel import rotation_matrix
+from ._followers import free_name
+from ._poses import IDENTITY, Pose, rotation_matrix
 
 JOINT_KINDS = ("revolute", "continuous", "prismatic", "fixed", "floating")
 SCALAR = ("revolute", "continuous", "prismatic")
 _Color = tuple[float, ...]
-
-
-class Pose(NamedTuple):
-    """Position (3,) [m] and rotation (3, 3) of a frame in another."""
-
-    position: np.ndarray
-    rotation: np.ndarray
-
-    def __matmul__(self, other: Pose) -> Pose:
-        return Pose(self.position + self.rotation @ other.position, self.rotation @ other.rotation)
-
-
-IDENTITY = Pose(np.zeros(3), np.eye(3))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,19 +105,14 @@ def _with_unique_shape_names(links: Mapping[str, Link]) -> dict[str, Link]:
     taken: set[str] = set()
 
     def unique(shape: Shape, link: str) -> Shape:
-        name = shape.name
-        if name in taken and name:
-            count = itertools.count(2)
-            name = f"{link}/{name}"
-            while name in taken:
-                name = f"{link}/{shape.name}_{next(count)}"
+        if shape.visual or not shape.name:
+            return shape
+        name = shape.name if shape.name not in taken else free_name(f"{link}/{shape.name}", taken)
         taken.add(name)
         return dataclasses.replace(shape, name=name)
 
     return {
-        name: dataclasses.replace(
-            link, shapes=tuple(shape if shape.visual else unique(shape, name) for shape in link.shapes)
-        )
+        name: dataclasses.replace(link, shapes=tuple(unique(shape, name) for shape in link.shapes))
         for name, link in links.items()
     }
 

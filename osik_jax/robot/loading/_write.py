@@ -16,18 +16,16 @@ from .._describe import model_name
 from .._model import RobotModel
 from .._tree import BALL, FREE, HINGE, QPOS_WIDTH, SLIDE, KinematicTree
 from ._equalities import KINDS, Ends, constraint_ends, is_in_tree
+from ._followers import free_name
 from ._mjmodel import (
     ACCELERATION_LIMIT_PREFIX,
     EQUALITY_END_PREFIX,
     LEAST_INERTIA,
     VELOCITY_LIMIT_PREFIX,
     element_names,
-    free_name,
-    quaternion,
-    rotation_matrix,
 )
+from ._poses import IDENTITY, Pose, quaternion, rotation_matrix
 from ._robots import ROBOT_ROOTS
-from ._urdf_elements import IDENTITY, Pose
 
 _TYPES = {FREE: "free", BALL: "ball", SLIDE: "slide", HINGE: "hinge"}
 _SHAPES = {

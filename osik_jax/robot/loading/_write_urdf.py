@@ -13,8 +13,9 @@ from ..._errors import OsikValueError
 from .._describe import model_name
 from .._model import RobotModel
 from .._tree import BALL, FREE, SLIDE
-from ._mjmodel import LEAST_INERTIA, free_name
-from ._urdf_elements import IDENTITY, Pose
+from ._followers import free_name
+from ._mjmodel import LEAST_INERTIA
+from ._poses import IDENTITY, Pose
 from ._write import check_same_place, dofs_of_joint, one_for_all, placed_joints, pose_of, put, refuse_stack
 
 _UNLIMITED = 1e9

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...robot.loading._mjmodel import quaternion, rotation_matrix
+from ...robot.loading._poses import quaternion, rotation_matrix
 from ...tasks import Task
 from .._parts import Part
 from ._obstacles import Obstacle

@@ -12,9 +12,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ...collision._convex import table_shapes
 from ...collision._core import core_scene, gaps_at
-from ...collision._table import ShapeKind
+from ...collision._table import ShapeKind, table_shapes
 from ...limits import CollisionAvoidanceLimit, Limit
 from .._parts import Part
 

@@ -12,7 +12,7 @@ from ..._errors import warn
 from ...kinematics import forward_kinematics
 from ...limits import Limit
 from ...robot import Robot
-from ...robot._hands import find_hands
+from ...robot._guesses import find_hands
 from ...robot._mujoco import model_bodies, mujoco_frame_pose, mujoco_poses
 from ...schemes import WeightedQP
 from ...tasks import ComTask, FrameTask, PostureTask, SupportPolygon, Task, support_polygon
