@@ -92,7 +92,6 @@ class DampingTask(VelocityTask):
     """
 
     calms: ClassVar[bool] = True
-    __init__ = VelocityTask.__init__
 
 
 class FreezeTask(VelocityTask):

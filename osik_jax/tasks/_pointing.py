@@ -184,7 +184,6 @@ class AxisAlignTask(PointingTask):
         "target_velocity": "rad/s",
     }
 
-    __init__ = PointingTask.__init__
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
@@ -242,7 +241,6 @@ class LookAtTask(PointingTask):
 
     units: ClassVar[Mapping[str, str]] = {"": "rad", "axis": "1 (direction)", "target": "m", "target_velocity": "m/s"}
 
-    __init__ = PointingTask.__init__
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
