@@ -93,6 +93,17 @@ class DampingTask(VelocityTask):
 
     calms: ClassVar[bool] = True
 
+    def __init__(
+        self,
+        robot: Robot,
+        *,
+        joints: Iterable[str] | None = None,
+        weight: WeightLike | None = None,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        super().__init__(robot, joints=joints, weight=weight, priority=priority, hard=hard)
+
 
 class FreezeTask(VelocityTask):
     """Task that keeps joints at rest while the rest of the robot moves: ``v_i = 0``.

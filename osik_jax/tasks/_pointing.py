@@ -66,16 +66,15 @@ class PointingTask(FramedTask):
         self,
         robot: Robot,
         frame: str,
-        *,
-        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
-        target: ArrayLike | Array | None = None,
-        target_frame: str | None = None,
-        target_velocity: ArrayLike | Array | None = None,
-        half_angle: ArrayLike | Array | None = None,
-        weight: ArrayLike | Array = 1.0,
-        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
-        priority: int = 1,
-        hard: bool = False,
+        axis: ArrayLike | Array,
+        target: ArrayLike | Array | None,
+        target_frame: str | None,
+        target_velocity: ArrayLike | Array | None,
+        half_angle: ArrayLike | Array | None,
+        weight: ArrayLike | Array,
+        gain: ArrayLike | Array | AdaptiveGain,
+        priority: int,
+        hard: bool,
     ):
         for name in (frame,) if target_frame is None else (frame, target_frame):
             robot.tree.frame(name)
@@ -184,6 +183,23 @@ class AxisAlignTask(PointingTask):
         "target_velocity": "rad/s",
     }
 
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
+        target: ArrayLike | Array | None = None,
+        target_frame: str | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        half_angle: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        to, common = (axis, target, target_frame, target_velocity, half_angle), (weight, gain, priority, hard)
+        super().__init__(robot, frame, *to, *common)
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
@@ -241,6 +257,23 @@ class LookAtTask(PointingTask):
 
     units: ClassVar[Mapping[str, str]] = {"": "rad", "axis": "1 (direction)", "target": "m", "target_velocity": "m/s"}
 
+    def __init__(
+        self,
+        robot: Robot,
+        frame: str,
+        *,
+        axis: ArrayLike | Array = (0.0, 0.0, 1.0),
+        target: ArrayLike | Array | None = None,
+        target_frame: str | None = None,
+        target_velocity: ArrayLike | Array | None = None,
+        half_angle: ArrayLike | Array | None = None,
+        weight: ArrayLike | Array = 1.0,
+        gain: ArrayLike | Array | AdaptiveGain = DEFAULT_GAIN,
+        priority: int = 1,
+        hard: bool = False,
+    ):
+        to, common = (axis, target, target_frame, target_velocity, half_angle), (weight, gain, priority, hard)
+        super().__init__(robot, frame, *to, *common)
 
     def rows_at(self, frames: Frames, backend: Backend = "jax") -> TaskRows:
         """Return two rows along the axes across ``axis`` [rad], or one row for a cone."""
