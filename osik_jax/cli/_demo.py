@@ -12,7 +12,7 @@ from ._messages import CommandError, told, writing
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Moves NAO with each scheme, prints how well, and writes a film and the motion to a folder.
+    """Moves NAO with each scheme, and writes a film, a figure and the motion to a folder.
 
     NAO sways over both feet (double-support), or lifts one (single-support).
     """

@@ -10,7 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from ..viewer import animate
-from ._figures import figures, table
+from ._figures import comparison, figures, table
 from ._motion import Motion
 from ._run import TITLES, Run, run_scheme
 
@@ -26,7 +26,7 @@ def run_demo(
     animation: bool = True,
     announce: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Table, Sequence[Run]]:
-    """Run the schemes in turn and write ``motion.npz`` and a film.
+    """Run the schemes in turn and write ``comparison.png``, ``motion.npz`` and a film.
 
     Return the table of all figures, and the runs. The film is that of the last scheme, ``motion.gif``, and
     ``motion.mp4`` where the program ffmpeg is installed. ``announce`` is called with the current stage. ``motion.npz``
@@ -42,12 +42,15 @@ def run_demo(
         runs.append(run := run_scheme(motion, scheme, dt=dt))
         name = scheme.replace("-", "_")
         arrays |= {"time": run.seen.time, f"q_{name}": run.q, f"v_{name}": run.solution.velocity}
+    announce("drawing the comparison")
+    found = {run.scheme: figures(motion, run) for run in runs}
+    comparison(motion.title, found, dt).savefig(folder / "comparison.png")
     np.savez_compressed(folder / "motion.npz", allow_pickle=False, **arrays)
     if animation:
         announce("filming")
         for name in ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]:
             _film(folder / name, motion, runs[-1], dt)
-    return table(motion.title, {run.scheme: figures(motion, run) for run in runs}), runs
+    return table(motion.title, found), runs
 
 
 def _film(path: Path, motion: Motion, run: Run, dt: float) -> None:

@@ -8,13 +8,14 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco_states import mujoco_at
+from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
 from osik_jax.demo import _nao
 from osik_jax.demo._demo import run_demo
-from osik_jax.demo._figures import figures, table
+from osik_jax.demo._figures import Figure, comparison, figures, table
 from osik_jax.demo._motion import Path, Stroke, minimum_jerk
 from osik_jax.demo._observed import observe
 from osik_jax.demo._run import Run, make_scheme, run_scheme
@@ -178,7 +179,7 @@ def test_single_support_reaches_its_numbers():
 def test_files_and_figures_agree_with_mujoco(short, nao):
     """Velocities integrate to the configurations, by MuJoCo's own integration."""
     folder, shown, motion, run = short
-    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "motion.npz"}
+    assert {p.name for p in folder.iterdir()} >= {"motion.gif", "comparison.png", "motion.npz"}
     arrays = np.load(folder / "motion.npz")
     assert arrays["q_weighted"].shape == (101, nao.nq) and arrays["v_weighted"].shape == (100, nao.nv)
     assert [column.header for column in shown.columns] == ["", "Weighted QP"]
@@ -202,3 +203,30 @@ def test_files_and_figures_agree_with_mujoco(short, nao):
 def test_unknown_schemes_are_refused():
     with pytest.raises(KeyError, match="hierarchical"):
         make_scheme("magic")
+
+
+def test_comparison_draws_the_curves_it_gets(tmp_path):
+    """Schemes in one plot; what is only rounding about a constant, or 0 throughout, draws no curve."""
+    time = np.linspace(0.0, 1.0, 11)
+    curves = {"weighted": 1e-3 * (1.0 + time), "hierarchical": 1e-6 * (1.0 + time)}
+    rows = {
+        scheme: [
+            Figure("drift [mm]", values, most=0.1, floor=1e-5),
+            Figure("margin [mm]", values, least=0.0),
+            Figure("steady", 0.5 + 1e-16 * np.sin(40.0 * time), span=0.1),
+            Figure("zero", 0.0 * time, floor=1e-5),
+            Figure("number", 3.0),
+        ]
+        for scheme, values in curves.items()
+    }
+    page = comparison("x", rows, 0.1)
+    page.savefig(tmp_path / "f.png")
+    log, linear, steady, zero = page.axes[:4]
+    assert [bool(axes.lines) for axes in page.axes] == [True] * 4 + [False] * 2
+    np.testing.assert_allclose(np.asarray(log.lines[0].get_xydata()), np.stack([time, curves["weighted"]], -1))
+    np.testing.assert_allclose(np.asarray(log.lines[1].get_ydata()), 1e-5)
+    np.testing.assert_allclose(np.asarray(linear.lines[1].get_ydata()), curves["hierarchical"])
+    assert log.get_yscale() == "log" and log.get_ylim()[1] > 0.1 and linear.get_ylim()[0] < 0.0
+    assert np.ptp(steady.get_ylim()) >= 0.1 and zero.get_ylim() == pytest.approx((1e-5, 1e-3))
+    with Image.open(tmp_path / "f.png") as picture:
+        assert picture.size == tuple(round(x) for x in page.get_size_inches() * page.dpi)
