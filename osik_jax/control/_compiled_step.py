@@ -339,7 +339,7 @@ def _placed(
     """Return numbers of new leaves with the rows of lanes that JAX computes, by task and of limits, and the leaves.
 
     The leaves stand side by side in one array; ``places`` gets theirs. Numbers are in the order of
-    ``StepRows::add_given``, -1 for what it does not need.
+    ``GivenTask::add`` (``core/tasks/given.hpp``), -1 for what it does not need.
     """
     found: dict[str, list[int]] = {}
     parts: list[Array] = []
@@ -359,7 +359,7 @@ def _placed(
 
 
 def row_parts(rows: TaskRows) -> tuple[Any, ...]:
-    """Return the numbers of rows that JAX computes, in the order of ``StepRows::add_given``; None: it needs none."""
+    """Return the numbers of rows that JAX computes, in the order of ``GivenTask::add``; None: it needs none."""
     upper, jacobian = (None if rows.is_equality else rows.upper), (None if rows.dofs is not None else rows.jacobian)
     return rows.error, rows.lower, upper, rows.weight, rows.pull, rows.levers, rows.curvature, jacobian, None
 

@@ -89,13 +89,12 @@ def _copies(branches: Float[np.ndarray, "k n"], own: Coordinates, most: int) -> 
     """
     joints = np.flatnonzero(own.turns & np.isfinite(own.lower) & np.isfinite(own.upper))
     here, unit = branches[:, joints, None], np.eye(len(own.first), dtype=branches.dtype)[joints]
-    fewest, greatest = (
-        np.ceil((own.lower[joints, None] - here) / TURN),
-        np.floor((own.upper[joints, None] - here) / TURN),
-    )
+    lower, upper = own.lower[joints, None], own.upper[joints, None]
+    fewest, greatest = np.ceil((lower - here) / TURN), np.floor((upper - here) / TURN)
     choices = (greatest - fewest).max((0, 2), initial=0).astype(int) + 1
-    number = fewest + np.arange(choices.max(initial=1))
-    moved = np.where(number <= greatest, TURN * number, np.nan).astype(branches.dtype)
+    moved = (TURN * (fewest + np.arange(choices.max(initial=1)))).astype(branches.dtype)
+    # not by their numbers: a sum that is rounded may be outside
+    moved[(here + moved < lower) | (here + moved > upper)] = np.nan
     copies = branches[:, None]
     for at in np.flatnonzero(choices > 1):
         turned = moved[:, None, at, : choices[at], None] * unit[at]

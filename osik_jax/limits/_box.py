@@ -59,6 +59,7 @@ class Limit(MadeForRobot, Replaceable):
             contradict each other, the one applied first holds.
         bound_name: what a bound on a single joint is called in verdicts; empty: by the class.
         sees_places: whether the limit keeps places of bodies, such as a hand before a wall; not joints alone.
+            ``inverse_kinematics`` of poses keeps such a limit if ``sought`` returns one.
     """
 
     kind: ClassVar[Kind] = "velocity"

@@ -129,7 +129,7 @@ class ComTask(Task):
         return position
 
     def core_leaves(self) -> list[Any]:
-        """Return the leaves in the order of ``StepRows::add_task``."""
+        """Return the leaves in the order of the card in ``core/tasks``."""
         bounds = [self.lower, self.upper, self.target, None]
         if self.polygon is not None:
             bounds = [None, self.polygon.offsets, self.polygon.normals, self.polygon.vertices]

@@ -124,7 +124,7 @@ class PoseTask(FramedTask):
         return np.flatnonzero(self.kept) < 3
 
     def core_leaves(self) -> list[Any]:
-        """Return the leaves in the order of ``StepRows::add_task``."""
+        """Return the leaves in the order of the card in ``core/tasks``."""
         bounds, weights = (self.lower, self.upper), (self.position_weight, self.orientation_weight)
         return [self.gain, self.weight, self.target_velocity, *bounds, *self.target, *weights]
 

@@ -125,7 +125,7 @@ class PostureTask(Task):
         return CoreCard(POSTURE, len(dofs), [*(robot.tree.qpos_address[joint] for joint in self.joints), *dofs])
 
     def core_leaves(self) -> list[Any]:
-        """Return the leaves in the order of ``StepRows::add_task``."""
+        """Return the leaves in the order of the card in ``core/tasks``."""
         bounds = self.lower, self.upper
         return [self.gain, self.weight, self.target_velocity, *bounds, self.target, None, None, None]
 

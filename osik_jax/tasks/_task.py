@@ -269,7 +269,7 @@ class Task(MadeForRobot, Replaceable):
         raise NotImplementedError
 
     def core_leaves(self) -> list[Any]:
-        """Return the leaves of a task with a card in the order of ``StepRows::add_task``; None for a missing one."""
+        """Return the leaves that the task's card in ``core/tasks`` reads, in its order; None for a missing one."""
         return []
 
     def counted_dofs(self, robot: Robot) -> tuple[int, ...]:

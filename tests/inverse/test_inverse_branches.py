@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import osik_jax as osik
+from osik_jax.inverse._branches import Coordinates, _copies
 
 UR10E = Path(__file__).parents[1] / "data" / "ur10e_branches.npz"
 """Poses of random configurations, and their solutions by EAIK 1.2.2, NaN where there are fewer than eight."""
@@ -68,6 +69,15 @@ def test_configurations_by_whole_turns_within_limits_follow_the_branches():
     solutions = np.asarray(found.solutions)
     assert max(np.abs(solutions[:8] - one).max(1).min() for one in expected) < 1e-4
     assert np.abs(solutions[:2]).max() <= np.pi and np.isnan(solutions[8:]).all()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_copies_by_whole_turns_stay_within_limits_also_by_rounding(rng, dtype):
+    for here in rng.uniform(-6.0, 0.0, 50).astype(dtype):
+        turned = here + np.asarray(2 * np.pi, dtype)
+        for upper, expected in ((turned, 1), (np.nextafter(turned, here), 0)):
+            own = (np.array([number]) for number in (True, here, upper, here))
+            assert len(_copies(here[None, None], Coordinates(np.arange(1), *own), 8)) == expected
 
 
 @pytest.mark.parametrize("joint", ["", 'range="-20 20"'])

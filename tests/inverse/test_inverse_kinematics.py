@@ -15,6 +15,7 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax.inverse._problem import read_problem
+from osik_jax.limits import LimitRows
 
 POSITION, ORIENTATION = 1e-3, 1e-2
 
@@ -254,6 +255,35 @@ def test_tasks_on_an_arm_with_a_wall_and_preferences(arm):
     assert found.converged and away.max() <= POSITION and turned.max() <= ORIENTATION
     assert mujoco_pose(arm, found.q, "link4")[0][1] <= 0.02 + 1e-4
     assert_within_limits(arm, found.q)
+
+
+class Ceiling(osik.Limit):
+    """A class of one's own: the elbow stays below a height [m]."""
+
+    sees_places = True
+    height: jax.Array
+
+    def has_rows(self, robot):
+        return True
+
+    def rows(self, robot, kinematics, q, dt):
+        position, _ = kinematics.frame_pose(robot, "link4")
+        jacobian = osik.frame_jacobian(robot, kinematics, "link4")
+        return LimitRows(jacobian[2:3], jnp.array([-jnp.inf]), self.height - position[2:3])
+
+    def sought(self, robot):
+        return self
+
+
+@pytest.mark.release
+def test_poses_below_a_limit_of_ones_own_on_places(arm):
+    position, _ = mujoco_pose(arm, arm.q0, "hand")
+    free = osik.inverse_kinematics(arm, {"hand": position}, seeds=8)
+    height = mujoco_pose(arm, free.q, "link4")[0][2] - 0.02
+    found = osik.inverse_kinematics(arm, {"hand": position}, limits=[Ceiling(jnp.asarray(height))], seeds=8)
+    assert free.converged and found.converged
+    assert mujoco_pose(arm, found.q, "link4")[0][2] <= height + 1e-4
+    np.testing.assert_allclose(mujoco_pose(arm, found.q, "hand")[0], position, atol=POSITION)
 
 
 @pytest.mark.release
