@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from .._whole_file import write_text
 from ._inputs import read_pose_file, read_robot
 from ._messages import CommandError, told, writing
 
@@ -75,7 +74,7 @@ class Place:
             self.out.mkdir(parents=True, exist_ok=True)
             base = dict(zip(("x", "y", "yaw", "height"), found.best.tolist(), strict=True))
             q = [row.tolist() if ok else None for row, ok in zip(found.q, found.is_reached, strict=True)]
-            write_text(self.out / "placement.json", json.dumps({"base": base, "q": q}, indent=1))
+            (self.out / "placement.json").write_text(json.dumps({"base": base, "q": q}, indent=1), encoding="utf-8")
             found.figure().savefig(self.out / "placement.png")
         print(f"written: {self.out}/placement.json, placement.png")
         return 0 if found.is_reached.all() else 1

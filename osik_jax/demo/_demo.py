@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from .._whole_file import whole_file
 from ..viewer import animate
 from ._figures import figures, table
 from ._motion import Motion
@@ -43,8 +42,7 @@ def run_demo(
         runs.append(run := run_scheme(motion, scheme, dt=dt))
         name = scheme.replace("-", "_")
         arrays |= {"time": run.seen.time, f"q_{name}": run.q, f"v_{name}": run.solution.velocity}
-    with whole_file(folder / "motion.npz") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+    np.savez_compressed(folder / "motion.npz", allow_pickle=False, **arrays)
     if animation:
         announce("filming")
         for name in ["motion.gif", "motion.mp4"] if shutil.which("ffmpeg") else ["motion.gif"]:
