@@ -35,7 +35,7 @@ def open_npz(path: str | os.PathLike[str]) -> Iterator[NpzFile]:
                 yield file
         except OsikValueError:  # of the block, too
             raise
-        except (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        except (ValueError, EOFError, OSError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
             # NumPy takes what it does not know for a pickle, and says how to allow these
             why = "it is none, or holds objects" if "pickle" in str(error) else error
             raise OsikValueError(f"{name} cannot be read as an .npz of plain arrays: {why}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
@@ -49,7 +50,7 @@ class View(InScene):
 
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends; or write one that plays a motion."""
-        from ..saving import load_controller
+        from ..saving._controller import read_controller
         from ..viewer.live import _open, _server
         from ..viewer.live._page import serve
 
@@ -67,7 +68,9 @@ class View(InScene):
             _server.check_port(self.host, self.port)
             options: Any = dict(host=self.host, port=self.port)
             if self.file is not None:
-                view = serve(load_controller(self.file), **options)
+                content = self.file.read_bytes()
+                controller, robot = read_controller(content, str(self.file)), json.loads(content)["robot"]
+                view = serve(controller, source=robot.get("file", robot.get("name")), **options)
             else:
                 robot = read_robot(self.robot, self.base)
                 keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()

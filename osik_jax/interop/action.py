@@ -107,7 +107,7 @@ class TaskSpaceAction(eqx.Module):
         check_setting("TaskSpaceAction(robot, tasks)", robot, scheme, dt)
         check_tasks(tasks, robot)
         for what, scale in (("position_scale", position_scale), ("rotation_scale", rotation_scale)):
-            if not (np.ndim(scale) == 0 and 0.0 < scale < np.inf):
+            if isinstance(scale, Mapping) or not (np.ndim(scale) == 0 and 0.0 < scale < np.inf):
                 raise OsikValueError(f"{what} is {scale!r}; it is a positive number")
         self.robot, self.tasks = robot, dict(tasks)
         self.scheme, self.limits = scheme, checked_limits(robot, limits)

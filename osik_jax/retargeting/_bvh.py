@@ -67,7 +67,10 @@ def read_bvh(path: str | os.PathLike[str], *, unit: str | float | None = None, u
     words, joints = _Words(source, Path(path).read_text(encoding="utf-8-sig", errors="replace")), list[_Joint]()
     words.take("HIERARCHY")
     words.take("ROOT")
-    _read_joint(words, joints, -1)
+    try:
+        _read_joint(words, joints, -1)
+    except RecursionError:
+        raise words.error("joints are inside each other without end") from None
     fps, values = _frames(words, sum(len(joint.channels) for joint in joints))
     parents, names = [joint.parent for joint in joints], tuple(joint.name for joint in joints)
     if len(set(names)) < len(names):
@@ -144,9 +147,10 @@ def _read_joint(words: _Words, joints: list[_Joint], parent: int, is_end: bool =
 def _read_channels(words: _Words) -> tuple[tuple[str, str], ...]:
     """Return kind and axis of each channel after the word CHANNELS."""
     count = words.next("the number of channels")
-    names = [words.next("a channel").lower() for _ in range(int(count) if count.isdigit() else 0)]
+    is_count = count.isdecimal()
+    names = [words.next("a channel").lower() for _ in range(int(count) if is_count else 0)]
     unknown = [name for name in names if name not in _CHANNELS]
-    if unknown or not names or len(set(names)) < len(names):
+    if unknown or not is_count or len(set(names)) < len(names):
         raise words.error(f"CHANNELS is followed by how many there are, and by some of {', '.join(_CHANNELS)}")
     return tuple(_CHANNELS[name] for name in names)
 

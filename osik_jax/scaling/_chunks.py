@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from .._errors import OsikValueError
 from .._progress import Progress, check_progress, reported
 from ..batching._names import leaf_names
 from ..numerics._arguments import check_count
-from ._fingerprint import fingerprint
+from ._fingerprint import differences, fingerprint
 from ._folder import only_job
 from ._saved import FORMAT, Saved
 
@@ -42,9 +42,10 @@ def run_in_chunks(
 
     With ``out``, each chunk is a file of that folder, under its name only when complete, beside a manifest. Call it
     again with the same arguments and it runs only the chunks that are missing or damaged: each file that is there is
-    read once, against its checksums. Different arguments are refused: compared are the number of lanes and of those in
-    a chunk, precision, version, ``label``, and names, shapes and numbers of ``batch`` and ``shared``. What the function
-    holds besides is not seen: pass it through ``shared``, or name it in ``label``. One job works in a folder at a time.
+    read once, against its checksums, and has to be of this job. Different arguments are refused: compared are the
+    number of lanes and of those in a chunk, precision, version, ``label``, and names, shapes and numbers of ``batch``
+    and ``shared``. What the function holds besides is not seen: pass it through ``shared``, or name it in ``label``.
+    One job works in a folder at a time.
 
     On several hosts, each runs its own part of the batch into a folder of its own, without ``jax.distributed``.
 
@@ -70,8 +71,8 @@ def run_in_chunks(
 
     Raises:
         ValueError: arguments that do not fit, a folder with another job in it (the message names what differs),
-            several processes of ``jax.distributed``, or results that do not have the lanes in front or are of a type
-            that a ``.npz`` does not keep.
+            several processes of ``jax.distributed``, or results that do not have the lanes in front, are of other
+            names, types or shapes than in other chunks, or of a type that a ``.npz`` does not keep.
         BlockingIOError: another process works in the folder.
         OSError: the folder cannot be made or written to; what is finished stays.
     """
@@ -88,13 +89,19 @@ def run_in_chunks(
         return jax.tree.map(lambda *rows: np.concatenate(rows), *parts)
     saved = Saved(Path(out), job.manifest(label))
     with only_job(saved.folder):
-        for k, result in job.results(saved.claim(), progress, unit):
+        todo = saved.claim()
+        if 0 < len(todo) < job.chunks:
+            done = min(set(range(job.chunks)).difference(todo)) * job.chunk
+            job.layout = _layout(saved[done : done + 1])
+        for k, result in job.results(todo, progress, unit):
             saved.write(k, dict(zip(leaf_names(result), jax.tree.leaves(result), strict=True)))
     return saved
 
 
 class _Job:
-    """Function, batch and chunk size of a job."""
+    """Function, batch and chunk size of a job; and the results' types and shapes, once they are known."""
+
+    layout: dict[str, str] | None = None
 
     def __init__(self, function: Callable[..., Any], batch: Any, shared: tuple[Any, ...], count: int, chunk: int):
         self.function, self.batch, self.shared, self.count, self.chunk = function, batch, tuple(shared), count, chunk
@@ -146,21 +153,32 @@ class _Job:
         with reported(self.count, self.count - missing, progress, unit) as advance:
             started = [self.run(k) for k in todo[:1]]
             for place, k in enumerate(todo, 1):
-                started += [self.run(following) for following in todo[place : place + 1]]
-                yield k, self._without_padding(started.pop(0), k)
-                advance(self.size(k))
+                try:
+                    started += [self.run(following) for following in todo[place : place + 1]]
+                finally:  # what is computed is kept, also when the next chunk fails
+                    yield k, self._without_padding(started.pop(0), k)
+                    advance(self.size(k))
 
     def _without_padding(self, result: Any, k: int) -> Any:
         """Return the lanes of a chunk as NumPy arrays."""
-        wrong = [
-            name or "it"
-            for name, leaf in zip(leaf_names(result), jax.tree.leaves(result), strict=True)
-            if np.shape(leaf)[:1] != (self.chunk,)
-        ]
-        if wrong or not jax.tree.leaves(result):
+        names, leaves = leaf_names(result), jax.tree.leaves(result)
+        wrong = [name or "it" for name, leaf in zip(names, leaves, strict=True) if np.shape(leaf)[:1] != (self.chunk,)]
+        if wrong or not leaves:
             found = f"{wrong[0]} does not" if wrong else "there are none"
             raise OsikValueError(f"the function's results have the lanes in front, {self.chunk} of them: {found}")
+        if len(set(names)) < len(names):
+            raise OsikValueError(f"two arrays of the function's results are called {max(names, key=names.count)!r}")
+        found = _layout(dict(zip(names, leaves, strict=True)))
+        changed = differences(self.layout or found, found)
+        if changed:
+            raise OsikValueError(f"the function's results of chunk {k} are not like those before: {'; '.join(changed)}")
+        self.layout = found
         return jax.tree.map(lambda leaf: np.asarray(leaf)[: self.size(k)], result)
+
+
+def _layout(arrays: Mapping[str, Any]) -> dict[str, str]:
+    """Return type and shape of one lane of each array."""
+    return {name or "it": f"{array.dtype} {array.shape[1:]}" for name, array in arrays.items()}
 
 
 def _lengths(tree: Any) -> set[int]:

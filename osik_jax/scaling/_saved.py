@@ -14,11 +14,16 @@ import numpy as np
 from .._errors import OsikKeyError, OsikTypeError, OsikValueError, warn
 from .._npz import open_npz
 from .._whole_file import whole_file, write_text
-from ._fingerprint import differences
+from ._fingerprint import differences, identifier
 
 FORMAT = 3
 _MANIFEST = "manifest.json"
-_RESULT = "result."
+_RESULT, _MARK = "result.", "of"
+"""Name of a result in a file begins so; name of the array with the identifier of the job, the chunk and the results."""
+
+
+class _DamagedChunk(OsikValueError):
+    """A chunk's file cannot be read, or has other arrays than were written."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +86,7 @@ class Saved:
             if array.dtype.hasobject or (array.dtype.names is None and np.dtype(array.dtype.str) != array.dtype):
                 raise OsikValueError(f"{name or 'the result'} is of type {array.dtype}, which no .npz keeps")
         named: dict[str, Any] = {_RESULT + name: array for name, array in arrays.items()}
+        named[_MARK] = np.array([identifier(self.manifest), str(chunk), *arrays])
         with whole_file(self._path(chunk)) as file:
             np.savez(file, allow_pickle=False, **named)
 
@@ -105,7 +111,7 @@ class Saved:
             return False
         try:
             self._chunk(chunk, None)
-        except ValueError as damaged:
+        except _DamagedChunk as damaged:
             warn(f"{str(damaged).partition(';')[0]}; it is made anew")
             self._path(chunk).unlink()
             return False
@@ -123,14 +129,19 @@ class Saved:
                 f"chunk {chunk} of {self.folder} is missing, with {more} more of {self.chunks}; {again}, it goes on "
                 "where it was"
             )
+        path = self._path(chunk)
         try:
-            with open_npz(self._path(chunk)) as file:
-                known = [name.removeprefix(_RESULT) for name in file.files]
+            with open_npz(path) as file:
+                job, number, *known = file[_MARK].tolist() if _MARK in file.files else ("", "")
+                if number != str(chunk) or {_MARK, *(_RESULT + name for name in known)} != set(file.files):
+                    raise OsikValueError(f"{path} has not the arrays of chunk {chunk}")
                 unknown = [name for name in names or () if name not in known]
-                if not unknown:
+                if job == identifier(self.manifest) and not unknown:
                     return {name: file[_RESULT + name] for name in (known if names is None else names)}
-        except (KeyError, ValueError) as error:
-            raise OsikValueError(f"{error}; {again}, it makes the file anew") from error
+        except ValueError as error:
+            raise _DamagedChunk(f"{error}; {again}, it makes the file anew") from error
+        if job != identifier(self.manifest):
+            raise OsikValueError(f"{path} has results of another job; take it out of the folder")
         raise OsikKeyError(f"no array {unknown[0]!r}; arrays: {', '.join(known)}")
 
 

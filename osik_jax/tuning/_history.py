@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from .._errors import OsikValueError
 from .._npz import open_npz
 from .._whole_file import whole_file
+from ._parameters import ParameterSpace
 
 _FORMAT = 1
 
@@ -63,24 +64,25 @@ class State:
     history: History  # of the iterations so far
 
 
-def save_state(path: str | os.PathLike[str], state: State, names: tuple[str, ...]) -> None:
-    """Write a state of parameters of these names as .npz; it replaces an older file only when it is complete."""
+def save_state(path: str | os.PathLike[str], state: State, space: ParameterSpace) -> None:
+    """Write a state as .npz; it replaces an older file only when it is complete."""
     arrays = {f"history/{name}": value for name, value in vars(state.history).items()}
     arrays |= {f"optimizer/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state.optimizer))}
-    arrays |= {"format": np.array(_FORMAT), "vector": np.asarray(state.vector), "space/names": np.array(names)}
+    arrays |= {"format": np.array(_FORMAT), "vector": np.asarray(state.vector)} | _described(space)
     with whole_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def load_state(path: str | os.PathLike[str], names: tuple[str, ...], optimizer: Any) -> State:
+def load_state(path: str | os.PathLike[str], space: ParameterSpace, optimizer: Any) -> State:
     """Return a state that ``save_state`` wrote; ``optimizer`` is the first state of the optimiser."""
     with open_npz(path) as file:
         arrays = dict(file)
     if arrays.get("format") != _FORMAT:
         raise OsikValueError(f"{os.fspath(path)} is no state of a tuning that this version can read")
-    saved = tuple(arrays["space/names"].tolist())
-    if saved != names:
-        raise OsikValueError(f"the parameters are not those saved in {os.fspath(path)}: {saved}, now {names}")
+    for name, now in _described(space).items():
+        if not np.array_equal(arrays[name], now):
+            what = f"{name.removeprefix('space/')} {arrays[name]}, now {now}"
+            raise OsikValueError(f"the parameters are not those saved in {os.fspath(path)}: {what}")
     leaves, structure = jax.tree.flatten(optimizer)
     memory = [arrays[f"optimizer/{i}"] for i in range(sum(name.startswith("optimizer/") for name in arrays))]
     if [leaf.shape for leaf in memory] != [np.shape(leaf) for leaf in leaves]:
@@ -88,3 +90,9 @@ def load_state(path: str | os.PathLike[str], names: tuple[str, ...], optimizer: 
     memory = [jnp.asarray(new, old.dtype) for new, old in zip(memory, leaves, strict=True)]
     history = History(**{name: arrays[f"history/{name}"] for name in History.__dataclass_fields__})
     return State(jnp.asarray(arrays["vector"]), jax.tree.unflatten(structure, memory), history)
+
+
+def _described(space: ParameterSpace) -> dict[str, np.ndarray]:
+    """Return what a vector of parameters means: their names, and how they are mapped to numbers without bounds."""
+    numbers = {f"space/{name}": np.asarray(getattr(space, name)) for name in ("log", "lower", "upper", "scale")}
+    return {"space/names": np.array(space.names)} | numbers

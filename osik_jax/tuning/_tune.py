@@ -108,14 +108,14 @@ def tune(
     rule = _optimizer(optimizer)
     state = State(space.initial, rule.init(space.initial), History.empty(len(space.names)))
     if resume is not None:
-        state = load_state(resume, space.names, state.optimizer)
+        state = load_state(resume, space, state.optimizer)
     step = _compiled_step(Problem(loss, loop, space), scenarios, held_out, rule, chunk)
     bar = progress_bar(iterations, len(state.history), unit="iterations") if progress else nullcontext(lambda *_: None)
     with bar as show:
         while len(state.history) < iterations:
             state = step(state)
             if save is not None:
-                save_state(save, state, space.names)
+                save_state(save, state, space)
             show(len(state.history), _described(state.history))
     return _result(loop, space, state.history)
 

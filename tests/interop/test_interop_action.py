@@ -108,6 +108,7 @@ def test_what_does_not_fit_is_told(arm, tasks):
         (dict(commanded="hand"), "not one string"),
         (dict(commanded=()), "no task to command"),
         (dict(position_scale=0.0), "position_scale is 0.0"),
+        (dict(position_scale={"hand": 0.1}), "position_scale is .* a positive number"),
         (dict(joints=("elbow",)), "no joint 'elbow'"),
         (dict(dt=-1.0), "dt is -1.0"),
     ):

@@ -1,6 +1,7 @@
 """Readers of motion files beside SciPy's rotations, and what they say of broken files."""
 
 import dataclasses
+import re
 import warnings
 from typing import Any
 
@@ -175,6 +176,11 @@ BROKEN = {
     "channels twice": (lambda t: t.replace(_THREE, 2 * _THREE, 1), r"line 10: JOINT, End Site or } should come"),
     "no channel": (lambda t: t.replace("6 Xposition", "6 Wposition"), r"line 5: CHANNELS is followed by.*xposition"),
     "count of channels": (lambda t: t.replace("CHANNELS 6", "CHANNELS 7"), r"line 6: CHANNELS is followed by"),
+    "superscript": (lambda t: t.replace("CHANNELS 6", "CHANNELS ²"), r"line 5: CHANNELS is followed by"),
+    "nested": (
+        lambda t: t.replace(_THREE, _THREE + 3000 * "JOINT a {\nOFFSET 0 0 0\n", 1),
+        "inside each other without end",
+    ),
     "joint in an end": (lambda t: t.replace(_END, _END + "JOINT tip\n{\n}\n", 1), r"line \d+: } should come here"),
     "no name": (lambda t: t.replace("ROOT Hips", "ROOT"), r"line 2: a joint has no name"),
     "a name twice": (lambda t: t.replace("JOINT Neck", "JOINT Spine"), r"a second joint is called Spine"),
@@ -227,6 +233,16 @@ def test_statements_of_a_bvh_may_stand_on_any_lines(tmp_path):
         motion = read_bvh(path)
         assert motion.joint_names[1] == "the end of the Spine", what
         np.testing.assert_array_equal(motion.positions, whole.positions, what)
+
+
+def test_a_joint_of_a_bvh_may_have_no_channels(tmp_path):
+    path = write_bvh(tmp_path / "clip.bvh", dancer())
+    found = re.search(r"End Site\n(\t*)\{\n\t*OFFSET 0 0 0\n", path.read_text())
+    assert found is not None
+    path.write_text(path.read_text().replace(found[0], found[0].replace("End Site", "JOINT tip") + "CHANNELS 0\n", 1))
+    motion = read_bvh(path)
+    tip = motion.joint_names.index("tip")
+    np.testing.assert_array_equal(motion.positions[:, tip], motion.positions[:, tip - 1])
 
 
 def _written(path, **changes):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
@@ -63,6 +64,8 @@ def flipped(data: bytes, place: int) -> bytes:
 DAMAGES = {
     "half of it": lambda data: data[: len(data) // 2],
     "empty": lambda data: b"",
+    "an array hidden": lambda data: flipped(data, data.find(b"PK\x01\x02") + 32),  # length of a comment
+    "marked as encrypted": lambda data: flipped(data, data.find(b"PK\x01\x02") + 8),
     "no zip": lambda data: b"text" * 100,
     "an array": lambda data: b"\x93NUMPY\x01\x00" + data,
     "byte flipped in an array": lambda data: flipped(data, data.find(b"result.twice.npy") + 200),
@@ -100,6 +103,33 @@ def test_a_folder_whose_manifest_is_lost_is_refused_and_kept(done, damage):
     assert function.ran == [] and sorted(done.glob("*.npz")) == before and leftovers(done) == []
 
 
+def test_a_chunk_of_another_job_is_refused_and_kept(done, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    run(other, program, shared=(4.0,))
+    shutil.copy(done / "00000002.npz", other)
+    function = Counted()
+    for call in (lambda: scaling.load(other)[8:12], lambda: run(other, function, shared=(4.0,))):
+        refuses(ValueError, r"00000002\.npz has results of another job", call)
+    assert (other / "00000002.npz").read_bytes() == (done / "00000002.npz").read_bytes() and function.ran == []
+
+
+CHANGES = [
+    (lambda y: {"y": y[:, None]}, r"y was float64 \(\), is float64 \(1,\)$"),
+    (lambda y: {"y": y.astype(np.float32)}, r"y was float64 \(\), is float32 \(\)$"),
+    (lambda y: {"z": y}, r"y was float64 \(\), is absent; z was absent, is float64 \(\)$"),
+]
+
+
+@pytest.mark.parametrize(("changed", "message"), CHANGES, ids=["shape", "type", "name"])
+def test_chunks_have_the_same_types_and_shapes(tmp_path, changed, message):
+    """In one job, and where a job goes on."""
+    wrong = r"results of chunk 2 are not like those before: " + message
+    for out in (None, tmp_path):
+        refuses(ValueError, wrong, run, out, lambda x: changed(x) if x[0] == 8 else {"y": x})
+    assert scaling.load(tmp_path).missing == (2, 3, 4)
+    refuses(ValueError, wrong, run, tmp_path, changed)
+
+
 def test_plain_numpy_reads_a_chunk(done):
     with np.load(done / "00000004.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["result.square"], 3.0 * X[16:] ** 2)
@@ -130,7 +160,8 @@ def test_what_a_killed_job_left_stops_nobody(done):
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, RuntimeError])
-def test_what_is_written_when_the_job_stops_stays(tmp_path, failure):
+def test_what_is_computed_when_the_job_stops_stays(tmp_path, failure):
+    """Also the chunk that was about to be written while the next one ran."""
     function, failures = Counted(), [failure]
 
     def batch(start: int, stop: int) -> Any:
@@ -140,10 +171,10 @@ def test_what_is_written_when_the_job_stops_stays(tmp_path, failure):
 
     with pytest.raises(failure):
         run(tmp_path, function, batch, count=20, shared=(3.0,))
-    assert sorted(path.name for path in tmp_path.glob("*.npz")) == ["00000000.npz", "00000001.npz"]
+    assert sorted(path.name for path in tmp_path.glob("*.npz")) == [f"{k:08d}.npz" for k in range(3)]
     assert leftovers(tmp_path) == []
     assert_right(run(tmp_path, function, batch, count=20, shared=(3.0,)))
-    assert function.ran == [0, 4, 8, 8, 12, 16]
+    assert function.ran == [0, 4, 8, 12, 16]
 
 
 def test_a_folder_that_cannot_be_written_to(tmp_path):
@@ -186,6 +217,7 @@ def test_a_job_of_numpy_that_is_done(tmp_path):
     [
         (lambda x: {"y": jnp.asarray(x, jnp.bfloat16)}, "y is of type bfloat16, which no .npz keeps"),
         (lambda x: {"y": np.array([{}] * len(x))}, "y is of type object, which no .npz keeps"),
+        (lambda x: {"a.b": x, "a": {"b": -x}}, r"two arrays of the function's results are called 'a\.b'"),
     ],
 )
 def test_results_that_would_not_come_back(tmp_path, function, message):

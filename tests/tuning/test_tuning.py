@@ -371,6 +371,9 @@ class TestTune:
         refuses(ValueError, "another optimizer", run, loop, scenarios, resume=file, optimizer=optax.sgd(0.1))
         with pytest.raises(ValueError, match="the parameters are not those"):
             tuning.tune(LOSS, ["hand.weight"], scenarios, loop=loop, resume=file, progress=False)
+        other = [tuning.Parameter(name, log=False) for name in NAMES]  # of the same names, which mean other numbers
+        with pytest.raises(ValueError, match="the parameters are not those saved.*: log "):
+            tuning.tune(LOSS, other, scenarios, loop=loop, resume=file, progress=False)
         with pytest.raises(FileNotFoundError):
             run(loop, scenarios, resume=tmp_path / "no.npz")
 

@@ -120,6 +120,18 @@ def test_edits_at_the_desk() -> None:
         desk.load(osik.Controller(ROBOT, {"posture": osik.PostureTask(ROBOT)}, dt=0.01))
 
 
+def test_a_page_without_source_takes_the_file_that_it_wrote() -> None:
+    """The file has the robot's MJCF, whose frames come in another order."""
+    arm = osik.load_robot("arm7")
+    tasks = {"hand": osik.FrameTask(arm, "hand", weight=3.0), "posture": osik.PostureTask(arm)}
+    own = Session(arm, tasks, osik.WeightedQP(), (), 0.005, np.asarray(arm.q0))
+    desk, controller = Desk(own), read_controller(own.to_text().encode(), "the file")
+    assert controller.robot.tree != arm.tree
+    desk.load(controller)
+    now: Any = desk.session
+    assert now.robot is arm and now.tasks["hand"].frame == "hand" and float(now.tasks["hand"].weight) == 3.0
+
+
 def test_a_default_session_has_what_there_is_to_drag() -> None:
     assert find_hands(ROBOT) == ("l_gripper", "r_gripper")
     assert find_hands(osik.load_robot("arm7")) == ("hand",)

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import pytest
 import viser
+from waiting import until
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin, Subprotocol
@@ -49,6 +50,19 @@ def test_a_page_of_another_site_moves_nothing(
             page.recv(timeout=10.0)
     assert tuple(handle.position) == (0.0, 0.0, 0.0)
     assert f"osik view: refused a connection from a page of {origin}" in capfd.readouterr().err
+
+
+def test_a_message_that_cannot_be_read_ends_no_other_visit(server: Any) -> None:
+    """Only the connection that it came by."""
+    handle, own = server.scene.add_transform_controls("/hand"), f"http://127.0.0.1:{server.get_port()}"
+    with opened(server, own) as visitor:
+        for message in ("text", b"\xff\x00junk", msgspec.msgpack.encode({"type": "TransformControlsUpdateMessage"})):
+            with opened(server, own) as other, pytest.raises(ConnectionClosed):
+                other.send(message)
+                while True:
+                    other.recv(timeout=10.0)
+        visitor.send(moved([1.0, 2.0, 3.0]))
+        assert until(lambda: tuple(handle.position) == (1.0, 2.0, 3.0))
 
 
 @pytest.mark.parametrize(

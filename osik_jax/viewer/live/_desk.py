@@ -17,7 +17,7 @@ from ..._errors import OsikValueError, unknown_name
 from ...limits import Limit, no_limits, with_own_limits
 from ...robot import Robot
 from ...saving._controller import controller_text
-from ...saving._parts import decode, encode
+from ...saving._parts import decode, decode_parts, encode, encode_parts
 from ...schemes import HierarchicalQP, NullSpace, Scheme, WeightedQP
 from ...tasks import FrameTask, Task
 from ._loop import ControlLoop
@@ -200,10 +200,12 @@ class Desk:
         """Replace the controller by one of the same robot, at the current configuration."""
         robot, tasks, scheme, limits, dt = controller
         own = self._session.robot
-        if robot.tree != own.tree:
+        if robot.tree.dof_owners != own.tree.dof_owners:
             raise OsikValueError("the controller is of another robot: start osik view with its file")
         if dt != self._session.dt:
             raise OsikValueError(f"the controller's step is {dt} s, this page's {self._session.dt} s")
+        if robot.tree != own.tree:  # a file without source has frames in another order
+            tasks, scheme, limits = decode_parts(encode_parts(robot, tasks, scheme, limits or ()), own)
         limits = with_own_limits(own, limits)
         self.edit(tasks=tasks, scheme=scheme, limits=limits, off=frozenset(), limits_off=frozenset())
 

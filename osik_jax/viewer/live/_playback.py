@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..._errors import OsikValueError
 from ..._npz import open_npz
+from ..._whole_file import write_text
 from ...control import Trajectory
 from ...robot import Robot
 from ...robot._mujoco import mujoco_poses
@@ -201,7 +202,7 @@ def write_page(robot: Robot, motion: Motion, out: Path, *, title: str) -> Path:
     finally:
         close_server(server)
     page = page.replace("<title>Viser</title>", f"<title>{html.escape(title, quote=False)}</title>", 1)
-    out.write_text(page, encoding="utf-8")
+    write_text(out, page)
     return out
 
 
