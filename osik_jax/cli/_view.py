@@ -92,7 +92,7 @@ class View(InScene):
         page = self.html or self.file.with_suffix(".html")
         write_page(robot, read_motion(self.file, robot), page, title=self.file.stem)
         print(f"written: {page}")
-        if self.browser:
+        if self.browser and self.html is None:
             webbrowser.open(page.resolve().as_uri())
         return 0
 
