@@ -1,4 +1,4 @@
-// Rows that keep the nearest pairs of shapes apart: limits/_scene_rows.py.
+// Rows that keep the nearest pairs of shapes apart: collision/_near_rows.py.
 //
 //   bodies -> lower bounds on the distances of all pairs -> the nearest pairs, exactly -> their Jacobians and bounds
 #pragma once

@@ -115,7 +115,7 @@ void pose_rows(const PoseGoal<In, Own>& goal, From position, From rotation, cons
   to.curvature[0] = (paired(force, axes, arms) + Real(0.5) * paired(torque, axes, axes)) / Real(1.4142135623730951);
 }
 
-// Turn the first of two frames' poses and Jacobians into those in the axes of the second (tasks/_relative_frame.py).
+// Turn the first of two frames' poses and Jacobians into those in the axes of the second (tasks/_frame.py: RelativeFrameTask).
 template <class Real> void see_from_root(Real* position, Real* rotation, Real* jacobian, int nv) {
   using V = Vec3<Real>;
   const Mat3<Real> turn = Mat3<Real>::of(rotation + 9).transposed();
