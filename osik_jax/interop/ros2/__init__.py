@@ -1,4 +1,4 @@
-"""ROS 2 topics without ROS: a robot's controller as a function of messages. ``.dds`` speaks DDS and reads bags."""
+"""ROS 2 topics without ROS: a robot's controller as a function of messages. ``.dds`` speaks DDS."""
 
 from ._controller import Controller as Controller
 from ._settings import Settings as Settings
