@@ -164,13 +164,29 @@ class RelativeFrameTask(PoseTask):
         priority: int = 1,
         hard: bool = False,
     ):
-        options = {name: given for name, given in locals().items() if name not in ("self", "robot", "frame", "root")}
         robot.tree.frame(frame)
         robot.tree.frame(root)
         if frame == root:
             raise OsikValueError(f"frame and root are both {frame!r}; the pose of a frame in itself never changes")
         self.root = root
-        PoseTask.__init__(self, robot, frame, **options)
+        super().__init__(
+            robot,
+            frame,
+            target=target,
+            target_velocity=target_velocity,
+            lower=lower,
+            upper=upper,
+            position_weight=position_weight,
+            orientation_weight=orientation_weight,
+            weight=weight,
+            rows=rows,
+            axes=axes,
+            error=error,
+            orientation_jacobian=orientation_jacobian,
+            gain=gain,
+            priority=priority,
+            hard=hard,
+        )
 
     _card = PoseTask._card
 

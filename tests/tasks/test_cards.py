@@ -1,4 +1,4 @@
-"""What tasks and limits say of themselves, and that no other part of the package keeps lists of their classes."""
+"""Tasks and limits tell their own facts, and no other part of the package keeps a list of their classes."""
 
 import ast
 from pathlib import Path
