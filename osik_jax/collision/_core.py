@@ -27,7 +27,7 @@ from ._table import RobotShapes, ShapeKind, ShapeTable, bounding_ball, table_sha
 
 _SPREAD = 32
 """Vertices of a hull in all directions, from which the core begins to look for the farthest one."""
-_SPACES = {"are_free": "clearances"}
+_SPACES = {"are_free": "clearances", "near_geometry": "near_rows"}
 """Methods that take the workspace of another."""
 _PACK = 4
 """Hulls have a multiple of so many vertices in the core: the last one is repeated."""
@@ -93,11 +93,10 @@ def call_here(
         sizes: what ``core/_cuda.py: space_of_lane`` takes.
         members: threads of a lane on a GPU.
     """
+    space = _cuda.space_of_lane(_SPACES.get(method, method), *sizes)
     if not cuda_is_default():
-        return _library.call(method, shapes, *given)
-    return _cuda.call_lanes(
-        method, shapes, *given, space=_cuda.space_of_lane(_SPACES.get(method, method), *sizes), members=members
-    )
+        return _library.call(method, shapes, *given, space=space)
+    return _cuda.call_lanes(method, shapes, *given, space=space, members=members)
 
 
 @remembered

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..core import _library
 from ..execution._computed import in_shared_lanes
 from ..execution._rules import custom_jvp
 from ..kinematics import Kinematics
@@ -19,7 +18,7 @@ from ..numerics._guarded import at_most_inverse
 from ..numerics._remembered import remembered
 from ..robot import Robot
 from ._clearance import shape_frames
-from ._core import CoreScene, core_robot, core_scene
+from ._core import CoreScene, call_here, core_robot, core_scene
 from ._distance import Nearest, nearest_points
 from ._pair_layout import separation_jacobian
 from ._scene import Scene
@@ -175,13 +174,16 @@ def _by_core(
     limit: Array,
 ) -> NearRows:
     """Return the rows of all lanes; arrays have a leading axis, of the lanes or of length 1."""
-    given = *kinematics, kept.core.integers, kept.core.numbers, integers, numbers, limit
+    own = (a.reshape(1, -1) for a in (kept.core.integers, kept.core.numbers))
+    given = *kinematics, *own, integers, numbers, limit
     lanes = max(len(a) for a in (*kinematics, integers, numbers, limit))
     shapes: Any = [((lanes, most, kept.tree.nv), float), ((lanes, most), float), ((lanes, most), float)]
     shapes += [((lanes, most, 4), int)]
     if with_geometry:
         shapes += [((lanes, most, _GEOMETRY), float), ((lanes, most), int)]
-    return NearRows(*_library.call("near_rows", shapes, *given))
+    count = kept.core.sizes[2]
+    sizes = *kept.core.sizes, CoreScene(integers, numbers).rows(count), most
+    return NearRows(*call_here("near_geometry" if with_geometry else "near_rows", shapes, *given, sizes=sizes))
 
 
 def _rows_of(

@@ -172,6 +172,8 @@ _METHODS = {
     "free_find": "find_free",
     "clearances": "find_clearances",
     "are_free": "find_free_ones",
+    "near_rows": "find_near_rows",
+    "near_geometry": "find_near_geometry",
 }
 _GROUPED, _OPTIONS = ("chain_find", "free_find"), 4
 """Methods whose lanes have several threads, and their argument of options."""

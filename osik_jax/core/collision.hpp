@@ -4,13 +4,18 @@
 // depends on how well spheres fit.
 #pragma once
 #include <algorithm>
+#include <utility>
 #include <vector>
 
 #include "shapes.hpp"
 
 namespace osik {
 
-template <class Real> class Collision {
+template <class R> class Collision {
+ public:
+  using Real = R;
+
+ private:
   using V = Vec3<Real>;
   using M = Mat3<Real>;
   using List = std::vector<Real>;
@@ -23,6 +28,7 @@ template <class Real> class Collision {
   std::vector<int> carrier;  // body of each shape
   std::vector<Pair> pairs;  // those that are kept apart
   int fixed = 0;  // the first ones, whose distance no search changes
+  std::vector<std::pair<Real, int>> candidates;  // lower bounds on distances, and numbers of pairs
 
  public:
   // The second argument is for collisions that work in memory of their caller.
@@ -90,12 +96,21 @@ template <class Real> class Collision {
   }
   // Less than the distance of a pair; of half spaces, no bound.
   Real lower_bound(Pair p) const { return osik::lower_bound(world[p.i], ball[p.i], world[p.j], ball[p.j]); }
-  bool is_out_of_reach(Pair p, Real far) const { return ball[p.i].is_out_of_reach(ball[p.j], far); }
-  // f(number, shapes) of each pair whose distance changes
-  template <class F> void each_moving_pair(F f) const {
-    for (int k = fixed; k < int(pairs.size()); ++k) f(k, pairs[k]);
+  // f(pair, far) of the pairs whose distance changes and is perhaps less than `far`, the likely nearest first; it returns
+  // what is far from then on.
+  template <class F> void each_near_pair(Real far, F f) {
+    candidates.clear();
+    for (int k = fixed; k < int(pairs.size()); ++k) {
+      if (ball[pairs[k].i].is_out_of_reach(ball[pairs[k].j], far)) continue;
+      const Real bound = lower_bound(pairs[k]);
+      if (bound < far) candidates.push_back({bound, k});
+    }
+    std::sort(candidates.begin(), candidates.end());
+    for (const auto& [bound, k] : candidates) {
+      if (bound >= far) return;
+      far = f(pairs[k], far);
+    }
   }
-  Pair pair(int number) const { return pairs[number]; }
   int body(int shape) const { return carrier[shape]; }
   const Convex<Real>& shape(int number) const { return world[number]; }
   template <class F> bool any_pair(F f) const {

@@ -21,6 +21,9 @@ extern "C" {
 int osik_clearances_space(int bodies, int dofs, int shapes, int rows) {
   return LaneCollision<double>::space_of(bodies, dofs, shapes, rows);
 }
+int osik_near_rows_space(int bodies, int dofs, int shapes, int rows, int most) {
+  return NearRows<LaneCollision<float>>::space_of(most) + osik_clearances_space(bodies, dofs, shapes, rows);
+}
 int osik_chain_find_space(int n, int frames, int joints, int nq) {
   return n + ChainFinder<Robots, true>::space_of(n, frames, joints, nq);
 }
@@ -32,7 +35,8 @@ int osik_free_find_space(int n, int frames, int joints, int nq, int bodies, int 
 void* osik_free_find(xla::CallFrame* frame) { return handle<find_free<Robots>>(frame); }
 void* osik_are_free(xla::CallFrame* frame) { return handle<find_free_ones<Robots>>(frame); }
 void* osik_clearances(xla::CallFrame* frame) { return handle<find_clearances<Robots>>(frame); }
-void* osik_near_rows(xla::CallFrame* frame) { return xla::handle<xla::of_batch<find_near_rows>>(frame); }
+void* osik_near_rows(xla::CallFrame* frame) { return handle<find_near_rows<Robots>>(frame); }
+void* osik_near_geometry(xla::CallFrame* frame) { return handle<find_near_geometry<Robots>>(frame); }
 void* osik_shape_gaps(xla::CallFrame* frame) { return handle<find_gaps<Robots>>(frame); }
 void* osik_ways(xla::CallFrame* frame) { return xla::handle<xla::of_batch<find_ways<&WayAround::connect>>>(frame); }
 void* osik_free_curves(xla::CallFrame* frame) { return xla::handle<xla::of_batch<find_ways<&WayAround::prove>>>(frame); }

@@ -6,7 +6,10 @@
 namespace osik {
 
 template <class R> class LaneCollision {
+ public:
   using Real = R;
+
+ private:
   using V = Vec3<Real>;
   using M = Mat3<Real>;
 
@@ -37,6 +40,15 @@ template <class R> class LaneCollision {
   OSIK_CALL void place(const Real* q) {
     place_bodies(robot.tree(), Configuration<const Real*>{q, robot.factor, robot.offset, robot.source},
                  Placed<Real*>{positions, turns, unused, unused + 3 * robot.dofs, unused + 6 * robot.dofs});
+    place_balls();
+  }
+  // Place the shapes where the bodies are: [bodies, 3] and [bodies, 9].
+  template <class In> void place(In body_positions, In body_turns) {
+    for (int e = 0; e < 3 * robot.bodies; ++e) positions[e] = body_positions[e];
+    for (int e = 0; e < 9 * robot.bodies; ++e) turns[e] = body_turns[e];
+    place_balls();
+  }
+  void place_balls() {
     for (int k = 0; k < robot.shapes + scene.rows; ++k) {
       const Ball<Real> own = k < robot.shapes ? Ball<Real>{V::of(robot.center + 3 * k), robot.bound[k]}
                                               : row_ball[k - robot.shapes];
@@ -66,6 +78,14 @@ template <class R> class LaneCollision {
     });
     return best;
   }
+  // f(pair, far) of the pairs whose distance changes and is perhaps less than `far`; it returns what is far from then on.
+  template <class F> void each_near_pair(Real far, F f) const {
+    any_pair([&](int i, int j) {
+      if (group(i) == group(j) || ball[i].is_out_of_reach(ball[j], far)) return false;
+      if (lower_bound({i, j}) < far) far = f(Pair{i, j}, far);
+      return false;
+    });
+  }
   OSIK_CALL Real lower_bound(Pair p) const { return osik::lower_bound(shape(p.i), ball[p.i], shape(p.j), ball[p.j]); }
   template <class F> bool any_pair(F f) const { return any_pair_apart(robot, scene, f); }
   OSIK_CALL Gap<Real> gap_of(int i, int j) const { return gap_between(shape(i), shape(j)); }
@@ -74,11 +94,7 @@ template <class R> class LaneCollision {
     const V way = ball[shape].center - from;
     return sqrt(inner(way, way)) + ball[shape].radius;
   }
-
- private:
   int body(int shape) const { return shape < robot.shapes ? robot.body[shape] : scene.body[shape - robot.shapes]; }
-  M turn(int body) const { return M::of(turns + 9 * body); }
-  V position(int body) const { return V::of(positions + 3 * body); }
   OSIK_CALL Convex<Real> shape(int k) const {
     Convex<Real> to = k < robot.shapes ? shape_of(robot, k) : shape_of_row(scene, k - robot.shapes);
     const int carrier = body(k);
@@ -87,6 +103,10 @@ template <class R> class LaneCollision {
     to.rotation = turned * to.rotation, to.position = turned * to.position + position(carrier);
     return to;
   }
+
+ private:
+  M turn(int body) const { return M::of(turns + 9 * body); }
+  V position(int body) const { return V::of(positions + 3 * body); }
   // Whether a pair is at least `least` >= 0 apart.
   OSIK_CALL bool keeps(int i, int j, Real least) const {
     if (ball[i].is_out_of_reach(ball[j], least)) return true;

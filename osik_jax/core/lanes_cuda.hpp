@@ -8,6 +8,7 @@
 #include "chain_group.hpp"
 #include "collision_calls.hpp"
 #include "lane_collision.hpp"
+#include "near_rows.hpp"
 
 namespace osik {
 

@@ -2,148 +2,136 @@
 //
 //   bodies -> lower bounds on the distances of all pairs -> the nearest pairs, exactly -> their Jacobians and bounds
 #pragma once
-#include <algorithm>
-#include <vector>
-
-#include "collision.hpp"
 #include "freedom.hpp"
-#include "xla.hpp"
 
 namespace osik {
 
 // Numbers of the limit: least distance, distance from which a pair is free [m], gain [1/s], recovery speed [m/s], time of
 // the step [s].
-struct AvoidanceNumbers {
-  double least, detection, gain, recovery, dt;
+template <class Real> struct AvoidanceNumbers {
+  Real least, detection, gain, recovery, dt;
 };
 
-class NearRows {
-  using V = Vec3<double>;
-  struct Candidate {
-    double distance;  // or a lower bound on it
-    int number;       // of the pair
-    bool operator<(const Candidate& other) const { return distance < other.distance; }
-  };
-  struct Found : Candidate {
-    Gap<double> gap;
-  };
+// Collision: collision.hpp, or on a GPU lane_collision.hpp.
+template <class Collision> class NearRows {
+  using Real = typename Collision::Real;
+  using V = Vec3<Real>;
 
-  const ShapedRobot<double>& robot;
-  Collision<double> collision;
-  std::vector<Candidate> candidates;  // by lower bounds
-  std::vector<Found> near;            // a heap of the nearest pairs, and at the end sorted
-  std::vector<int> owner;               // [dofs] body of each
-  std::vector<char> is_moved;           // [bodies] whether a dof of the body moves the shape at hand
+  const ShapedRobot<Real>& robot;
+  Collision collision;
+  Nearest<Real>* near;  // [most] the nearest pairs, sorted
+  int most, count = 0;
 
  public:
-  explicit NearRows(const ShapedRobot<double>& robot) : robot(robot), collision(robot), is_moved(robot.bodies) {
-    for (int j = 0; j < robot.joints; ++j) {
-      const int type = robot.types[j], count = type == FREE_JOINT ? 6 : type == BALL_JOINT ? 3 : 1;
-      owner.insert(owner.end(), count, robot.owners[j]);
-    }
-  }
-  void set(const SceneRows<double>& scene) { collision.set(scene); }
+  // space: space_of numbers, then those of the collision
+  NearRows(const ShapedRobot<Real>& robot, int most, Real* space)
+      : robot(robot), collision(robot, space + space_of(most)), near(reinterpret_cast<Nearest<Real>*>(space)), most(most) {}
+  static constexpr OSIK_HOST int space_of(int most) { return most * int(sizeof(Nearest<Real>) / sizeof(Real)); }
+  void set(const SceneRows<Real>& scene) { collision.set(scene); }
 
-  // Write the rows of the `most` nearest pairs: J [most, nv], lower bounds and distances [most], and the bodies of the two
-  // shapes and their numbers [most, 4], -1 for no pair. Rows of no pair are zeros without bounds.
-  void find(const Placed<const double*>& placed, const AvoidanceNumbers& limit, int most, double* J, double* lower,
-            double* distance, int* pair) {
+  // Write the rows of the nearest pairs: J [most, nv], lower bounds and distances [most], and the bodies of the two shapes
+  // and their numbers [most, 4], -1 for no pair. Rows of no pair are zeros without bounds. How many pairs there are.
+  template <class In, class Out, class Labels>
+  int find(const Placed<In>& placed, const AvoidanceNumbers<Real>& limit, Out J, Out lower, Out distance, Labels pair) {
     collision.place(placed.position, placed.rotation);
-    find_nearest(limit.detection, most);
-    std::fill_n(J, most * robot.nv, 0.0), std::fill_n(lower, most, -INFINITE), std::fill_n(distance, most, INFINITE);
-    std::fill_n(pair, 4 * most, -1);
-    const double gain = limit.gain * limit.dt > 1 ? 1 / limit.dt : limit.gain;
-    for (size_t k = 0; k < near.size(); ++k) {
-      const auto [i, j] = collision.pair(near[k].number);
-      const Gap<double>& gap = near[k].gap;
-      const int bodies[] = {collision.body(i), collision.body(j)};
-      add_motion(placed, bodies[0], gap.on_a, -1, gap.normal, J + k * robot.nv);
-      add_motion(placed, bodies[1], gap.on_b, 1, gap.normal, J + k * robot.nv);
-      distance[k] = gap.distance, lower[k] = std::min(-gain * (gap.distance - limit.least), limit.recovery);
-      pair[4 * k] = bodies[0], pair[4 * k + 1] = bodies[1], pair[4 * k + 2] = i, pair[4 * k + 3] = j;
+    find_nearest(limit.detection);
+    const Real gain = limit.gain * limit.dt > 1 ? 1 / limit.dt : limit.gain;
+    for (int e = 0; e < most * robot.nv; ++e) J[e] = 0;
+    for (int k = 0; k < most; ++k) {
+      const auto& [i, j, gap] = near[k];
+      const bool is_pair = k < count;
+      const int labels[] = {is_pair ? collision.body(i) : -1, is_pair ? collision.body(j) : -1, is_pair ? i : -1,
+                            is_pair ? j : -1};
+      for (int n = 0; n < 4; ++n) pair[4 * k + n] = labels[n];
+      distance[k] = is_pair ? gap.distance : Real(INFINITE), lower[k] = -Real(INFINITE);
+      if (!is_pair) continue;
+      const Real rate = -gain * (gap.distance - limit.least);
+      lower[k] = rate < limit.recovery ? rate : limit.recovery;
+      add_motion(placed, labels[0], gap.on_a, -1, gap.normal, J + k * robot.nv);
+      add_motion(placed, labels[1], gap.on_b, 1, gap.normal, J + k * robot.nv);
     }
+    return count;
   }
   // Write what the derivatives of pair k are made of: four points of each shape's core [2, 4, 3], normal [3], radii [2], and
   // the shape that the normal goes along with, 0 or 1; -1: it is that of the points.
-  void put_geometry(int k, double* to, int& carried) const {
-    const auto [i, j] = collision.pair(near[k].number);
-    const Convex<double>&a = collision.shape(i), &b = collision.shape(j);
-    const Gap<double>& gap = near[k].gap;
+  template <class Out> int put_geometry(int k, Out to) const {
+    const auto& [i, j, gap] = near[k];
+    const Convex<Real> a = collision.shape(i), b = collision.shape(j);
     V points[8];
-    double radius[] = {0, 0};
-    std::fill_n(points, 4, gap.on_a), std::fill_n(points + 4, 4, gap.on_b);
-    carried = b.kind == HALF_SPACE ? 1 : a.kind == HALF_SPACE || gap.distance <= -a.radius() - b.radius() ? 0 : -1;
+    Real radius[] = {0, 0};
+    for (int p = 0; p < 8; ++p) points[p] = p < 4 ? gap.on_a : gap.on_b;
+    const bool is_deep = gap.distance <= -a.radius() - b.radius();
+    const int carried = b.kind == HALF_SPACE ? 1 : a.kind == HALF_SPACE || is_deep ? 0 : -1;
     if (carried < 0) {
-      Difference<double> difference(a, b);
+      Difference<Real> difference(a, b);
       difference.gap(), difference.put_points(points, points + 4);
       radius[0] = settle(a, gap.normal, gap.on_a, points);
       radius[1] = settle(b, V{0, 0, 0} - gap.normal, gap.on_b, points + 4);
     }
     for (int p = 0; p < 8; ++p) points[p].put(to + 3 * p);
     gap.normal.put(to + 24), to[27] = radius[0], to[28] = radius[1];
+    return carried;
   }
-  int count() const { return int(near.size()); }
 
  private:
   // The nearest pairs that are not farther than `detection`, exact and sorted.
-  void find_nearest(double detection, size_t most) {
-    candidates.clear(), near.clear();
-    collision.each_moving_pair([&](int number, Pair p) {
-      if (collision.is_out_of_reach(p, detection)) return;
-      const double bound = collision.lower_bound(p);
-      if (bound < detection) candidates.push_back({bound, number});
+  OSIK_CALL void find_nearest(Real detection) {
+    count = 0;
+    collision.each_near_pair(detection, [&](Pair p, Real far) {
+      const Gap<Real> gap = gap_between<Real>(collision.shape(p.i), collision.shape(p.j), far);
+      if (!(gap.distance < far)) return far;
+      int k = count < most ? count++ : most - 1;
+      for (; k > 0 && near[k - 1].gap.distance > gap.distance; --k) near[k] = near[k - 1];
+      near[k] = {p.i, p.j, gap};
+      return count < most ? far : near[most - 1].gap.distance;
     });
-    std::sort(candidates.begin(), candidates.end());
-    for (const Candidate& one : candidates) {
-      const double limit = near.size() < most ? detection : near[0].distance;
-      if (one.distance >= limit) break;
-      const auto [i, j] = collision.pair(one.number);
-      const Gap<double> gap = gap_between(collision.shape(i), collision.shape(j), limit);
-      if (!(gap.distance < limit)) continue;
-      if (near.size() == most) std::pop_heap(near.begin(), near.end()), near.pop_back();
-      near.push_back({{gap.distance, one.number}, gap}), std::push_heap(near.begin(), near.end());
-    }
-    std::sort_heap(near.begin(), near.end());
   }
   // Add `sign` times the speed along the normal of a point that goes along with a body.
-  void add_motion(const Placed<const double*>& placed, int body, V at, double sign, V normal, double* row) {
-    std::fill(is_moved.begin(), is_moved.end(), 0);
-    for (int b = body; b > 0; b = robot.parents[b]) is_moved[b] = 1;
-    for (int dof = 0; dof < robot.dofs; ++dof)
-      if (robot.column[dof] >= 0 && is_moved[owner[dof]])
-        row[robot.column[dof]] += sign * inner(normal, motion_of(placed, dof, at, robot.column_factor[dof]).linear);
+  template <class In, class Out>
+  void add_motion(const Placed<In>& placed, int body, V at, Real sign, V normal, Out row) const {
+    for (int joint = robot.joints, dof = robot.dofs; joint--;) {
+      const int type = robot.types[joint], first = dof - (type == FREE_JOINT ? 6 : type == BALL_JOINT ? 3 : 1);
+      while (body > robot.owners[joint]) body = robot.parents[body];
+      while (dof-- > first)
+        if (body == robot.owners[joint] && robot.column[dof] >= 0)
+          row[robot.column[dof]] += sign * inner(normal, motion_of(placed, dof, at, robot.column_factor[dof]).linear);
+      dof = first;
+    }
   }
   // The radius of a shape's core. A cylinder's is that of its axis where its side is met. On its rim the points of its core
   // are one, which leaves out that the nearest point slides along the rim. out: towards the other shape; at: nearest point
-  static double settle(const Convex<double>& shape, V out, V at, V* points) {
-    constexpr double PERPENDICULAR = 1e-5, PARALLEL_AXIS = 1 - 1e-9;  // cosine of normal and axis
-    const double cosine = fabs(inner(shape.axis(), out));
+  static Real settle(const Convex<Real>& shape, V out, V at, V* points) {
+    constexpr Real PERPENDICULAR = 1e-5, PARALLEL_AXIS = 1 - (sizeof(Real) == 8 ? 1e-9 : 1e-6);  // cosine of normal and axis
+    const Real cosine = fabs(inner(shape.axis(), out));
     if (shape.kind != CYLINDER || cosine > PARALLEL_AXIS) return shape.radius();
-    if (cosine > PERPENDICULAR) {
-      std::fill_n(points, 4, at);
-      return 0;
-    }
-    for (int k = 0; k < 4; ++k) points[k] = shape.position + (k % 2 ? shape.size.y : -shape.size.y) * shape.axis();
-    return shape.size.x;
+    for (int k = 0; k < 4; ++k)
+      points[k] = cosine > PERPENDICULAR ? at : shape.position + (k % 2 ? shape.size.y : -shape.size.y) * shape.axis();
+    return cosine > PERPENDICULAR ? Real(0) : shape.size.x;
   }
 };
 
 // Arguments: the fields of Kinematics, the robot's integers and numbers, a scene, numbers of the limit [5]. Results: those
-// of NearRows::find; then, if they are asked for, those of put_geometry [most, 29] and [most].
-inline void find_near_rows(const xla::Batch& call) {
-  const ShapedRobot<double> robot(call.integers(5), call.in(6, 0));
-  NearRows rows(robot);
-  const int lanes = call.result_size(0, 0), most = call.result_size(0, 1);
-  for (int lane = 0; lane < lanes; ++lane) {
-    if (lane == 0 || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane));
-    auto in = [&](int k) { return call.in(k, lane); };
-    auto out = [&](int k) { return call.out(k, lane); };
-    rows.find({in(0), in(1), in(2), in(3), in(4)}, *reinterpret_cast<const AvoidanceNumbers*>(in(9)), most, out(0), out(1),
-              out(2), call.labels(3, lane));
-    if (call.call.frame->results.size <= 4) continue;
-    int* carried = call.labels(5, lane);
-    std::fill_n(out(4), 29 * most, 0.0), std::fill_n(carried, most, 0);
-    for (int k = 0; k < rows.count(); ++k) rows.put_geometry(k, out(4) + 29 * k, carried[k]);
-  }
+// of NearRows::find; with_geometry: then those of put_geometry [most, 29] and [most].
+template <bool with_geometry, class Call> void find_near_pairs(const Call& call) {
+  using Real = typename Call::Real;
+  const ShapedRobot<Real> robot(call.integers(5), call.numbers(6, 0));
+  const int most = call.result_size(0, 1);
+  auto space = call.space();
+  NearRows<typename Call::Collision> rows(robot, most, space.data());
+  bool is_set = false;
+  call.each_lane([&](int lane) {
+    if (!is_set || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane)), is_set = true;
+    const auto n = call.in(9, lane);
+    const int count = rows.find(placed(call, lane), AvoidanceNumbers<Real>{n[0], n[1], n[2], n[3], n[4]}, call.out(0, lane),
+                                call.out(1, lane), call.out(2, lane), call.labels(3, lane));
+    if constexpr (with_geometry) {
+      const auto geometry = call.out(4, lane);
+      const auto carried = call.labels(5, lane);
+      for (int e = 0; e < 29 * most; ++e) geometry[e] = 0;
+      for (int k = 0; k < most; ++k) carried[k] = k < count ? rows.put_geometry(k, geometry + 29 * k) : 0;
+    }
+  });
 }
+template <class Call> void find_near_rows(const Call& call) { find_near_pairs<false>(call); }
+template <class Call> void find_near_geometry(const Call& call) { find_near_pairs<true>(call); }
 }  // namespace osik

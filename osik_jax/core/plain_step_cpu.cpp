@@ -2,6 +2,7 @@
 // used by one thread at a time.
 #include <new>
 
+#include "collision.hpp"
 #include "manifold.hpp"
 #include "near_rows.hpp"
 #include "step.hpp"
@@ -12,19 +13,21 @@ namespace {
 // The rows of a CollisionAvoidanceLimit of one robot.
 struct PlainRows {
   const ShapedRobot<double> robot;
-  NearRows rows;
-  std::vector<double> space, distance;
+  std::vector<double> near, space, distance;
   std::vector<int> pair;
+  NearRows<Collision<double>> rows;
 
   PlainRows(const int* integers, const double* numbers, int most)
-      : robot(integers, numbers), rows(robot), space(12 * robot.bodies + 9 * robot.dofs), distance(most), pair(4 * most) {}
+      : robot(integers, numbers), near(rows.space_of(most)), space(12 * robot.bodies + 9 * robot.dofs), distance(most),
+        pair(4 * most), rows(robot, most, near.data()) {}
   void find(const double* q, const double* limit, double* J, double* lower) {
     double *position = space.data(), *turn = position + 3 * robot.bodies, *axes = turn + 9 * robot.bodies;
     const int dofs = 3 * robot.dofs;
     place_bodies(robot.tree(), Configuration<const double*>{q, robot.factor, robot.offset, robot.source},
                  Placed<double*>{position, turn, axes, axes + dofs, axes + 2 * dofs});
-    rows.find({position, turn, axes, axes + dofs, axes + 2 * dofs}, *reinterpret_cast<const AvoidanceNumbers*>(limit),
-              int(distance.size()), J, lower, distance.data(), pair.data());
+    rows.find(Placed<const double*>{position, turn, axes, axes + dofs, axes + 2 * dofs},
+              AvoidanceNumbers<double>{limit[0], limit[1], limit[2], limit[3], limit[4]}, J, lower, distance.data(),
+              pair.data());
   }
 };
 }  // namespace

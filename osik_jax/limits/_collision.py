@@ -154,7 +154,7 @@ class CollisionAvoidanceLimit(Limit):
                 "scene goes without pairs, exclude and shapes: obstacles are in the scene; srdf and scene.allow say "
                 "what may touch"
             )
-        require_core("a CollisionAvoidanceLimit with a scene")
+        require_core("a CollisionAvoidanceLimit with a scene", on_gpu=True)
         check_one_scene(self.scene)
         least = concrete(self.minimum_distance) if q0_distance is None else q0_distance
         if least is None:

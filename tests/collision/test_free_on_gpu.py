@@ -1,4 +1,4 @@
-"""Searches in scenes by the text of a GPU: by the threads of a warp on a CPU, and on a GPU where there is one."""
+"""Searches and limits in scenes by a GPU's text: by threads of a warp on a CPU, and on a GPU where there is one."""
 
 from functools import partial
 
@@ -10,7 +10,7 @@ import pytest
 from core_checks import needs_core
 
 import osik_jax as osik
-from osik_jax.collision import _core
+from osik_jax.collision import _core, _near_rows
 from osik_jax.collision._core import are_free, core_robot, core_scene, gaps_at
 from osik_jax.collision._robot_shapes import robot_shapes
 from osik_jax.core import _cuda
@@ -58,13 +58,9 @@ def test_threads_of_a_warp_find_free_configurations(panda, tmp_path, monkeypatch
     assert 0 < by_core.converged.sum() < 9 and (expected.distance < 0).sum() > 1  # depths too
     found = {}
 
-    def call(method, shapes, *given, sizes, members=1):
-        space = _cuda.space_of_lane("clearances" if method == "are_free" else method, *sizes)
-        return list(map(jnp.asarray, _cuda.call_lanes(method, shapes, *given, space=space, members=members)))
-
     monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
-    monkeypatch.setattr(_core, "call_here", call)
-    monkeypatch.setattr(_whole, "call_here", call)
+    monkeypatch.setattr(_core, "call_here", call_by_threads)
+    monkeypatch.setattr(_whole, "call_here", call_by_threads)
     with jax.disable_jit():
         gaps = gaps_at(own, q, arrays)
         np.testing.assert_array_equal(are_free(own, q, arrays, jnp.zeros(1)), expected.distance >= 0)
@@ -84,6 +80,41 @@ def test_threads_of_a_warp_find_free_configurations(panda, tmp_path, monkeypatch
         free = np.asarray(answers.converged)
         np.testing.assert_allclose(np.asarray(answers.q)[free], np.asarray(found[2, 64].q)[free], atol=1e-12)
         check(panda, poses, scenes, answers, 0.002)
+
+
+@pytest.mark.slow
+def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch):
+    """The GPU's text on a CPU, a scene each: rows, pairs and what derivatives are made of are those of the core."""
+    _, scenes = problems(panda, 9)
+    first = jax.tree.map(lambda a: a[0], scenes)
+    limit = osik.CollisionAvoidanceLimit(panda, scene=first, detection_distance=0.1, q0_distance=-np.inf, max_pairs=5)
+    q = np.random.default_rng(6).uniform(panda.position_lower, panda.position_upper, (9, panda.nq))
+    places, arrays = jax.vmap(partial(osik.forward_kinematics, panda))(q), core_scene(scenes, limit.kept.shapes)
+    numbers = jnp.asarray(limit.numbers(0.01))
+    given = jax.tree.leaves(places), jnp.asarray(arrays.integers), jnp.asarray(arrays.numbers), numbers[None]
+    expected = [_near_rows._by_core(limit.kept, 5, with_geometry, *given) for with_geometry in (False, True)]
+    distance = np.asarray(expected[0].distance)
+    assert (distance < 0).any() and np.isinf(distance).any() and np.isfinite(distance[:, 4]).any()
+    monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
+    monkeypatch.setattr(_near_rows, "call_here", call_by_threads)
+    found = [_near_rows._by_core(limit.kept, 5, with_geometry, *given) for with_geometry in (False, True)]
+    monkeypatch.undo()
+    for ours, rows in zip(found, expected, strict=True):
+        for name in ("jacobian", "lower", "distance", "pair"):
+            np.testing.assert_allclose(getattr(ours, name), getattr(rows, name), atol=1e-7)
+    np.testing.assert_array_equal(found[1].carried, expected[1].carried)
+    # points that a nearest point lies between are not unique on round shapes, but what follows from them is
+    poses = scenes.table.position, scenes.table.rotation
+    rows = jax.vmap(partial(_near_rows._rows_of, limit.kept), (0, 0, 0, 0, None))
+    jacobian, lower = rows(found[1], scenes.body, places, poses, numbers)
+    np.testing.assert_allclose(jacobian, expected[0].jacobian, atol=1e-6)
+    np.testing.assert_allclose(lower, expected[0].lower, atol=1e-6)
+
+
+def call_by_threads(method, shapes, *given, sizes, members=1):
+    """A call of ``_core.call_here`` by threads of a GPU, which ``_cuda.call`` runs."""
+    space = _cuda.space_of_lane(_core._SPACES.get(method, method), *sizes)
+    return list(map(jnp.asarray, _cuda.call_lanes(method, shapes, *given, space=space, members=members)))
 
 
 def check(robot, poses, scenes, found, clearance):

@@ -33,6 +33,9 @@ FREE = (
     ((2, 9), (2, 9), (2, 12), (2, 10), (2, 3)),
 )
 PLACES = ((2, 9), (1, 300), *SCENE[1:]), (1, 3)
+NEAR = ((*PLACED, (1, 300), *SCENE[1:], (1, 5)), (5, 7))
+NEAREST = (2, 4, 7), (2, 4), (2, 4), (2, 4, 4)
+"""Rows of the four nearest pairs."""
 
 
 def test_headers_become_one_text_whose_loops_stay_loops():
@@ -66,6 +69,10 @@ TEXTS = {
     "searches": lambda: _cuda._lanes_source("chain_find", True, *FIND, ((2, 9), (2, 9), (2, 12)), (2,), 400),
     "searches in scenes": lambda: _cuda._lanes_source("free_find", False, *FREE, (2, 4), 900),
     "clearances": lambda: _cuda._lanes_source("clearances", True, *PLACES, ((2, 10), (2, 2)), (1,), 400),
+    "rows of near pairs": lambda: _cuda._lanes_source("near_rows", False, *NEAR, NEAREST, (3,), 400),
+    "their geometry": lambda: _cuda._lanes_source(
+        "near_geometry", True, *NEAR, (*NEAREST, (2, 4, 29), (2, 4)), (3, 5), 400
+    ),
     "banded": lambda: banded.kernel_source(13, 2),
 }
 
