@@ -27,6 +27,9 @@ from ._table import RobotShapes
 _GEOMETRY = 29
 """Numbers of a pair in ``NearRows::put_geometry``."""
 
+_MOST_THREADS = 1 << 16
+"""Threads that keep a GPU busy: with fewer robots, several find the rows of each."""
+
 
 class KeptShapes:
     """A robot's shapes, and the pairs of them that a limit keeps apart; equal by identity, so that it can be static.
@@ -183,7 +186,10 @@ def _by_core(
         shapes += [((lanes, most, _GEOMETRY), float), ((lanes, most), int)]
     count = kept.core.sizes[2]
     sizes = *kept.core.sizes, CoreScene(integers, numbers).rows(count), most
-    return NearRows(*call_here("near_geometry" if with_geometry else "near_rows", shapes, *given, sizes=sizes))
+    members = min(max(_MOST_THREADS // lanes, 1), 32)
+    members = 1 << (members.bit_length() - 1)
+    method = "near_geometry" if with_geometry else "near_rows"
+    return NearRows(*call_here(method, shapes, *given, np.full(1, members), sizes=sizes, members=members))
 
 
 def _rows_of(

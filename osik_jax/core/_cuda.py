@@ -175,8 +175,8 @@ _METHODS = {
     "near_rows": "find_near_rows",
     "near_geometry": "find_near_geometry",
 }
-_GROUPED, _OPTIONS = ("chain_find", "free_find"), 4
-"""Methods whose lanes have several threads, and their argument of options."""
+_GROUPED = {"chain_find": 4, "free_find": 4, "near_rows": 10, "near_geometry": 10}
+"""Methods whose lanes have several threads, and the argument whose last number says how many."""
 
 
 @cache
@@ -212,6 +212,8 @@ def _lanes_source(
         for k in kept
     ]
 
+    options = _GROUPED.get(method)
+    members = 1 if options is None else f"a{options}[{given[options][0] - 1}]"
     parameters = [f"const {'int' if k in integers else 'Real'}* a{k}" for k in range(len(given))]
     parameters += [f"{'int' if k in labels else 'Real'}* r{k}" for k in range(len(results))]
     return (
@@ -228,7 +230,7 @@ def _lanes_source(
         + f"const void* arguments[] = {{{names('a', len(given))}}};\n"
         + f"void* results[] = {{{names('r', len(results))}}};\n"
         + f"const Real* kept[] = {{{', '.join(f's{k}' if k in kept else 'nullptr' for k in range(len(given)))}}};\n"
-        + f"const int members = {f'a{_OPTIONS}[{given[_OPTIONS][0] - 1}]' if method in _GROUPED else 1};\n"
+        + f"const int members = {members};\n"
         + f"{_METHODS[method]}(ThreadCall<Real, Sizes>{{arguments, results, kept, problems, members}});\n}}\n"
     )
 

@@ -97,8 +97,8 @@ template <class R> class Collision {
   // Less than the distance of a pair; of half spaces, no bound.
   Real lower_bound(Pair p) const { return osik::lower_bound(world[p.i], ball[p.i], world[p.j], ball[p.j]); }
   // f(pair, far) of the pairs whose distance changes and is perhaps less than `far`, the likely nearest first; it returns
-  // what is far from then on.
-  template <class F> void each_near_pair(Real far, F f) {
+  // what is far from then on. One thread takes all pairs.
+  template <class F> void each_near_pair(Real far, int, int, F f) {
     candidates.clear();
     for (int k = fixed; k < int(pairs.size()); ++k) {
       if (ball[pairs[k].i].is_out_of_reach(ball[pairs[k].j], far)) continue;

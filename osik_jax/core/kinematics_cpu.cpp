@@ -9,10 +9,13 @@
 using namespace osik;
 
 namespace {
-struct Robots : xla::Batch {
+struct Robots : xla::Batch, Alone {
   using Collision = osik::Collision<double>;
+  template <class F> void each_group(F f) const {
+    each_lane([&](int lane) { f(lane, true); });
+  }
 };
-template <void (*method)(const Robots&)> void of_lanes(const xla::Call& call) { method(Robots{{call}}); }
+template <void (*method)(const Robots&)> void of_lanes(const xla::Call& call) { method(Robots{{call}, {}}); }
 template <void (*method)(const Robots&)> void* handle(xla::CallFrame* frame) { return xla::handle<of_lanes<method>>(frame); }
 }  // namespace
 

@@ -78,10 +78,12 @@ template <class R> class LaneCollision {
     });
     return best;
   }
-  // f(pair, far) of the pairs whose distance changes and is perhaps less than `far`; it returns what is far from then on.
-  template <class F> void each_near_pair(Real far, F f) const {
+  // f(pair, far) of a member's share of the pairs whose distance changes and is perhaps less than `far`; it returns what is
+  // far from then on.
+  template <class F> void each_near_pair(Real far, int member, int members, F f) const {
+    int number = 0;
     any_pair([&](int i, int j) {
-      if (group(i) == group(j) || ball[i].is_out_of_reach(ball[j], far)) return false;
+      if (number++ % members != member || group(i) == group(j) || ball[i].is_out_of_reach(ball[j], far)) return false;
       if (lower_bound({i, j}) < far) far = f(Pair{i, j}, far);
       return false;
     });

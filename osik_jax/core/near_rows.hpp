@@ -1,10 +1,20 @@
 // Rows that keep the nearest pairs of shapes apart: collision/_near_rows.py.
 //
 //   bodies -> lower bounds on the distances of all pairs -> the nearest pairs, exactly -> their Jacobians and bounds
+//
+// On a GPU the members of a group (chain_group.hpp) share the pairs of a robot: each keeps the nearest of its own, which then
+// get their places among those of all.
 #pragma once
 #include "freedom.hpp"
 
 namespace osik {
+
+// A group of one thread, as of a CPU.
+struct Alone {
+  static constexpr int members = 1;
+  static int member() { return 0; }
+  template <class T> static T of_member(int, T number) { return number; }
+};
 
 // Numbers of the limit: least distance, distance from which a pair is free [m], gain [1/s], recovery speed [m/s], time of
 // the step [s].
@@ -17,45 +27,59 @@ template <class Collision> class NearRows {
   using Real = typename Collision::Real;
   using V = Vec3<Real>;
 
+  struct Near {
+    int i, j, row;
+    Gap<Real> gap;
+  };
   const ShapedRobot<Real>& robot;
   Collision collision;
-  Nearest<Real>* near;  // [most] the nearest pairs, sorted
-  int most, count = 0;
+  Near* near;  // [most] the nearest pairs of this thread, sorted
+  int most, count = 0, first_free = 0, stride = 1;
 
  public:
   // space: space_of numbers, then those of the collision
   NearRows(const ShapedRobot<Real>& robot, int most, Real* space)
-      : robot(robot), collision(robot, space + space_of(most)), near(reinterpret_cast<Nearest<Real>*>(space)), most(most) {}
-  static constexpr OSIK_HOST int space_of(int most) { return most * int(sizeof(Nearest<Real>) / sizeof(Real)); }
+      : robot(robot), collision(robot, space + space_of(most)), near(reinterpret_cast<Near*>(space)), most(most) {}
+  static constexpr OSIK_HOST int space_of(int most) { return most * int(sizeof(Near) / sizeof(Real)); }
   void set(const SceneRows<Real>& scene) { collision.set(scene); }
 
   // Write the rows of the nearest pairs: J [most, nv], lower bounds and distances [most], and the bodies of the two shapes
-  // and their numbers [most, 4], -1 for no pair. Rows of no pair are zeros without bounds. How many pairs there are.
-  template <class In, class Out, class Labels>
-  int find(const Placed<In>& placed, const AvoidanceNumbers<Real>& limit, Out J, Out lower, Out distance, Labels pair) {
+  // and their numbers [most, 4], -1 for no pair. Rows of no pair are zeros without bounds. group: the words member(),
+  // members and of_member of a call
+  template <class Group, class In, class Out, class Labels> void find(const Group& group, const Placed<In>& placed,
+                                                                      const AvoidanceNumbers<Real>& limit, Out J, Out lower,
+                                                                      Out distance, Labels pair) {
     collision.place(placed.position, placed.rotation);
-    find_nearest(limit.detection);
+    find_nearest(limit.detection, group.member(), group.members);
     const Real gain = limit.gain * limit.dt > 1 ? 1 / limit.dt : limit.gain;
-    for (int e = 0; e < most * robot.nv; ++e) J[e] = 0;
-    for (int k = 0; k < most; ++k) {
-      const auto& [i, j, gap] = near[k];
-      const bool is_pair = k < count;
-      const int labels[] = {is_pair ? collision.body(i) : -1, is_pair ? collision.body(j) : -1, is_pair ? i : -1,
-                            is_pair ? j : -1};
-      for (int n = 0; n < 4; ++n) pair[4 * k + n] = labels[n];
-      distance[k] = is_pair ? gap.distance : Real(INFINITE), lower[k] = -Real(INFINITE);
-      if (!is_pair) continue;
+    first_free = take_places(group) + group.member(), stride = group.members;
+    each_free_row([&](int row) {
+      for (int e = 0; e < robot.nv; ++e) J[row * robot.nv + e] = 0;
+      for (int e = 0; e < 4; ++e) pair[4 * row + e] = -1;
+      distance[row] = Real(INFINITE), lower[row] = -Real(INFINITE);
+    });
+    for (int k = 0; k < count; ++k) {
+      const auto& [i, j, row, gap] = near[k];
+      const int labels[] = {collision.body(i), collision.body(j), i, j};
+      for (int e = 0; e < robot.nv; ++e) J[row * robot.nv + e] = 0;
+      for (int e = 0; e < 4; ++e) pair[4 * row + e] = labels[e];
       const Real rate = -gain * (gap.distance - limit.least);
-      lower[k] = rate < limit.recovery ? rate : limit.recovery;
-      add_motion(placed, labels[0], gap.on_a, -1, gap.normal, J + k * robot.nv);
-      add_motion(placed, labels[1], gap.on_b, 1, gap.normal, J + k * robot.nv);
+      distance[row] = gap.distance, lower[row] = rate < limit.recovery ? rate : limit.recovery;
+      add_motion(placed, labels[0], gap.on_a, -1, gap.normal, J + row * robot.nv);
+      add_motion(placed, labels[1], gap.on_b, 1, gap.normal, J + row * robot.nv);
     }
-    return count;
+  }
+  // f(row) of the rows of no pair that are this thread's to write, and f(k, row) of its pairs.
+  template <class F> void each_free_row(F f) const {
+    for (int row = first_free; row < most; row += stride) f(row);
+  }
+  template <class F> void each_row(F f) const {
+    for (int k = 0; k < count; ++k) f(k, near[k].row);
   }
   // Write what the derivatives of pair k are made of: four points of each shape's core [2, 4, 3], normal [3], radii [2], and
   // the shape that the normal goes along with, 0 or 1; -1: it is that of the points.
   template <class Out> int put_geometry(int k, Out to) const {
-    const auto& [i, j, gap] = near[k];
+    const auto& [i, j, row, gap] = near[k];
     const Convex<Real> a = collision.shape(i), b = collision.shape(j);
     V points[8];
     Real radius[] = {0, 0};
@@ -74,17 +98,33 @@ template <class Collision> class NearRows {
   }
 
  private:
-  // The nearest pairs that are not farther than `detection`, exact and sorted.
-  OSIK_CALL void find_nearest(Real detection) {
+  // The nearest of this thread's pairs that are not farther than `detection`, exact and sorted.
+  OSIK_CALL void find_nearest(Real detection, int member, int members) {
     count = 0;
-    collision.each_near_pair(detection, [&](Pair p, Real far) {
+    collision.each_near_pair(detection, member, members, [&](Pair p, Real far) {
       const Gap<Real> gap = gap_between<Real>(collision.shape(p.i), collision.shape(p.j), far);
       if (!(gap.distance < far)) return far;
       int k = count < most ? count++ : most - 1;
       for (; k > 0 && near[k - 1].gap.distance > gap.distance; --k) near[k] = near[k - 1];
-      near[k] = {p.i, p.j, gap};
+      near[k] = {p.i, p.j, 0, gap};
       return count < most ? far : near[most - 1].gap.distance;
     });
+  }
+  // Keep those of the pairs that are among the nearest of the group, each with its row; how many rows there are.
+  template <class Group> int take_places(const Group& group) {
+    int own = 0, row = 0;
+    for (int chosen = 0; row < most && chosen >= 0; row += chosen >= 0) {
+      const Real head = own < count ? near[own].gap.distance : Real(INFINITE);
+      Real least = Real(INFINITE);
+      chosen = -1;
+      for (int k = 0; k < group.members; ++k) {
+        const Real its = group.of_member(k, head);
+        if (its < least) least = its, chosen = k;
+      }
+      if (chosen == group.member()) near[own++].row = row;
+    }
+    count = own;
+    return row;
   }
   // Add `sign` times the speed along the normal of a point that goes along with a body.
   template <class In, class Out>
@@ -110,8 +150,8 @@ template <class Collision> class NearRows {
   }
 };
 
-// Arguments: the fields of Kinematics, the robot's integers and numbers, a scene, numbers of the limit [5]. Results: those
-// of NearRows::find; with_geometry: then those of put_geometry [most, 29] and [most].
+// Arguments: the fields of Kinematics, the robot's integers and numbers, a scene, numbers of the limit [5]; on a GPU also the
+// number of members. Results: those of NearRows::find; with_geometry: then those of put_geometry [most, 29] and [most].
 template <bool with_geometry, class Call> void find_near_pairs(const Call& call) {
   using Real = typename Call::Real;
   const ShapedRobot<Real> robot(call.integers(5), call.numbers(6, 0));
@@ -119,16 +159,19 @@ template <bool with_geometry, class Call> void find_near_pairs(const Call& call)
   auto space = call.space();
   NearRows<typename Call::Collision> rows(robot, most, space.data());
   bool is_set = false;
-  call.each_lane([&](int lane) {
+  call.each_group([&](int lane, bool) {  // threads without a lane write what others write
     if (!is_set || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane)), is_set = true;
     const auto n = call.in(9, lane);
-    const int count = rows.find(placed(call, lane), AvoidanceNumbers<Real>{n[0], n[1], n[2], n[3], n[4]}, call.out(0, lane),
-                                call.out(1, lane), call.out(2, lane), call.labels(3, lane));
+    rows.find(call, placed(call, lane), AvoidanceNumbers<Real>{n[0], n[1], n[2], n[3], n[4]}, call.out(0, lane),
+              call.out(1, lane), call.out(2, lane), call.labels(3, lane));
     if constexpr (with_geometry) {
       const auto geometry = call.out(4, lane);
       const auto carried = call.labels(5, lane);
-      for (int e = 0; e < 29 * most; ++e) geometry[e] = 0;
-      for (int k = 0; k < most; ++k) carried[k] = k < count ? rows.put_geometry(k, geometry + 29 * k) : 0;
+      rows.each_row([&](int k, int row) { carried[row] = rows.put_geometry(k, geometry + 29 * row); });
+      rows.each_free_row([&](int row) {
+        for (int e = 0; e < 29; ++e) geometry[29 * row + e] = 0;
+        carried[row] = 0;
+      });
     }
   });
 }

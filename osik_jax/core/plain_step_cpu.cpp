@@ -25,7 +25,7 @@ struct PlainRows {
     const int dofs = 3 * robot.dofs;
     place_bodies(robot.tree(), Configuration<const double*>{q, robot.factor, robot.offset, robot.source},
                  Placed<double*>{position, turn, axes, axes + dofs, axes + 2 * dofs});
-    rows.find(Placed<const double*>{position, turn, axes, axes + dofs, axes + 2 * dofs},
+    rows.find(Alone{}, Placed<const double*>{position, turn, axes, axes + dofs, axes + 2 * dofs},
               AvoidanceNumbers<double>{limit[0], limit[1], limit[2], limit[3], limit[4]}, J, lower, distance.data(),
               pair.data());
   }

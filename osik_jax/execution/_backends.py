@@ -17,7 +17,8 @@ of its whole step.
     "core"    CPUs and CUDA: any robot, any precision
 
     of inverse kinematics                     searches for poses of frames that hinges and slides carry, in scenes too
-    "core"    CPUs and CUDA: any robot, any precision; "nearest" and "all" in a scene: CPUs
+    "core"    CPUs and CUDA: any robot, any precision; "nearest" and "all" in a scene: the
+              CPU beside a GPU
 
     of retargeting                            iterations of a plan                a plan's banded systems
     "core"                                    CPUs: any robot, any precision      CPUs: inside the former

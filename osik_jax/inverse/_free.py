@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from ..collision._robot_shapes import Given, robot_shapes
 from ..collision._scene import Scene
 from ..collision._table import RobotShapes
 from ..execution._blocks import first_axes_as_one
-from ..execution._platform import cuda_is_default
+from ..execution._platform import cuda_is_default, on_host
 from ..limits import CollisionAvoidanceLimit, Limit
 from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
@@ -112,15 +113,19 @@ def find_free(
     single: bool,
 ) -> Explored:
     """Return free configurations; arguments as of ``whole``. Without numbers, ``settings`` and so on may be traced."""
+    traced = is_traced((goals, settings, obstacles.around, robot))
     if (how.near or how.every) and cuda_is_default():
-        where = "call it under jax.default_device(jax.devices('cpu')[0])"
-        raise OsikError(f"nearest and all run on a CPU where there is a scene: {where}")
+        with nullcontext() if traced else on_host():
+            if cuda_is_default():
+                where = "inside jit, call it under jax.default_device(jax.devices('cpu')[0])"
+                raise OsikError(f"nearest and all run on a CPU where there is a scene: {where}")
+            return find_free(robot, goals, settings, most, steps, how, obstacles, single=single)
     route, scenes = obstacles.route, len(obstacles.around.scene.integers)
     if len(goals.position) == 1 and scenes > 1:
         goals = jax.tree.map(lambda a: a.repeat(scenes, 0), goals)
     count = len(goals.position)
     check_length(obstacles.around.scene, count, "targets")
-    if is_traced((goals, settings, obstacles.around, robot)):
+    if traced:
         return Explored(_traced(robot, goals, settings, most, steps, how, obstacles), *split(None))
     counts = np.full(count, most)
     if not (how.near or how.every):

@@ -123,8 +123,9 @@ def inverse_kinematics(
             quicker where many targets are out of reach and only ``converged`` is wanted.
         scene: obstacles. Only a configuration in which nothing touches is a solution then: no shape of the robot
             comes nearer than ``clearance`` to the scene or to another shape of the robot. A scene with a leading axis
-            has one for each target, for poses of frames that hinges and slides carry. With the compiled core; tasks,
-            ``nearest`` and ``all`` on a CPU alone. Default: none, and shapes of the robot may touch.
+            has one for each target, for poses of frames that hinges and slides carry. With the compiled core;
+            ``nearest`` and ``all`` take the CPU, also where there is a GPU, and then not inside ``jit``. Default: none,
+            and shapes of the robot may touch.
         clearance: smallest distance of all pairs of shapes [m].
         srdf: pairs that may touch, besides those of neighbouring bodies: path or text of an SRDF; ``True``: the file
             beside the robot's URDF.
@@ -146,6 +147,9 @@ def inverse_kinematics(
     check_setting("inverse_kinematics(robot, tasks)", robot, scheme, 1.0)
     check_count("steps", steps)
     check_count("restarts", restarts, least=0)
+    for name, flag in (("nearest", nearest), ("all", all)):
+        if not isinstance(flag, bool | np.bool_):
+            raise OsikTypeError(f"{name} is a {type(flag).__name__}; it is True or False, and q0 is what to be near to")
     limits, dtype = checked_limits(robot, limits), robot.q0.dtype
     home = robot.q0 if q0 is None else _start(robot, q0, dtype)
     problem = read_problem(robot, tasks, targets, scheme, limits, home)

@@ -83,7 +83,8 @@ def test_threads_of_a_warp_find_free_configurations(panda, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch):
+@pytest.mark.parametrize("members", [1, 8])
+def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch, members):
     """The GPU's text on a CPU, a scene each: rows, pairs and what derivatives are made of are those of the core."""
     _, scenes = problems(panda, 9)
     first = jax.tree.map(lambda a: a[0], scenes)
@@ -97,6 +98,7 @@ def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch):
     assert (distance < 0).any() and np.isinf(distance).any() and np.isfinite(distance[:, 4]).any()
     monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
     monkeypatch.setattr(_near_rows, "call_here", call_by_threads)
+    monkeypatch.setattr(_near_rows, "_MOST_THREADS", 9 * members)
     found = [_near_rows._by_core(limit.kept, 5, with_geometry, *given) for with_geometry in (False, True)]
     monkeypatch.undo()
     for ours, rows in zip(found, expected, strict=True):
@@ -126,9 +128,40 @@ def check(robot, poses, scenes, found, clearance):
     assert np.asarray(osik.is_free(robot, q, scenes, clearance))[called].all()
 
 
-@pytest.mark.skipif(
+on_a_gpu = pytest.mark.skipif(
     not (cuda_is_default() and _cuda.installed()), reason="needs JAX_PLATFORMS=cuda,cpu and a CUDA device"
 )
+
+
+@on_a_gpu
+def test_steps_with_a_limit_and_nearest_solutions_are_those_of_a_cpu(panda):
+    (place, turn), scenes = problems(panda, 60)
+    q = np.random.default_rng(8).uniform(panda.position_lower, panda.position_upper, (60, panda.nq))
+    first = jax.tree.map(lambda a: a[0], scenes)
+    limit = osik.CollisionAvoidanceLimit(panda, scene=first, q0_distance=-np.inf)
+    tasks = {HAND: osik.FrameTask(panda, HAND), "posture": osik.PostureTask(panda, weight=1e-2)}
+
+    @jax.jit
+    @jax.vmap
+    def steps(q, place, turn, scene):
+        aims, limits = {HAND: (place, turn)}, (limit.replace(scene=scene),)
+        return osik.solve(panda, q, tasks, limits=limits, targets=aims, dt=0.01)
+
+    def nearest():
+        return osik.inverse_kinematics(panda, {HAND: (place, turn)}, scene=scenes, q0=q[0], nearest=True)
+
+    found, near = steps(q, place, turn, scenes), nearest()
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected, by_cpu = steps(q, place, turn, scenes), nearest()
+    np.testing.assert_array_equal(found.status, expected.status)
+    solved = np.asarray(found.status) == osik.Status.SOLVED
+    assert solved.sum() > 20
+    np.testing.assert_allclose(found.velocity[solved], expected.velocity[solved], atol=2e-3)
+    np.testing.assert_array_equal(near.converged, by_cpu.converged)
+    np.testing.assert_allclose(near.q, by_cpu.q, atol=1e-4)
+
+
+@on_a_gpu
 def test_a_gpu_finds_what_a_cpu_finds_in_batches_of_any_size(panda):
     poses, scenes = problems(panda, 300)
     found = osik.inverse_kinematics(panda, {HAND: poses}, scene=scenes, clearance=0.002)

@@ -33,7 +33,7 @@ FREE = (
     ((2, 9), (2, 9), (2, 12), (2, 10), (2, 3)),
 )
 PLACES = ((2, 9), (1, 300), *SCENE[1:]), (1, 3)
-NEAR = ((*PLACED, (1, 300), *SCENE[1:], (1, 5)), (5, 7))
+NEAR = ((*PLACED, *SCENE, (1, 5), (1,)), (5, 7, 10))
 NEAREST = (2, 4, 7), (2, 4), (2, 4), (2, 4, 4)
 """Rows of the four nearest pairs."""
 
