@@ -1,10 +1,8 @@
-"""Visual shapes of a robot's links, which are read when the robot is drawn."""
+"""Visual shapes of a robot's links."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -36,15 +34,3 @@ class Look:
 
     shapes: tuple[LinkShape, ...]
     missing: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class UnreadLook:
-    """Visual shapes whose files are not read yet."""
-
-    reader: Callable[[], Look]  # function that reads them
-
-    @cached_property
-    def read(self) -> Look:
-        """Return the shapes; the files are read once."""
-        return self.reader()

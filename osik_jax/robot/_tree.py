@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 import jax
 import mujoco
@@ -16,16 +16,12 @@ from jaxtyping import ArrayLike, Num
 
 from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
-from ._look import UnreadLook
+
+if TYPE_CHECKING:
+    from .loading._look import UnreadLook
 
 FREE, BALL, SLIDE, HINGE = (
-    int(t)
-    for t in (
-        mujoco.mjtJoint.mjJNT_FREE,
-        mujoco.mjtJoint.mjJNT_BALL,
-        mujoco.mjtJoint.mjJNT_SLIDE,
-        mujoco.mjtJoint.mjJNT_HINGE,
-    )
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
 QPOS_WIDTH = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
 DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
@@ -35,6 +31,7 @@ DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 class UnreadMesh:
     """Collision mesh of a URDF, whose file is read when distances to it are needed."""
 
+    name: str  # its own; empty where it has none
     link: str  # name of its link
     file: str  # its address, as the URDF has it
     scale: tuple[float, ...]  # of the file's numbers along x, y and z

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 
 import mujoco
@@ -25,19 +26,6 @@ _NEAR = 3
 _Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def read_look(urdf: Urdf, packages: Packages, beside: Path | None) -> Look:
-    """Return the visual shapes of a URDF with their meshes (DAE, STL, OBJ, MSH).
-
-    Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
-    both ways that one is taken that puts the meshes nearer to the joints of their links.
-
-    Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
-    shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
-    whatever the package is called there. ``beside`` is the path of the URDF; None if it was given as text.
-    """
-    return _Reader(urdf, packages, beside).look()
-
-
 def geom_size(shape: Shape) -> list[float]:
     """Return MuJoCo's sizes: radius first, then half lengths."""
     if shape.kind == "box":
@@ -46,20 +34,30 @@ def geom_size(shape: Shape) -> list[float]:
     return [radius, *(value / 2.0 for value in length), 0.0, 0.0][:3]
 
 
-class _Reader:
-    """Reader that reads each mesh file once."""
+class UnreadLook:
+    """Visual shapes of a URDF and their meshes (DAE, STL, OBJ, MSH), whose files are read at most once, when asked for.
+
+    Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
+    both ways that one is taken that puts the meshes nearer to the joints of their links.
+
+    Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
+    shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
+    whatever the package is called there. ``beside`` is the path of the URDF; None if it was given as text.
+    """
 
     def __init__(self, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
         self._urdf, self._packages, self._beside = urdf, packages, beside
-        self._read: dict[str, list[Triangles]] = {}
+        self._parts: dict[str, list[Triangles]] = {}
         self._turned = False
 
-    def look(self) -> Look:
+    @cached_property
+    def read(self) -> Look:
+        """Return the shapes."""
         visible = any(shape.visual for link in self._urdf.links.values() for shape in link.shapes)
         shapes = self._shapes(visual=visible, turned=False)
-        if any(part.y_up for parts in self._read.values() for part in parts):
+        if any(part.y_up for parts in self._parts.values() for part in parts):
             shapes = min(shapes, self._shapes(visual=visible, turned=True), key=self._from_joints)
-        return Look(shapes, tuple(address for address, parts in self._read.items() if not parts))
+        return Look(shapes, tuple(address for address, parts in self._parts.items() if not parts))
 
     def _shapes(self, *, visual: bool, turned: bool) -> tuple[LinkShape, ...]:
         self._turned = turned
@@ -108,12 +106,12 @@ class _Reader:
 
     def _triangles(self, shape: Shape) -> list[Triangles]:
         """Return the triangles of a mesh file; empty if the file cannot be read."""
-        if shape.file not in self._read:
+        if shape.file not in self._parts:
             try:
-                self._read[shape.file] = read_mesh(self._path(shape.file))
+                self._parts[shape.file] = read_mesh(self._path(shape.file))
             except (OSError, ValueError):
-                self._read[shape.file] = []
-        return self._read[shape.file]
+                self._parts[shape.file] = []
+        return self._parts[shape.file]
 
     def _path(self, address: str) -> Path:
         try:
