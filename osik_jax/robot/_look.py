@@ -25,12 +25,7 @@ class LinkShape:
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """Visual shapes of a robot's links.
-
-    Attributes:
-        shapes: of all links.
-        missing: addresses of mesh files that were not found or could not be read.
-    """
+    """Visual shapes of a robot's links."""
 
     shapes: tuple[LinkShape, ...]
-    missing: tuple[str, ...]
+    missing: tuple[str, ...]  # addresses of mesh files that were not found or could not be read

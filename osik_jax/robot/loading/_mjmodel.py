@@ -84,14 +84,9 @@ def from_mjmodel(
 ) -> RobotModel:
     """Return names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
-    Args:
-        model: the model, with the floating base that it is to have.
-        options: of which limits and locked joints are honoured here.
-        fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
-        notes: what the file that the model was made from asks for and the model does not have.
-        meshes: collision meshes that the model does not hold; they become the last of the robot's geoms.
-        look: visual shapes of a URDF.
-        path: of a URDF file.
+    The model has its floating base already. ``fixed`` names free joints that are locked where the model has them,
+    unless ``options`` lock them too. ``notes`` are on elements of the file that the model lacks. ``meshes``, which the
+    model does not hold, become the last of the robot's geoms. ``look`` and ``path`` are those of a URDF.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")

@@ -40,12 +40,7 @@ _NEAREST = 8
 
 
 def example_urdf(name: str) -> Path:
-    """Return the URDF of one of ``EXAMPLES``, in the package example-robot-data.
-
-    Raises:
-        KeyError: no such robot.
-        FileNotFoundError: example-robot-data is not installed.
-    """
+    """Return the URDF of one of ``EXAMPLES``; raise FileNotFoundError if example-robot-data is not installed."""
     if name not in EXAMPLES:
         raise unknown_name("robot", name, tuple(EXAMPLES))
     for folder in sys.path:
@@ -62,10 +57,7 @@ def example_urdf(name: str) -> Path:
 def named(name: str, options: LoadOptions) -> RobotModel:
     """Return names and numbers of a robot by its name.
 
-    Raises:
-        FileNotFoundError: the robot is one of ``EXAMPLES``, and neither example-robot-data nor robot_descriptions is
-            installed.
-        ImportError, KeyError, ValueError: as ``described``.
+    One of ``EXAMPLES`` raises FileNotFoundError if neither example-robot-data nor robot_descriptions is installed.
     """
     if name in ROBOTS:
         return embedded(name, options)
