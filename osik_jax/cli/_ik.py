@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ._inputs import InScene, read_robot
+from ._inputs import HasBase, InScene, read_robot
 from ._messages import told
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ik(InScene):
+class Ik(HasBase, InScene):
     """Finds a configuration that brings a frame to a pose, and prints it; or says what stops the robot.
 
     The exit code is 1 where none is found.
@@ -32,8 +32,6 @@ class Ik(InScene):
     """Wanted orientation as a quaternion w x y z. Default: any."""
     hold: tuple[str, ...] = ()
     """Frames that stay where they are at the robot's home configuration, such as feet."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     nearest: bool = False
     """Return the solution that is nearest to the home configuration."""
     all: bool = False

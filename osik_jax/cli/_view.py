@@ -7,11 +7,11 @@ import json
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ._inputs import InScene, read_robot
+from ._inputs import HasBase, InScene, read_robot
 from ._messages import CommandError, refuse, told
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _CLEARANCE = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class View(InScene):
+class View(HasBase, InScene):
     """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
 
     With a file: writes a page that plays the motion.npz of osik demo or osik retarget, or runs the controller that a
@@ -35,8 +35,6 @@ class View(InScene):
     """A motion.npz to play, or a controller.json to run. Default: drag the robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     support: tuple[str, ...] = ()
     """Frames that stand on the ground. Default: those that look like feet."""
     host: str = "127.0.0.1"

@@ -15,16 +15,7 @@ from .._tree import BALL, FREE, SLIDE
 from ._followers import free_name
 from ._mjmodel import LEAST_INERTIA
 from ._poses import IDENTITY, Pose
-from ._write import (
-    check_same_place,
-    frame_pose,
-    motion_to,
-    one_for_all,
-    placed_joints,
-    pose_of,
-    put,
-    refuse_stack,
-)
+from ._write import check_same_place, frame_pose, motion_to, one_for_all, placed_joints, pose_of, put, refuse_stack
 
 _UNLIMITED = 1e9
 """Written for an infinite limit of a slide or of one side: URDF has no word for it."""
