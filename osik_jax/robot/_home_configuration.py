@@ -14,9 +14,9 @@ from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
 from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
-from ._ranges import inside, joints_outside
+from ._ranges import first_of, inside, joints_outside
 from ._tree import QPOS_WIDTH
-from .loading._keyframes import keyframe_home, keyframe_names
+from .loading._keyframes import home_notes, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""
@@ -53,15 +53,19 @@ def _as_array(home: Any, dtype: Any) -> Array:
 
 
 def _keyframe(robot: RobotModel, home: Any) -> np.ndarray:
-    """Return the configuration of a keyframe of the MuJoCo model, within the robot's limits."""
+    """Return the configuration of a keyframe, joints brought inside their limits; warn of those that were outside."""
     names = keyframe_names(robot.mj_model)
-    if isinstance(home, str) and home in names:
-        number = names.index(home)
-    elif not isinstance(home, str) and 0 <= home < len(names):
-        number = int(home)
-    else:
+    if home not in (names if isinstance(home, str) else range(len(names))):
         raise unknown_name("keyframe", home, tuple(names))
-    return keyframe_home(robot, number)
+    number = names.index(home) if isinstance(home, str) else int(home)
+    q = robot.mj_model.key_qpos[number][robot.tree.own_qpos]
+    if isinstance(robot.position_lower, Tracer):
+        return q
+    ranges = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
+    notes = list(home_notes(robot.tree, names[number], q, *ranges))
+    if notes:
+        warn(first_of([str(note) for note in notes]))
+    return inside(robot.tree, q, *ranges)
 
 
 def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Numbers:

@@ -82,8 +82,9 @@ class Controller:
         settings: the settings.
 
     Raises:
-        FileNotFoundError, KeyError, TypeError, ValueError: see ``Steps`` and ``joint_names``; frames that share a
-            topic; joints of a Float64MultiArray that are not the robot's, each once.
+        FileNotFoundError, KeyError, TypeError, ValueError: the controller's file cannot be read, or something is given
+            that it has; a frame does not exist, or shares its topic with another; there is nothing to lead or to stand
+            on; a joint has no place in a JointState; joints of a Float64MultiArray are not the robot's, each once.
     """
 
     def __init__(self, robot: Robot | None, settings: Settings):

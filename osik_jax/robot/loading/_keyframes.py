@@ -6,12 +6,9 @@ from collections.abc import Iterator
 
 import mujoco
 import numpy as np
-from jax.core import Tracer
 
-from ..._errors import warn
 from .._load_report import LoadNote
-from .._model import RobotModel
-from .._ranges import first_of, inside, joints_outside
+from .._ranges import joints_outside
 from .._tree import KinematicTree
 
 _KEY_ROUNDING = 1e-3
@@ -29,15 +26,3 @@ def home_notes(
     """Yield notes on the joints that a keyframe has outside their range."""
     for text in joints_outside(tree, q, lower, upper, _KEY_ROUNDING).values():
         yield LoadNote("keyframe", key, f"{text}: in q0 it is at the end of that")
-
-
-def keyframe_home(robot: RobotModel, number: int) -> np.ndarray:
-    """Return the configuration of a keyframe, joints brought inside their limits; warn of those that were outside."""
-    q = robot.mj_model.key_qpos[number][robot.tree.own_qpos]
-    if isinstance(robot.position_lower, Tracer):
-        return q
-    ranges = np.asarray(robot.position_lower), np.asarray(robot.position_upper)
-    notes = list(home_notes(robot.tree, keyframe_names(robot.mj_model)[number], q, *ranges))
-    if notes:
-        warn(first_of([str(note) for note in notes]))
-    return inside(robot.tree, q, *ranges)

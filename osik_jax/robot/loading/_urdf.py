@@ -156,7 +156,9 @@ def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
         bodies[joint.child] = _add_body(parent, pose, urdf.links[joint.child], moving=joint.kind != "fixed")
         _add_joint(spec, bodies[joint.child], joint)
     for joint in urdf.joints:
-        _add_mimic(spec, joint)
+        if joint.mimic is not None:
+            equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name, name2=joint.mimic.leader)
+            equality.data[:5] = joint.mimic.offset, joint.mimic.multiplier, 0.0, 0.0, 0.0
     return spec
 
 
@@ -235,10 +237,3 @@ def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
         for prefix, rate in rates.items():
             if math.isfinite(rate):
                 spec.add_numeric(name=prefix + joint.name, data=[rate], size=1)
-
-
-def _add_mimic(spec: mujoco.MjSpec, joint: Joint) -> None:
-    if joint.mimic is not None:
-        equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name, name2=joint.mimic.leader)
-        equality.data[:2] = joint.mimic.offset, joint.mimic.multiplier
-        equality.data[2:5] = 0.0
