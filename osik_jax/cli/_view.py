@@ -48,6 +48,7 @@ class View(HasBase, InScene):
 
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends; or write one that plays a motion."""
+        from ..robot._guesses import guess_feet
         from ..saving._controller import read_controller
         from ..viewer.live import _open, _server
         from ..viewer.live._page import serve
@@ -71,8 +72,8 @@ class View(HasBase, InScene):
                 view = serve(controller, source=robot.get("file", robot.get("name")), **options)
             else:
                 robot = read_robot(self.robot, self.base)
-                keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()
-                view = _open.open_robot(robot, self.robot, self.support or _feet(robot), limits=keeps_off, **options)
+                options["limits"] = _keeps_off(robot, **obstacles) if obstacles else ()
+                view = _open.open_robot(robot, self.robot, self.support or guess_feet(robot), **options)
         print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
         if self.browser:
             webbrowser.open(view.url)
@@ -100,10 +101,3 @@ def _keeps_off(robot: Robot, scene: Scene, srdf: Path | None, clearance: float) 
     from ..limits import CollisionAvoidanceLimit
 
     return (CollisionAvoidanceLimit(robot, scene=scene, srdf=srdf, minimum_distance=clearance or _CLEARANCE),)
-
-
-def _feet(robot: Robot) -> tuple[str, ...]:
-    """Return frames on the ground, of a robot that moves freely."""
-    from ..robot._guesses import guess_feet
-
-    return guess_feet(robot) if robot.floating_base else ()

@@ -7,7 +7,7 @@ import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import Any, Generic, TypeVar, cast
 
 import jax
 import mujoco
@@ -16,9 +16,6 @@ from jaxtyping import ArrayLike, Num
 
 from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
-
-if TYPE_CHECKING:
-    from .loading._look import UnreadLook
 
 FREE, BALL, SLIDE, HINGE = (
     int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
@@ -54,8 +51,8 @@ class ModelHolder:
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
     # collision meshes whose files are not read; they are the last of the tree's geoms
     meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
-    # visual shapes of a URDF, read when they are drawn; None: those of the model
-    look: UnreadLook | None = dataclasses.field(default=None, repr=False)
+    # visual shapes of a URDF, an ``UnreadLook`` of ``loading``, read when they are drawn; None: those of the model
+    look: Any = dataclasses.field(default=None, repr=False)
     # URDF file, whose SRDF is looked for beside it; None: the robot was made from a text or an MJCF
     path: Path | None = dataclasses.field(default=None, repr=False)
 
