@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from ._inputs import HasBase, InScene, read_robot
 from ._messages import told
-
-if TYPE_CHECKING:
-    from ..robot import Robot
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +47,12 @@ class Ik(HasBase, InScene):
 
         from ..inverse import inverse_kinematics
         from ..inverse._report import print_found
+        from ..kinematics._forward import home_kinematics
 
         robot = read_robot(self.robot, self.base)
         with told():
-            held = _home_poses(robot, self.hold)
+            home = home_kinematics(robot)
+            held: dict[str, Any] = {name: home.frame_pose(robot, name) for name in self.hold}
             turned = self.quaternion is not None
             wanted = {self.frame: (self.position, self.quaternion) if turned else self.position}
             found = inverse_kinematics(
@@ -70,13 +68,3 @@ class Ik(HasBase, InScene):
             )
         print_found(Console(), robot, found)
         return 0 if found.converged else 1
-
-
-def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:
-    """Return the poses of frames at the home configuration."""
-    from ..kinematics import forward_kinematics
-
-    if not frames:
-        return {}
-    home = forward_kinematics(robot, robot.q0)
-    return {name: home.frame_pose(robot, name) for name in frames}
