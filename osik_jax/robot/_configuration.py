@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Num
 from .._errors import OsikTypeError, OsikValueError
 from ..numerics._host import on_host, replaced_at, to_jax
 from ._model import RobotModel
-from ._tree import BALL, FREE, QPOS_WIDTH, check_shape
+from ._tree import BALL, FREE, check_shape
 
 _LEAST_QUATERNION = 1e-8
 """A quaternion that is not longer has no direction, so it counts as zero."""
@@ -53,13 +53,9 @@ def check_configuration(robot: RobotModel, q: Num[ArrayLike, " nq"] | Sequence[f
     values = np.asarray(q)
     if not np.isfinite(values).all():
         raise OsikValueError(f"{name} is not finite at indices {np.flatnonzero(~np.isfinite(values)).tolist()}")
-    for joint, start in tree.qpos_address.items():
-        kind = tree.joint_types[joint]
-        if kind not in (FREE, BALL):
-            continue
-        end = start + QPOS_WIDTH[kind]
-        if np.linalg.norm(values[end - 4 : end]) < _LEAST_QUATERNION:
+    for start in tree.quaternions:
+        if np.linalg.norm(values[start : start + 4]) < _LEAST_QUATERNION:
+            *_, joint = (tree.joint_names[j] for j, at in tree.qpos_address.items() if at <= start)
             raise OsikValueError(
-                f"{name}[{end - 4}:{end}], the quaternion of joint {tree.joint_names[joint]!r}, is zero; the identity "
-                "is (1, 0, 0, 0)"
+                f"{name}[{start}:{start + 4}], the quaternion of joint {joint!r}, is zero; the identity is (1, 0, 0, 0)"
             )

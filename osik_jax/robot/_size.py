@@ -34,7 +34,7 @@ def robot_size(robot: RobotModel) -> Float[Array, ""] | float:
 
 def _longest_way(tree: KinematicTree, links: Any, tips: Any, larger: Any) -> Any:
     """Return the longest way between two leaves of the tree, from the lengths of its links and tips."""
-    parents, moves = tree.body_parents, tree.moves.any(1)
+    parents, moves = tree.body_parents, np.any(tree.moves, 1)
     below: list[Any] = [0.0] * len(parents)  # from a body's joint to the farthest point below it
     for frame, body in enumerate(tree.frame_bodies):
         below[body] = larger(below[body], tips[frame])

@@ -358,21 +358,17 @@ def _parents_first(root: str, links: Mapping[str, Link], joints: Mapping[str, Jo
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
-    for joint in joints.values():
-        if joint.mimic is None:
-            continue
-        leader = joints.get(joint.mimic.leader)
-        if leader is None:
-            missing = unknown_name("joint", joint.mimic.leader, tuple(joints))
-            raise OsikValueError(f"joint {joint.name!r} mimics what is not there: {missing}")
-        if leader.kind not in SCALAR:
-            raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
-        _check_chain(joint, joints)
-
-
-def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
-    chain = [joint.name]
-    while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
-        if mimic.leader in chain:
-            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
-        chain.append(mimic.leader)
+    """Raise ValueError unless each chain of followers ends at a joint that follows none."""
+    for name in joints:
+        chain = [name]
+        while (mimic := joints[chain[-1]].mimic) is not None:
+            leader = joints.get(mimic.leader)
+            if leader is None:
+                missing = unknown_name("joint", mimic.leader, tuple(joints))
+                raise OsikValueError(f"joint {chain[-1]!r} mimics what is not there: {missing}")
+            if leader.kind not in SCALAR:
+                raise OsikValueError(f"joint {chain[-1]!r} mimics {leader.name!r}, which is {leader.kind}")
+            if leader.name in chain:
+                circle = " -> ".join([*chain, leader.name])
+                raise OsikValueError(f"mimic joints follow each other in a circle: {circle}")
+            chain.append(leader.name)
