@@ -60,7 +60,8 @@ def named(name: str, options: LoadOptions) -> RobotModel:
     One of ``EXAMPLES`` raises FileNotFoundError if neither example-robot-data nor robot_descriptions is installed.
     """
     if name in ROBOTS:
-        return embedded(name, options)
+        model = resources.files("osik_jax") / "robot" / "models" / f"{name}.xml"
+        return from_mjcf(model.read_text(encoding="utf-8"), options)
     if name not in EXAMPLES:
         return described(name, options)
     try:
@@ -74,12 +75,6 @@ def named(name: str, options: LoadOptions) -> RobotModel:
             return described(ELSEWHERE[name], options)
         except ImportError:
             raise missing from None
-
-
-def embedded(name: str, options: LoadOptions) -> RobotModel:
-    """Return names and numbers of an embedded robot, one of ``ROBOTS``."""
-    text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
-    return from_mjcf(text, options)
 
 
 def described(name: str, options: LoadOptions) -> RobotModel:

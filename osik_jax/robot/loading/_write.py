@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -224,22 +225,24 @@ def one_for_all(values: ArrayLike, joint: str, what: str) -> float:
 
 def _add_frames(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
     """Write geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
-    tree = robot.tree
-    done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
+    for name, body, pose in other_frames(robot, _add_geoms(robot, bodies)):
+        put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
+
+
+def other_frames(robot: RobotModel, geoms: dict[str, Pose]) -> Iterator[tuple[str, int, Pose]]:
+    """Yield name, body and pose of the frames that are neither bodies nor geoms.
+
+    A frame of a body or of one of ``geoms`` that is not where that is raises ValueError.
+    """
+    tree, places = robot.tree, dict.fromkeys(robot.tree.body_names, IDENTITY) | geoms
     for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
         pose = frame_pose(robot, k)
-        if name not in done:
-            put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
-        else:
-            check_same_place(name, pose, done[name])
-
-
-def check_same_place(name: str, frame: Pose, own: Pose) -> None:
-    """Raise ValueError if the frame of a body or geom is not where that is."""
-    if not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(frame, own, strict=True)):
-        raise OsikValueError(
-            f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
-        )
+        if name not in places:
+            yield name, body, pose
+        elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, places[name], strict=True)):
+            raise OsikValueError(
+                f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
+            )
 
 
 def pose_of(position: ArrayLike, rotation: ArrayLike) -> Pose:

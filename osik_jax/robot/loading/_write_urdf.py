@@ -15,7 +15,7 @@ from .._tree import BALL, FREE, SLIDE
 from ._followers import free_name
 from ._mjmodel import LEAST_INERTIA
 from ._poses import IDENTITY, Pose
-from ._write import check_same_place, frame_pose, motion_to, one_for_all, placed_joints, pose_of, put, refuse_stack
+from ._write import frame_pose, motion_to, one_for_all, other_frames, placed_joints, pose_of, put, refuse_stack
 
 _UNLIMITED = 1e9
 """Written for an infinite limit of a slide or of one side: URDF has no word for it."""
@@ -33,15 +33,12 @@ def to_urdf(robot: RobotModel) -> str:
         if body:
             _add_inertial(robot, body, links[name])
             _add_body(robot, body, root)
-    done = dict.fromkeys(tree.body_names, IDENTITY)
+    done: dict[str, Pose] = {}
     for geom, body in enumerate(tree.geom_bodies):
         done |= _add_geom(robot, geom, links[tree.body_names[body]])
-    for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
-        if name in done:
-            check_same_place(name, frame_pose(robot, k), done[name])
-        else:
-            put(root, "link", name=name)
-            _add_joint(root, f"{name}_fixed", "fixed", tree.body_names[body], name, frame_pose(robot, k))
+    for name, body, pose in other_frames(robot, done):
+        put(root, "link", name=name)
+        _add_joint(root, f"{name}_fixed", "fixed", tree.body_names[body], name, pose)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
