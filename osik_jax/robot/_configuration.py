@@ -18,7 +18,7 @@ _LEAST_QUATERNION = 1e-8
 """A quaternion that is not longer has no direction, so it counts as zero."""
 
 
-def with_joints(robot: RobotModel, joints: Mapping[str, float], base: Num[ArrayLike, " nq"] | None) -> Array:
+def with_joints(robot: RobotModel, joints: Mapping[str, Any], base: Num[ArrayLike, " nq"] | None) -> Array:
     """Return ``q0`` (or ``base``) with the named joints set, unchecked."""
     q = on_host(robot.q0 if base is None else to_jax(base, robot.q0.dtype))
     offset, coefficient = on_host(robot.qpos_offset), robot.tree.qpos_source[1]

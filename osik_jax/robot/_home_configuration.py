@@ -74,8 +74,7 @@ def _with_joints(robot: RobotModel, values: Mapping[str, Any]) -> Numbers:
     for name, value in values.items():
         width, entries = QPOS_WIDTH[robot.tree.joint_types[robot.tree.joint(name)]], _as_array(value, q.dtype)
         if width == 1:
-            number: Any = entries
-            q = with_joints(robot, {name: number}, q)
+            q = with_joints(robot, {name: entries}, q)
             continue
         start = robot.joint_qpos_index(name)
         if entries.shape != (width,):
