@@ -16,7 +16,7 @@ from ._configuration import check_configuration, with_joints
 from ._model import RobotModel
 from ._ranges import first_of, inside, joints_outside
 from ._tree import QPOS_WIDTH
-from .loading._keyframes import home_notes, keyframe_names
+from .loading._notes import home_notes, keyframe_names
 
 Home: TypeAlias = str | int | Mapping[str, Any] | ArrayLike | Array
 """A keyframe's name or number, a mapping from joint names to values, or a configuration (nq,)."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
-from .._look import LinkShape, Look
 from ._collada import Triangles
 from ._meshes import read_mesh
 from ._packages import Packages
@@ -24,6 +25,28 @@ GEOMS = {
 _NEAR = 3
 """Number of folders above a URDF that are searched for a mesh whose package has another name there."""
 _Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+@dataclasses.dataclass(frozen=True)
+class LinkShape:
+    """A shape of a link, in the link's frame."""
+
+    link: str  # name of the link
+    kind: mujoco.mjtGeom  # MuJoCo's geom type
+    size: Float[np.ndarray, "3"]  # MuJoCo's geom sizes [m]
+    # centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]  # rotation of a simple shape in the link's frame
+    color: tuple[float, ...] | None  # red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none
+    mesh: tuple[np.ndarray, np.ndarray] | None = None  # vertices (k, 3) [m] and triangles (m, 3) of a mesh
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """Visual shapes of a robot's links."""
+
+    shapes: tuple[LinkShape, ...]
+    missing: tuple[str, ...]  # addresses of mesh files that were not found or could not be read
 
 
 def geom_size(shape: Shape) -> list[float]:

@@ -27,9 +27,8 @@ from ._followers import (
     qpos_offset,
     resolve_followers,
 )
-from ._keyframes import home_notes, keyframe_names
 from ._look import UnreadLook
-from ._notes import model_notes
+from ._notes import home_notes, keyframe_names, model_notes
 from ._options import LoadOptions, PositionLimits
 from ._poses import IDENTITY, Pose, quaternion, rotation_matrix
 from ._robots import robot_trees
