@@ -9,7 +9,7 @@ from typing import Any
 
 from .._errors import OsikKeyError, OsikTypeError
 from . import loading
-from ._home_configuration import Home
+from ._configuration import Home
 from ._robot import Robot
 from .loading import LoadOptions, LockedJoints, PositionLimits
 

@@ -14,7 +14,7 @@ from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ..numerics._arguments import as_array, check_bounds, check_finite, check_not_nan, check_not_negative, concrete
 from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
-from ._home_configuration import home_configuration
+from ._configuration import home_configuration
 from ._model import RobotModel
 from ._tree import DOF_WIDTH, QPOS_WIDTH, KinematicTree
 from .loading._followers import match_names

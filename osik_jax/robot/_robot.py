@@ -14,9 +14,8 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Num
 from .._whole_file import write_text
 from ..numerics._arguments import float_dtype
 from . import loading
-from ._configuration import check_configuration, with_joints
+from ._configuration import Home, check_configuration, home_configuration, with_joints
 from ._describe import described
-from ._home_configuration import Home, home_configuration
 from ._model import RobotModel
 from ._ranges import warn_of_far_joints
 from ._replace import Factors, replaced_leaves, scaled_leaves
