@@ -39,7 +39,7 @@ def file_motion(
         ValueError: a floating robot of which no frame looks like a foot, or the moving frame is one that stands.
     """
     moving = guess_moving_frame(robot) if frame is None else frame
-    standing = tuple(support) or (guess_feet(robot) if robot.floating_base else ())
+    standing = tuple(support) or guess_feet(robot)
     _check_frames(robot, moving, standing)
     # one or two feet are flat, more feet are points
     rows: Rows = "pose" if len(standing) <= 2 else "position"

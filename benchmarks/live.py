@@ -129,7 +129,7 @@ def resident() -> float:
 def measure(name: str, seconds: float) -> dict[str, object]:
     """One session."""
     robot = read_robot(name)
-    feet = guess_feet(robot) if robot.floating_base else ()
+    feet = guess_feet(robot)
     load = os.getloadavg()[0]
     with _open.open_robot(robot, name, feet, host="127.0.0.1", port=0) as view:
         view.loop.wait_until_ready(300.0)

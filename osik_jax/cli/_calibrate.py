@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ._inputs import read_robot
+from ._inputs import HasBase, read_robot
 from ._messages import CommandError, told, writing
 
 if TYPE_CHECKING:
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Calibrate:
+class Calibrate(HasBase):
     """Finds a robot's offsets, lengths, tool, base or camera from measurements in a CSV file.
 
     Prints each number with its deviation, and what the measurements do not determine. Writes calibration.yaml,
@@ -47,8 +47,6 @@ class Calibrate:
     """JSON, such as the frames of a calibration.yaml: {"camera": {"parent": "tool0", "position": [0, 0, 0.1]}}."""
     out: Path = Path("osik-calibration")
     """Folder for the files."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
     def run(self) -> int:
         """Run the command; return the exit code: 1 if the fit did not converge."""
@@ -57,12 +55,7 @@ class Calibrate:
         robot = read_robot(self.robot, self.base)
         with told():
             measured = calibration.read_measurements(
-                self.measurements,
-                robot,
-                self.frame,
-                other=self.other,
-                intrinsics=self.intrinsics,
-                sigma=self.sigma,
+                self.measurements, robot, self.frame, other=self.other, intrinsics=self.intrinsics, sigma=self.sigma
             )
             found = calibration.calibrate(
                 robot,

@@ -47,12 +47,7 @@ class Demo:
         console.print(escape(motion.title))
         with writing(self.out), console.status("starting") as status:
             shown, _ = run_demo(
-                motion,
-                self.out,
-                schemes=self.schemes,
-                dt=dt,
-                animation=self.animation,
-                announce=status.update,
+                motion, self.out, schemes=self.schemes, dt=dt, animation=self.animation, announce=status.update
             )
         console.print(shown)
         console.print(f"written to {self.out}: {', '.join(sorted(os.listdir(self.out)))}", markup=False)

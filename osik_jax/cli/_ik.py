@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
-from ._inputs import InScene, read_robot
+from ._inputs import HasBase, InScene, read_robot
 from ._messages import told
-
-if TYPE_CHECKING:
-    from ..robot import Robot
 
 
 @dataclasses.dataclass(frozen=True)
-class Ik(InScene):
+class Ik(HasBase, InScene):
     """Finds a configuration that brings a frame to a pose, and prints it; or says what stops the robot.
 
     The exit code is 1 where none is found.
@@ -32,8 +28,6 @@ class Ik(InScene):
     """Wanted orientation as a quaternion w x y z. Default: any."""
     hold: tuple[str, ...] = ()
     """Frames that stay where they are at the robot's home configuration, such as feet."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     nearest: bool = False
     """Return the solution that is nearest to the home configuration."""
     all: bool = False
@@ -53,10 +47,12 @@ class Ik(InScene):
 
         from ..inverse import inverse_kinematics
         from ..inverse._report import print_found
+        from ..kinematics._forward import home_kinematics
 
         robot = read_robot(self.robot, self.base)
         with told():
-            held = _home_poses(robot, self.hold)
+            home = home_kinematics(robot)
+            held: dict[str, Any] = {name: home.frame_pose(robot, name) for name in self.hold}
             turned = self.quaternion is not None
             wanted = {self.frame: (self.position, self.quaternion) if turned else self.position}
             found = inverse_kinematics(
@@ -72,13 +68,3 @@ class Ik(InScene):
             )
         print_found(Console(), robot, found)
         return 0 if found.converged else 1
-
-
-def _home_poses(robot: Robot, frames: Sequence[str]) -> dict[str, Any]:
-    """Return the poses of frames at the home configuration."""
-    from ..kinematics import forward_kinematics
-
-    if not frames:
-        return {}
-    home = forward_kinematics(robot, robot.q0)
-    return {name: home.frame_pose(robot, name) for name in frames}

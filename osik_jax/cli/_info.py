@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ._inputs import read_robot
+from ._inputs import HasBase, read_robot
 from ._messages import CommandError
 
 if TYPE_CHECKING:
@@ -18,15 +18,13 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Info:
+class Info(HasBase):
     """Prints a robot's joints with their limits, its frames and its mass, and what it does not keep of its file."""
 
     robot: Annotated[str, tyro.conf.Positional] = ""
     """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
     system: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the versions and devices in use, and which compiled core is loaded and why."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
     spheres: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the spheres that cover its collision shapes: how many, and how far they stick out."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -22,11 +22,7 @@ _POSITION, _POSE = ("x", "y", "z"), ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def read_robot(source: str, base: str = "auto") -> Robot:
-    """Return a robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by what is in it.
-
-    Raises:
-        CommandError: no such file, or what is in it is broken.
-    """
+    """Return a robot by a name that ``load_robot`` takes, or a URDF or MJCF file, told apart by its content."""
     from ..robot import _load_robot
     from ..robot.loading import ROBOTS
 
@@ -43,6 +39,14 @@ def read_robot(source: str, base: str = "auto") -> Robot:
             # robot_descriptions: its git may fail in ways of its own
             reason = " ".join(str(error).split())
             raise CommandError(f"{source} could not be fetched: {type(error).__name__}: {reason}") from error
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HasBase:
+    """Whether the robot of a file has a floating base."""
+
+    base: Literal["auto", "floating", "fixed"] = "auto"
+    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -67,11 +71,7 @@ class InScene:
 
 
 def read_pose_file(path: Path) -> Any:
-    """Return the positions of a file, and the quaternions w x y z if it has them.
-
-    Raises:
-        ValueError: other columns than x, y, z, or x, y, z, qw, qx, qy, qz. Without a head they have this order.
-    """
+    """Return the positions of a file, and the quaternions w x y z if it has them; without a head in this order."""
     columns = read_columns(path, _POSE)
     if set(columns) not in (set(_POSITION), set(_POSE)):
         raise OsikValueError(f"{path}: its columns are {','.join(columns)}; they are x,y,z or x,y,z,qw,qx,qy,qz")

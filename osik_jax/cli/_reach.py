@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ._inputs import InScene, read_robot
+from ._inputs import HasBase, InScene, read_robot
 from ._messages import told, writing
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Reach(InScene):
+class Reach(HasBase, InScene):
     """Maps what a frame gets to: for each position of a grid, the share of orientations that it reaches.
 
     Writes the map and, beside it, a picture. What is finished is kept in a folder until then: the name of the map with
@@ -39,8 +39,6 @@ class Reach(InScene):
     """Number of searches for a pose, at most."""
     key: int = 0
     """Number of the sequence of their starts."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     position_tolerance: float = 1e-3
     """Largest distance from a position [m]."""
     orientation_tolerance: float = 1e-2

@@ -132,7 +132,7 @@ def _retarget_folder(command: Retarget) -> int:
         _print_figures([*rows, ("worst", {"frames": summary["frames"], **summary["worst"]})])
     print(
         f"{summary['clips']} clips, {summary['frames']:,} frames, written to {command.out}; all figures are in "
-        f"{command.out / 'report.json'}",
+        f"{command.out / 'report.json'}"
     )
     if summary["no_clips"]:
         print(f"no clips, and not read: {shortened(summary['no_clips'])}")

@@ -8,9 +8,9 @@ import signal
 import threading
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from ._inputs import read_robot
+from ._inputs import HasBase, read_robot
 from ._messages import CommandError, refuse, told
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclasses.dataclass(frozen=True)
-class Ros2:
+class Ros2(HasBase):
     """Leads a robot over ROS 2 topics, without ROS on this machine: joint states and targets in, commands out.
 
     Needs the extra ros2. It starts at the measured configuration, stays there until a target comes, and holds where
@@ -30,8 +30,6 @@ class Ros2:
     of the controller that the settings name."""
     config: Path | None = None
     """A TOML file with settings: topics, frames, limits, names of joints."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     domain: int | None = None
     """Number of the DDS domain. Default: ROS_DOMAIN_ID, or 0."""
     loopback: bool = False

@@ -7,11 +7,11 @@ import json
 import webbrowser
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from ._inputs import InScene, read_robot
+from ._inputs import HasBase, InScene, read_robot
 from ._messages import CommandError, refuse, told
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ _CLEARANCE = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class View(InScene):
+class View(HasBase, InScene):
     """Shows a robot in the browser: drag its hands, feet and waist, and it follows. Needs the extra viewer.
 
     With a file: writes a page that plays the motion.npz of osik demo or osik retarget, or runs the controller that a
@@ -35,8 +35,6 @@ class View(InScene):
     """A motion.npz to play, or a controller.json to run. Default: drag the robot."""
     robot: str = "nao"
     """A URDF or MJCF file, or a robot by name: nao, ur5, g1 and others, or one of robot_descriptions."""
-    base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
     support: tuple[str, ...] = ()
     """Frames that stand on the ground. Default: those that look like feet."""
     host: str = "127.0.0.1"
@@ -50,6 +48,7 @@ class View(InScene):
 
     def run(self) -> int:
         """Serve a page until Ctrl-C, which is how a view ends; or write one that plays a motion."""
+        from ..robot._guesses import guess_feet
         from ..saving._controller import read_controller
         from ..viewer.live import _open, _server
         from ..viewer.live._page import serve
@@ -73,8 +72,8 @@ class View(InScene):
                 view = serve(controller, source=robot.get("file", robot.get("name")), **options)
             else:
                 robot = read_robot(self.robot, self.base)
-                keeps_off = _keeps_off(robot, **obstacles) if obstacles else ()
-                view = _open.open_robot(robot, self.robot, self.support or _feet(robot), limits=keeps_off, **options)
+                options["limits"] = _keeps_off(robot, **obstacles) if obstacles else ()
+                view = _open.open_robot(robot, self.robot, self.support or guess_feet(robot), **options)
         print(f"osik view: {view.url} (Ctrl-C ends it)", flush=True)
         if self.browser:
             webbrowser.open(view.url)
@@ -102,10 +101,3 @@ def _keeps_off(robot: Robot, scene: Scene, srdf: Path | None, clearance: float) 
     from ..limits import CollisionAvoidanceLimit
 
     return (CollisionAvoidanceLimit(robot, scene=scene, srdf=srdf, minimum_distance=clearance or _CLEARANCE),)
-
-
-def _feet(robot: Robot) -> tuple[str, ...]:
-    """Return frames on the ground, of a robot that moves freely."""
-    from ..robot._guesses import guess_feet
-
-    return guess_feet(robot) if robot.floating_base else ()

@@ -78,13 +78,13 @@ def _urdf_objects(root: ElementTree.Element, source: Source) -> Objects:
     model = urdf_spec(urdf).compile()
     data, objects = mujoco.MjData(model), _objects(model)
     mujoco.mj_kinematics(model, data)
-    for name, mesh in unread_meshes(urdf, Packages(), source.path):
+    for mesh in unread_meshes(urdf, Packages(), source.path):
         is_root = mesh.link == urdf.root
         body = 0 if is_root else model.body(mesh.link).id
         carrier = Pose(data.xpos[body], data.xmat[body].reshape(3, 3))
         pose = carrier @ Pose(np.array(mesh.position), np.array(mesh.rotation))
         shape = ConvexShape(ShapeKind.HULL, np.zeros(3), *pose, hull_vertices(unread_points(mesh)))
-        objects.setdefault(name or "world" if is_root else mesh.link, []).append(shape)
+        objects.setdefault(mesh.name or "world" if is_root else mesh.link, []).append(shape)
     return objects
 
 

@@ -26,11 +26,7 @@ class Candidates(NamedTuple):
         return self.search_rest(self.certified(*problems), *problems)
 
 
-def certified_or_searched(
-    kernels: dict[str, Candidates],
-    search: Callable[..., Any],
-    *problems: Any,
-) -> Any:
+def certified_or_searched(kernels: dict[str, Candidates], search: Callable[..., Any], *problems: Any) -> Any:
     """Solve a batch by the kernel of the platform and the search, or by the search alone.
 
     If the only kernel is for CPUs and JAX's default backend is a CPU, one search is traced, for all platforms. On

@@ -12,13 +12,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core import _cuda, _library
 from ._backends import on_platforms
-from ._blocks import first_axes_as_one
-from ._lanes import lanes_of, no_lanes
+from ._lanes import lanes_of, of_one_problem
 from ._platform import cuda_is_default
 from ._rules import custom_jvp
 
@@ -65,30 +63,7 @@ def in_shared_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
 
     Arrays that ``solve`` takes have a leading axis of lanes, or of length 1 if shared.
     """
-
-    @custom_vmap
-    def lanes(*args: Any) -> Any:
-        return solve(*args) if lanes_of(args) else no_lanes(solve, args)
-
-    @lanes.def_vmap
-    def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
-        inner = lanes_of(args, in_batched)
-
-        def merged(a: jax.Array, batched: bool) -> jax.Array:
-            if not batched and len(a) == 1:
-                return a
-            shape = a.shape[1 + batched :]
-            wide = a if batched else a[None]
-            return first_axes_as_one(jnp.broadcast_to(wide, (axis_size, inner, *shape)))
-
-        out = lanes(*jax.tree.map(merged, args, tuple(in_batched)))
-        out = jax.tree.map(lambda a: a.reshape(axis_size, inner, *a.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
-
-    def one(*args: Any) -> Any:
-        return jax.tree.map(lambda a: a[0], lanes(*jax.tree.map(lambda a: jnp.asarray(a)[None], args)))
-
-    return one
+    return of_one_problem(solve, shares=True)
 
 
 def over_lanes(function: Callable[..., Any]) -> Callable[..., Any]:

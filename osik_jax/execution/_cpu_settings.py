@@ -7,7 +7,7 @@ from importlib import import_module
 
 import jax
 
-from .._errors import OsikValueError
+from ..numerics._arguments import check_count
 from ._workers import ENOUGH, cores, jaxlib_version
 
 _UNTRIED_JAXLIB = (0, 13)  # the same bound as that of jax in pyproject.toml
@@ -35,8 +35,7 @@ def configure_cpu(*, workers: int = ENOUGH) -> None:
         RuntimeError: JAX has made its CPU client, which reads a setting that would have to change; the message names
             it.
     """
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
-        raise OsikValueError(f"workers is {workers!r}; it is an integer, at least 1")
+    check_count("workers", workers)
     changes = {}
     if "PJRT_NPROC" not in os.environ and workers > cores():
         changes["PJRT_NPROC"] = str(workers)

@@ -31,20 +31,29 @@ def in_lanes(solve: Callable[..., Any]) -> Callable[..., Any]:
     ``vmap`` of it, however deeply nested, calls ``solve`` on all lanes (on a CPU: on blocks of them). It is not
     differentiable: stop gradients at its inputs.
     """
+    return of_one_problem(lambda *args: in_blocks(solve, args, BLOCK), shares=False)
+
+
+def of_one_problem(solve: Callable[..., Any], *, shares: bool) -> Callable[..., Any]:
+    """Return a function of one problem from a batched function; ``vmap`` of it makes one axis of all lanes.
+
+    ``shares``: the batched function takes arrays of length 1 where all lanes share an array; else they are copied.
+    """
 
     @custom_vmap
     def lanes(*args: Any) -> Any:
-        if lanes_of(args) == 0:
-            return no_lanes(solve, args)
-        return in_blocks(solve, args, BLOCK)
+        return no_lanes(solve, args) if lanes_of(args) == 0 else solve(*args)
 
     @lanes.def_vmap
     def _(axis_size: int, in_batched: list[Any], *args: Any) -> tuple[Any, Any]:
-        wide = jax.tree.map(
-            lambda a, batched: a if batched else jnp.broadcast_to(a, (axis_size, *a.shape)), args, tuple(in_batched)
-        )
-        inner = jax.tree.leaves(wide)[0].shape[1]
-        out = lanes(*jax.tree.map(first_axes_as_one, wide))
+        inner = lanes_of(args, in_batched)
+
+        def merged(a: jax.Array, batched: bool) -> jax.Array:
+            if shares and not batched and len(a) == 1:
+                return a
+            return first_axes_as_one(jnp.broadcast_to(a, (axis_size, inner, *a.shape[1 + batched :])))
+
+        out = lanes(*jax.tree.map(merged, args, tuple(in_batched)))
         out = jax.tree.map(lambda a: a.reshape(axis_size, inner, *a.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 

@@ -29,7 +29,11 @@ def watch_memory_maps(name: str, compiled: Any) -> None:
     maps, most = counted_maps(), _most_maps()
     if maps is not None and most is not None and maps > _SHARE * most and not _warned:
         _warned.append(maps)
-        _warn(maps, most)
+        warn(
+            f"this process has {maps} of the {most} memory maps that the system allows. Each compiled structure of "
+            "tasks takes several hundred, and at the limit the process is aborted. Change numbers by replace, which "
+            "compiles nothing; call jax.clear_caches(); or raise the limit: sysctl -w vm.max_map_count=262144"
+        )
 
 
 def counted_maps() -> int | None:
@@ -46,11 +50,3 @@ def _most_maps() -> int | None:
         return int(_MOST.read_text())
     except (OSError, ValueError):
         return None
-
-
-def _warn(maps: int, most: int) -> None:
-    warn(
-        f"this process has {maps} of the {most} memory maps that the system allows. Each compiled structure of tasks "
-        "takes several hundred, and at the limit the process is aborted. Change numbers by replace, which compiles "
-        "nothing; call jax.clear_caches(); or raise the limit: sysctl -w vm.max_map_count=262144"
-    )

@@ -161,11 +161,7 @@ def by_platform(kernels: dict[str, Callable[..., Any]], otherwise: Callable[...,
 
     ``otherwise`` is for other platforms and is traced only if a program is lowered for one of them: half of the time
     until a first answer. It needs all arrays as arguments, and returns arrays of the same types as the kernels.
-
-    Args:
-        kernels: functions by platform, at least one.
-        otherwise: the function for all other platforms.
-        args: pytrees of arrays.
+    ``kernels`` has functions by platform, at least one; ``args`` are pytrees of arrays.
     """
     traced = [jax.make_jaxpr(kernel, return_shape=True)(*args) for kernel in kernels.values()]
     bodies = tuple(body for body, _ in traced)
@@ -176,12 +172,8 @@ def by_platform(kernels: dict[str, Callable[..., Any]], otherwise: Callable[...,
 def when_lowered(function: Callable[..., Any], like: Any, *args: Any) -> Any:
     """Return the function's result, traced only when the program is lowered; it is not differentiated.
 
-    Batches and derivatives trace functions again and again, and lower one of these traces.
-
-    Args:
-        function: needs all arrays as arguments.
-        like: arrays with the shapes and types of its results.
-        args: pytrees of arrays.
+    Batches and derivatives trace functions again and again, and lower one of these traces. The function needs all
+    arrays as arguments, in pytrees; ``like`` has arrays with the shapes and types of its results.
     """
     leaves, tree = jax.tree.flatten(like)
     return jax.tree.unflatten(tree, _bind_late(function, args, (), (), tuple(map(_strong_type, leaves))))

@@ -45,17 +45,11 @@ def splits(jaxlib: tuple[int, ...]) -> bool:
     return first <= jaxlib < after
 
 
+@cache
 def warn_of_few_workers() -> None:
     """Warn once that a batch is solved by too few workers."""
-    global _warned
-    if _warned:
-        return
-    _warned = True
     warn(
         f"a batch on a CPU of {cores()} cores: this jaxlib's batched factorisations wait for workers inside workers, "
         "and several in one program can wait for ever; call osik_jax.runtime.configure_cpu() first, before any robot "
         "is loaded, or set PJRT_NPROC, or take a jaxlib that has no such calls: 0.9, or 0.11.1 and later"
     )
-
-
-_warned = False

@@ -328,10 +328,6 @@ def _fields(robot: Robot, q: Float[Array, " nq"]) -> tuple[Array, ...]:
     return tuple(jax.tree.leaves(forward_kinematics(robot, q)))
 
 
-def _frames(robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]) -> Moving:
-    return moving_frames(robot, kinematics, names)
-
-
 def _frames_by_kernel(
     call: _kernels.Call, robot: Robot, kinematics: Kinematics, *, names: tuple[str, ...]
 ) -> tuple[Array, Array, Array]:
@@ -339,7 +335,7 @@ def _frames_by_kernel(
 
 
 _bodies = by_kernel(_fields, _kernels.bodies)
-_moving_frames = by_kernel(_frames, _frames_by_kernel)
+_moving_frames = by_kernel(moving_frames, _frames_by_kernel)
 _moving_center = by_kernel(_center_and_jacobian, _kernels.center_of_mass)
 
 

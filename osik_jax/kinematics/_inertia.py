@@ -13,14 +13,6 @@ from ._forward import Kinematics, body_masses, center_of_mass, check_kinematics,
 from ._rigid import compose, cross, rotate
 
 
-class Composite(NamedTuple):
-    """Inertia of each body with all its descendants as one rigid body, in world axes."""
-
-    mass: Float[Array, " nbody"]  # [kg]
-    center: Float[Array, "nbody 3"]  # of mass [m]
-    inertia: Float[Array, "nbody 3 3"]  # about that [kg m^2]
-
-
 class Momenta(NamedTuple):
     """Centre, linear and angular momentum of the bodies that each dof carries, at unit speed; world axes."""
 
@@ -78,8 +70,13 @@ def _momenta(robot: Robot, kinematics: Kinematics) -> Momenta:
     return Momenta(center, mass[:, None] * velocity, rotate(inertia, axis))
 
 
-def _composites(robot: Robot, kinematics: Kinematics) -> Composite:
-    """Return inertias summed about their own centres, because far from a common point light bodies lose digits."""
+def _composites(
+    robot: Robot, kinematics: Kinematics
+) -> tuple[Float[Array, " nbody"], Float[Array, "nbody 3"], Float[Array, "nbody 3 3"]]:
+    """Return mass [kg], centre of mass [m] and inertia about that [kg m^2] of each body with all its descendants.
+
+    World axes. Inertias are summed about their own centres, because far from a common point light bodies lose digits.
+    """
     turn, mass = kinematics.body_rotation, robot.body_mass
     centers = kinematics.body_position + rotate(turn, robot.body_com)
     below = jnp.asarray(robot.tree.descendants, mass.dtype)
@@ -93,4 +90,4 @@ def _composites(robot: Robot, kinematics: Kinematics) -> Composite:
     own = compose(compose(turn, robot.body_inertia), turn.mT)
     inertia = jnp.matmul(below, own.reshape(-1, 9), precision="highest").reshape(-1, 3, 3)
     trace = jnp.trace(spread, axis1=-2, axis2=-1)[:, None, None]
-    return Composite(total, center, inertia + trace * jnp.eye(3, dtype=mass.dtype) - spread)
+    return total, center, inertia + trace * jnp.eye(3, dtype=mass.dtype) - spread

@@ -32,12 +32,7 @@ _ACCEPTED = (
 
 
 def as_pose(
-    value: Any,
-    dtype: Any,
-    *,
-    rest: tuple[Any, Any] = (None, None),
-    numbers: Any = jnp,
-    what: str = "the target",
+    value: Any, dtype: Any, *, rest: tuple[Any, Any] = (None, None), numbers: Any = jnp, what: str = "the target"
 ) -> Pose:
     """Return position and rotation matrix from any form of a pose (``PoseLike``).
 

@@ -108,11 +108,7 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
 
 
 def as_floats(value: Any, *beside: Any) -> Array:
-    """Return the value as an array of its own precision; integers get that of the floats beside it, or JAX's default.
-
-    Raises:
-        TypeError: the value is complex.
-    """
+    """Return an array of the value's own precision; integers get that of the floats beside it, or JAX's default."""
     array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array

@@ -23,9 +23,7 @@ import numpy as np
 INACTIVE, AT_LOWER, AT_UPPER, EQUALITY = 0, -1, 1, 2
 """Labels of a constraint in an active set."""
 REDUNDANT = 3
-"""Label in a kernel's candidate: inactive, because the constraint depends on active ones and holds up to roundoff if
-they do.
-"""
+"""Label in a kernel's candidate: inactive, for it depends on active constraints and holds up to roundoff if they do."""
 
 EPSILON = float(np.finfo(np.float64).eps)
 """Machine epsilon of double precision, the precision of the CPU kernels."""
@@ -43,9 +41,7 @@ DAMPING_RIDGE_ROUNDOFF = 10.0
 NEGLIGIBLE_DAMPING = 1e-13
 """Damping relative to the square of the level's longest row whose gradients are below roundoff."""
 TIE_ROUNDOFF = 100.0
-"""Tolerance in units of machine epsilon of a row's terms: a row that leaves its interval by less is not in the damped
-step.
-"""
+"""Machine epsilons of a row's terms: a row that leaves its interval by less is not in the damped step."""
 COST_FRACTION = 0.1
 """Share of a level's cost decrease that lower levels may undo at second order."""
 MIN_RADIUS = 1e-6
@@ -73,9 +69,7 @@ PATH_STEP = 1e-9
 PATH_END = 1e-6
 """Tolerance relative to the largest scale: within it, the saturated joints are those of the end of the path."""
 BLOCKING_RANK = 1e-6
-"""A blocking joint is dependent if the part of its unit vector in the null space and outside the span of the other
-joints is below this.
-"""
+"""Part of a blocking joint's unit vector in the null space, outside the others' span, below which it is dependent."""
 BOUND_DISTANCE = 1e-9
 """Distance relative to the bound, above which a joint is not at its bound."""
 SATURATION_RESIDUAL = 2e-9
@@ -88,9 +82,7 @@ KKT_TOLERANCE = {jnp.dtype("float64"): 1e-9, jnp.dtype("float32"): 1e-5}
 FEASIBILITY = 1e-12
 """Violation, or multiplier of the wrong sign, relative to the scale of a constraint, below which it counts as zero."""
 FARKAS_RADIUS = 1e3
-"""Magnitude of x, relative to the numbers of the problem, up to which unbounded variables are considered in a Farkas
-certificate.
-"""
+"""Largest |x|, relative to the problem's numbers, that a Farkas certificate considers for unbounded variables."""
 FARKAS_ROUNDOFF = 1e-14
 """Sum relative to its absolute terms, below which it counts as 0."""
 FARKAS_MARGIN = 1e-3
@@ -102,9 +94,7 @@ BOX_TOLERANCE = 10.0
 bound that a step approaches by less than the rank tolerance of the step does not stop it.
 """
 MAX_RESIDUAL = 10.0
-"""Largest ``kkt_residual`` of a SOLVED hierarchy in units of the rank tolerance; with the default rank tolerance this
-is ``KKT_TOLERANCE``.
-"""
+"""Largest ``kkt_residual`` of a SOLVED hierarchy in units of the rank tolerance; by default ``KKT_TOLERANCE``."""
 
 # ---- weighted QPs
 
@@ -117,9 +107,7 @@ a search ends without an answer, the next one begins at its end.
 RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """Violations in units of roundoff up to which an exact solve after projected Newton is accepted."""
 ROW_MULTIPLIER = 1e-3
-"""Multiplier of a row relative to the sum of all rows in a variable's gradient, below which its sign is not
-significant.
-"""
+"""Multiplier of a row relative to all rows' sum in a variable's gradient, below which its sign is not significant."""
 INFEASIBLE_COMPLIANCE = {jnp.dtype("float64"): 1e-11, jnp.dtype("float32"): 1e-6}
 """Compliance of infeasible hard rows relative to C diag(H)^-1 C'; it makes the least violation differentiable.
 
@@ -152,9 +140,7 @@ its multiplier exceeds this in an entry of the gradient (double precision).
 # ---- projected Newton
 
 PENALTY = 1e5
-"""Curvature of a hard row relative to the largest curvature of the cost; an update reduces its violation to about
-1e-5.
-"""
+"""Curvature of a hard row relative to the cost's largest one; an update reduces its violation to about 1e-5."""
 LARGEST_PENALTY, SLOW_DECREASE = 1e7, 0.25
 """The same where updates are slow: that leave more than the second times the violation before."""
 SHORTEST_STEP, STEP_LENGTHS = 1e-9, 31
@@ -178,9 +164,7 @@ MAX_UPDATES = 40
 COMPLIANCE_DECREASE = 0.1
 """Factor on the compliance of infeasible hard rows, applied while a bound keeps x from the least violation."""
 ZERO_GRADIENT = 1e-9
-"""Cosine of the angle between the violation and a column of C, and multiplier relative to the gradient's terms, below
-which they count as 0.
-"""
+"""Cosine between violation and column of C, and multiplier relative to the gradient's terms, that count as 0."""
 UNCHANGED = 1e-9
 """Change of x by an update relative to x, below which the least violation has been found."""
 
@@ -197,16 +181,13 @@ MULTIPLIER_TOL = 1e-10
 HARD_ROW_TOL = 1e-11
 """Violation relative to the scale of a row, below which it counts as zero."""
 STATIONARITY_TOL = 10.0
-"""Gradient (in kernels) along free directions that counts as 0, in units of the multiplier's tolerance and of
-roundoff.
-"""
+"""Gradient along free directions (in kernels) that counts as 0, in units of multiplier tolerance and roundoff."""
 SINGULAR_TOL = 100.0
 """Singular values in units of machine epsilon of the data, below which they are not inverted in derivatives."""
 ZERO_PIVOT = 1e-2
 """Pivot in units of the rank tolerance that counts as 0, whatever rank another factorisation found."""
 DAMPED_RANK = 1e-14
-"""Least pivot of a damped level's rows that counts in its step, relative to its longest row; all above roundoff count.
-"""
+"""Least pivot that counts in a damped level's step, relative to its longest row; all above roundoff count."""
 EXTRA_DAMPING = 1e-9
 """Damping in units of the square of the level's longest row, with which a kernel takes one step along directions that
 the rank tolerance left out.
@@ -229,9 +210,7 @@ NEGLIGIBLE_ENTRY = 1e-7
 ENTRY_ROUNDOFF = 2.0
 """Entry in units of machine epsilon times the row's largest entry, below which it is the rounding of 0."""
 DERIVATIVE_RANK = 1e-7
-"""Part of a saturated joint's column of the projector outside the span of the others, below which the joint has no
-derivative of its own.
-"""
+"""Part of a saturated joint's projector column outside the others' span, below which it has no own derivative."""
 
 # ---- schemes
 
@@ -266,25 +245,19 @@ SINGLE_TOUCH = 2e-5
 # ---- tasks
 
 POINTING_SINE_SQUARED = 1e-3
-"""Squared sine of the angle from an axis to a direction, below which a series for angle over sine is exact to
-roundoff.
-"""
+"""Squared sine of the angle to a direction, below which a series for angle over sine is exact to roundoff."""
 LEVER_ROUNDOFF = 1e-6
 """Lever arm relative to the longest one, below which it may be the roundoff of 0."""
 UNHELD_PART = 0.04
-"""Share of the bound on a task's curvature that is used for joints that bend without moving the frame across its pull.
-"""
+"""Share of the bound on a task's curvature for joints that bend without moving the frame across its pull."""
 NEAR_ERROR = 0.06
-"""Error in lever arms, below which the whole bound is used, so that a stretched arm leaves and reaches its boundary
-without oscillation.
-"""
+"""Error in lever arms, below which the whole bound is used: a stretched arm does not oscillate at its boundary."""
 NEAR_PART = 0.4
 """Fraction of the curvature bound that counts at the target."""
 FARTHEST_ERROR = 1e6
 """Largest error that is considered, in units of ``NEAR_ERROR``; a larger one makes no difference."""
 ROW_ROUNDOFF = 10.0
-"""Part of a Jacobian row left by the rows before it, in units of machine epsilon per dof, below which it is dependent.
-"""
+"""Part of a Jacobian row left by the rows before it, in machine epsilons per dof, below which it is dependent."""
 INERTIA_ROUNDOFF = 4.0
 """Inertia given to a motion without any, in units of machine epsilon per dof, relative to the inertia of its dofs."""
 RANGE_ROUNDOFF = 8.0

@@ -61,11 +61,7 @@ def to_host(value: Any, dtype: Any = None) -> np.ndarray:
 
 
 def to_jax(value: Any, dtype: Any = None) -> Array:
-    """Return ``jnp.asarray(value, dtype)`` without compiling: that compiles a program for each shape of NumPy's arrays.
-
-    Raises:
-        TypeError, ValueError: as ``jnp.asarray``.
-    """
+    """Return ``jnp.asarray(value, dtype)`` without the program that it compiles for each shape of NumPy's arrays."""
     if isinstance(value, jax.Array):
         return jnp.asarray(value, dtype)
     try:

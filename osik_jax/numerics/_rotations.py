@@ -28,8 +28,7 @@ _Result = tuple[Numbers, Bool[Numbers, "*B"]]
 def _exact(function: Callable[[Any], _Result], given: Numbers, what: str, right: str) -> Numbers:
     """Return the first result; concrete arguments are computed on the host and stay concrete while a program is traced.
 
-    Raises:
-        ValueError: as ``_refuse``, where the second result is false.
+    Where the second result is false, a concrete argument is refused, and a traced one becomes NaN.
     """
     if isinstance(given, Tracer):
         return jax.jit(function)(given)[0]
@@ -43,12 +42,7 @@ def _exact(function: Callable[[Any], _Result], given: Numbers, what: str, right:
 
 
 def exact_quaternion(given: Float[Numbers, "*B 4"], what: str) -> Float[Numbers, "*B 4"]:
-    """Return quaternions divided by their lengths, which must be 1 within 2 %; the result is an array of the same kind.
-
-    Raises:
-        ValueError: a concrete length is not; the message calls the quaternion ``what``. A traced quaternion of another
-            length becomes NaN.
-    """
+    """Return quaternions divided by their lengths, which must be 1 within 2 %, as an array of the same kind."""
     return _exact(_unit_quaternion, given, what, f"w x y z has to be of length 1 within {ROUNDED:.0%}")
 
 
@@ -62,14 +56,7 @@ def _unit_quaternion(given: Float[Numbers, "*B 4"]) -> tuple[Float[Numbers, "*B 
 
 
 def exact_rotation(given: Float[Numbers, "*B 3 3"], what: str) -> Float[Numbers, "*B 3 3"]:
-    """Return the rotation matrices nearest to the given ones, whose columns must have length 1 within 2 %.
-
-    The result is an array of the same kind.
-
-    Raises:
-        ValueError: a concrete matrix is not that close to a rotation; the message calls it ``what``. Such a matrix
-            becomes NaN if it is traced.
-    """
+    """Return the nearest rotations to matrices whose columns have length 1 within 2 %, as an array of the same kind."""
     return _exact(_nearest_rotation, given, what, f"R R' = I within {ROUNDED:.0%} of the lengths, det R = 1")
 
 

@@ -36,7 +36,9 @@ def with_corners(frames: Sequence[str]) -> tuple[str, ...]:
 
 
 def guess_feet(robot: RobotModel) -> tuple[str, ...]:
-    """Return the frames with contact corners, else childless frames of different bodies named like feet."""
+    """Return the frames with contact corners, else childless frames named like feet; none if the base is fixed."""
+    if not robot.floating_base:
+        return ()
     tree = robot.tree
     frames = zip(tree.frame_names, tree.frame_bodies, strict=True)
     return with_corners(tree.frame_names) or find_feet(frames, tree.body_parents)

@@ -24,13 +24,7 @@ def select_joints(robot: Robot, pattern: str) -> list[int]:
 
 
 def select_all(robot: Robot, patterns: Iterable[str] | None) -> list[int]:
-    """Return independent joints, in the order of v, that match any of the patterns; ``None``: all but the free joints.
-
-    Raises:
-        KeyError: a pattern matches no joint.
-        TypeError: one string instead of a sequence of them, or no sequence.
-        ValueError: an empty sequence.
-    """
+    """Return the independent joints that match any pattern, in the order of v; ``None``: all but the free joints."""
     if patterns is None:
         return [j for j in robot.tree.independent if robot.tree.joint_types[j] != FREE]
     if isinstance(patterns, str):
@@ -87,9 +81,7 @@ def dof_values(robot: Robot, given: Any, default: Float[ArrayLike, " nv"], what:
         values = on_host(to_jax(default, dtype))
         for pattern, value in given.items():
             for joint in select_joints(robot, pattern):
-                dof = robot.tree.dof_address[joint]
-                width = DOF_WIDTH[robot.tree.joint_types[joint]]
-                values = replaced_at(values, slice(dof, dof + width), as_array(value, f"{what}[{pattern!r}]", dtype))
+                values = replaced_at(values, robot.tree.dofs(joint), as_array(value, f"{what}[{pattern!r}]", dtype))
         return to_jax(values)
     values = as_array(given, what, dtype)
     if values.shape != (robot.nv,):

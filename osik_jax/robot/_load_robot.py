@@ -9,7 +9,7 @@ from typing import Any
 
 from .._errors import OsikKeyError, OsikTypeError
 from . import loading
-from ._home_configuration import Home
+from ._configuration import Home
 from ._robot import Robot
 from .loading import LoadOptions, LockedJoints, PositionLimits
 
@@ -39,12 +39,8 @@ def load_robot(
 
     Args:
         name: of the robot.
-        floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
-        velocity_limits: likewise.
-        position_limits: likewise.
-        locked_joints: likewise.
-        home: likewise.
-        root: likewise.
+        floating_base, velocity_limits, position_limits, locked_joints, home, root: as in ``Robot.from_mjcf`` and, for
+            URDFs, ``Robot.from_urdf``.
 
     Raises:
         KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No
@@ -82,11 +78,7 @@ def is_file(source: str) -> bool:
 def read_robot(source: str, **options: Any) -> Robot:
     """Return a robot by its name, or from a URDF or MJCF file, told apart by its content.
 
-    ``options`` are those of ``load_robot``.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ImportError, KeyError, ValueError: as in ``load_robot``, ``Robot.from_urdf`` and ``Robot.from_mjcf``.
+    ``options`` and errors are those of ``load_robot``; a file that does not exist raises FileNotFoundError.
     """
     if not is_file(source):
         return load_robot(source, **options)

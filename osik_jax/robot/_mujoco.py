@@ -39,10 +39,9 @@ def home_poses(robot: RobotModel) -> mujoco.MjData:
 
 def own_masses(robot: RobotModel) -> Float[np.ndarray, " bodies"]:
     """Return the mass [kg] of each body of ``mj_model``, 0 where it is fixed to the world or not the robot's."""
-    model = robot.mj_model
-    names = element_names(model, "body")
-    roots = {int(model.body_rootid[names.index(robot.tree.body_names[top])]) for top in robot.tree.tops}
-    own = np.isin(model.body_rootid, sorted(roots)) & (model.body_weldid != 0)
+    model, bodies = robot.mj_model, model_bodies(robot)
+    roots = [model.body_rootid[bodies[top]] for top in robot.tree.tops]
+    own = np.isin(model.body_rootid, roots) & (model.body_weldid != 0)
     return np.where(own, model.body_mass, 0.0)
 
 
@@ -61,11 +60,7 @@ def model_bodies(robot: RobotModel) -> list[int]:
 def mujoco_frame_pose(
     robot: RobotModel, data: mujoco.MjData, name: str
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Return position [m] and rotation of a frame from its body's pose, in data of the robot's model or of its world.
-
-    Raises:
-        KeyError: no such frame.
-    """
+    """Return position [m] and rotation of a frame by its body's pose, in data of the robot's model or of its world."""
     index = robot.tree.frame(name)
     body = element_names(robot.mj_model, "body").index(robot.tree.body_names[robot.tree.frame_bodies[index]])
     turn = data.xmat[body].reshape(3, 3)

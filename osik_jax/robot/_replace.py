@@ -14,7 +14,7 @@ from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ..numerics._arguments import as_array, check_bounds, check_finite, check_not_nan, check_not_negative, concrete
 from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
-from ._home_configuration import home_configuration
+from ._configuration import home_configuration
 from ._model import RobotModel
 from ._tree import DOF_WIDTH, QPOS_WIDTH, KinematicTree
 from .loading._followers import match_names
@@ -49,18 +49,24 @@ def _replaced(robot: RobotModel, field: str, value: Any) -> Array:
     old = getattr(robot, field)
     if not isinstance(value, Mapping):
         return to_jax(_checked(field, value, old.shape, old.dtype, field))
-    new, rows, given = on_host(old), _rows_of(robot.tree, field), {}
-    names = tuple(rows)
-    for pattern, row_value in value.items():
+    new, rows = on_host(old), _rows_of(robot.tree, field)
+    for pattern in value:
         _refuse_frame(robot.tree, field, pattern)
-        for number in match_names(field.split("_")[0].replace("dof", "joint"), pattern, names):
-            name = names[number]
-            if name in given:
-                raise OsikValueError(f"{field} gives {name!r} twice, by {given[name]!r} and by {pattern!r}")
-            given[name] = pattern
-            what = f"{field}[{pattern!r}]"
-            new = replaced_at(new, rows[name], _checked(field, row_value, old[rows[name]].shape, old.dtype, what))
+    for name, pattern in _matched(field.split("_")[0].replace("dof", "joint"), value, field, tuple(rows)).items():
+        row, what = rows[name], f"{field}[{pattern!r}]"
+        new = replaced_at(new, row, _checked(field, value[pattern], old[row].shape, old.dtype, what))
     return to_jax(new)
+
+
+def _matched(kind: str, given: Mapping[str, Any], what: str, names: tuple[str, ...]) -> dict[str, str]:
+    """Return each matched name with the pattern that matches it; raise ValueError if there are two."""
+    found: dict[str, str] = {}
+    for pattern in given:
+        for name in (names[number] for number in match_names(kind, pattern, names)):
+            if name in found:
+                raise OsikValueError(f"{what} gives {name!r} twice, by {found[name]!r} and by {pattern!r}")
+            found[name] = pattern
+    return found
 
 
 def _refuse_frame(tree: KinematicTree, field: str, name: Any) -> None:
@@ -151,15 +157,9 @@ def _factors(tree: KinematicTree, given: Factors, what: str, dtype: np.dtype) ->
     factors = jnp.ones(len(tree.body_names), dtype)
     if not isinstance(given, Mapping):
         return factors.at[1:].set(_factor(given, what, dtype))
-    seen: dict[int, str] = {}
-    for pattern, factor in given.items():
-        for body in (1 + k for k in match_names("body", pattern, tree.body_names[1:])):
-            if body in seen:
-                raise OsikValueError(
-                    f"{what} gives {tree.body_names[body]!r} twice, by {seen[body]!r} and by {pattern!r}"
-                )
-            seen[body] = pattern
-            factors = factors.at[body].set(_factor(factor, f"{what}[{pattern!r}]", dtype))
+    for name, pattern in _matched("body", given, what, tree.body_names[1:]).items():
+        factor = _factor(given[pattern], f"{what}[{pattern!r}]", dtype)
+        factors = factors.at[tree.body_names.index(name)].set(factor)
     return factors
 
 

@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Self
 
-import equinox as eqx
 import jax
 import mujoco
 from jaxtyping import Array, ArrayLike, DTypeLike, Num
@@ -15,9 +14,8 @@ from jaxtyping import Array, ArrayLike, DTypeLike, Num
 from .._whole_file import write_text
 from ..numerics._arguments import float_dtype
 from . import loading
-from ._configuration import check_configuration, with_joints
+from ._configuration import Home, check_configuration, home_configuration, with_joints
 from ._describe import described
-from ._home_configuration import Home, home_configuration
 from ._model import RobotModel
 from ._ranges import warn_of_far_joints
 from ._replace import Factors, replaced_leaves, scaled_leaves
@@ -149,8 +147,7 @@ class Robot(RobotModel):
                 one. ``False``: free joints are locked where the file has them.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
                 numeric ``velocity_limit/JOINT`` in the file is read too.
-            position_limits: as in ``from_urdf``.
-            locked_joints: as in ``from_urdf``.
+            position_limits, locked_joints: as in ``from_urdf``.
             home: what ``q0`` is, see ``with_home``: a keyframe's name or number, for instance. Default: the first
                 keyframe, or ``qpos0`` where there is none, brought inside the joints' ranges.
             root: name of a body of the robot in a scene with other things that move, or names of several. The tree that
@@ -194,15 +191,12 @@ class Robot(RobotModel):
             model: the model.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over custom numerics
                 ``velocity_limit/JOINT`` of the model.
-            position_limits: as in ``from_urdf``.
             locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
-            home: as in ``from_mjcf``.
-            root: as in ``from_mjcf``.
+            position_limits, home, root: as in ``from_mjcf``.
 
         Raises:
             TypeError: ``model`` is no ``mujoco.MjModel``.
-            ValueError: the model has no moving joint, or a range with lower > upper, or ``home`` does
-                not fit.
+            ValueError: the model has no moving joint, or a range with lower > upper, or ``home`` does not fit.
             KeyError: a name in a mapping or ``locked_joints`` does not exist, or ``home`` names no keyframe.
 
         Warns:
@@ -263,8 +257,7 @@ class Robot(RobotModel):
             OsikWarning: a joint is outside its range, as a measured one may be; its value is kept. A keyframe's joints
                 are brought to the ends of their ranges, as when the robot is loaded.
         """
-        q0 = home_configuration(self, home)
-        return eqx.tree_at(lambda robot: robot.q0, self, q0)
+        return dataclasses.replace(self, q0=home_configuration(self, home))
 
     def astype(self, dtype: DTypeLike) -> Self:
         """Return the robot in another precision, with every number cast.
@@ -302,8 +295,7 @@ class Robot(RobotModel):
             ValueError: a wrong shape; a name given twice; not finite, a negative mass, a lower limit above the upper
                 one, no rotation; a stack of robots.
         """
-        changed = replaced_leaves(self, values)
-        return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
+        return dataclasses.replace(self, **replaced_leaves(self, values))
 
     def scaled(self, *, length: Factors = 1.0, mass: Factors = 1.0) -> Robot:
         """Return the robot with longer or heavier links; limits, ``q0`` and ``mj_model`` are unchanged.
@@ -322,11 +314,10 @@ class Robot(RobotModel):
             KeyError: no such body; the message lists those that exist.
             ValueError: a body is given twice; a factor is not finite, or negative; a length's is 0.
         """
-        changed = scaled_leaves(self, length, mass)
-        return eqx.tree_at(lambda robot: [getattr(robot, name) for name in changed], self, list(changed.values()))
+        return dataclasses.replace(self, **scaled_leaves(self, length, mass))
 
     def to_mjcf(self, path: str | os.PathLike[str] | None = None) -> str:
-        """Return the robot as MJCF with its present numbers: scaled, edited, joints locked.
+        """Return the robot as MJCF with its present numbers; write it to the file ``path`` if one is given.
 
         Locked joints are gone, their bodies posed at the locked values. Links that are fixed to others are one body
         with them and stay as frames. Mimic joints are joint equality constraints, velocity limits custom numerics
@@ -337,12 +328,6 @@ class Robot(RobotModel):
         the masses of what is fixed to the world are left out; bodies that locked joints leave fixed to the world count
         as such when the file is read. ``Robot.from_mjcf`` of the text is the same robot in all else.
 
-        Args:
-            path: file to write the text to, if any.
-
-        Returns:
-            The text.
-
         Raises:
             ValueError: a stack of robots, or numbers that MJCF has no place for: a joint limited on one side alone,
                 limits that differ between the dofs of a free or ball joint, the frame of a body moved without it.
@@ -350,19 +335,13 @@ class Robot(RobotModel):
         return _written(loading.to_mjcf(self), path)
 
     def to_urdf(self, path: str | os.PathLike[str] | None = None) -> str:
-        """Return the robot as URDF with its present numbers: calibrated, scaled, edited, joints locked.
+        """Return the robot as URDF with its present numbers; write it to the file ``path`` if one is given.
 
         The root link is ``world``. Each body is a link, and each frame that is no body a link on a fixed joint.
         Locked joints are gone. ``joint_reference`` (zero offsets) goes into the joints' origins, so the joints of the
         file have the values of ``q``. A joint whose anchor is off its body's origin gets a link in between. Boxes,
         spheres and cylinders are kept, capsules become those. Left out are meshes, ``q0``, ``dof_armature``, closed
         loops and the robot's effort limits, written as 0. An infinite limit of a slide is written as 1e9.
-
-        Args:
-            path: file to write the text to, if any.
-
-        Returns:
-            The text.
 
         Raises:
             ValueError: a stack of robots, or a ball joint, which URDF does not have.
@@ -372,9 +351,7 @@ class Robot(RobotModel):
     def check_configuration(self, q: Num[ArrayLike, " nq"] | Sequence[float], name: str = "q") -> None:
         """Raise ValueError if q has the wrong length, or (outside jit) is not finite or has a zero quaternion.
 
-        Args:
-            q: what should be a configuration. (nq,)
-            name: what the message calls it.
+        The message calls it ``name``.
         """
         check_configuration(self, q, name)
 

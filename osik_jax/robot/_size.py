@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
+from ..numerics._host import is_traced, module_of
 from ._model import RobotModel
+from ._tree import KinematicTree
 
 
 def robot_size(robot: RobotModel) -> Float[Array, ""] | float:
@@ -20,26 +20,23 @@ def robot_size(robot: RobotModel) -> Float[Array, ""] | float:
     """
     tree = robot.tree
     names = ("body_position", "body_quaternion", "joint_position", "frame_position")
-    is_traced = any(isinstance(getattr(robot, name), Tracer) for name in names)
-    xp: Any = jnp if is_traced else np
-    position, quaternion, anchors, frames = (xp.asarray(getattr(robot, name)) for name in names)
+    leaves = [getattr(robot, name) for name in names]
+    xp: Any = jnp if is_traced(leaves) else np
+    position, quaternion, anchors, frames = map(xp.asarray, leaves)
     bodies = list(tree.joint_bodies)
     first = np.array([bodies.index(body) if body in bodies else -1 for body in range(len(tree.body_names))])
     anchor = xp.where((first >= 0)[:, None], anchors[np.maximum(first, 0)], 0.0) if bodies else 0.0 * position
     parents, carriers = np.array(tree.body_parents), np.array(tree.frame_bodies, int)
-    links = _length(xp, position + _rotated(xp, quaternion, anchor) - anchor[parents])
-    tips = _length(xp, frames - anchor[carriers])
-    size = _longest_way(tree.body_parents, tree.moves.any(1), tree.frame_bodies, links, tips, xp)
-    return size if is_traced else float(size)
+    links = _length(position + _rotated(xp, quaternion, anchor) - anchor[parents])
+    size = _longest_way(tree, links, _length(frames - anchor[carriers]), xp.maximum)
+    return float(size) if xp is np else size
 
 
-def _longest_way(
-    parents: Sequence[int], moves: Any, carriers: Sequence[int], links: Any, tips: Any, xp: Any
-) -> Float[Array, ""] | float:
+def _longest_way(tree: KinematicTree, links: Any, tips: Any, larger: Any) -> Any:
     """Return the longest way between two leaves of the tree, from the lengths of its links and tips."""
-    larger = xp.maximum
+    parents, moves = tree.body_parents, np.any(tree.moves, 1)
     below: list[Any] = [0.0] * len(parents)  # from a body's joint to the farthest point below it
-    for frame, body in enumerate(carriers):
+    for frame, body in enumerate(tree.frame_bodies):
         below[body] = larger(below[body], tips[frame])
     longest: Any = 0.0
     for body in range(len(parents) - 1, 0, -1):
@@ -58,7 +55,7 @@ def _rotated(xp: Any, quaternion: Any, vector: Any) -> Any:
     return vector + real * twice + xp.cross(axis, twice)
 
 
-def _length(xp: Any, vectors: Any) -> Any:
+def _length(vectors: Any) -> Any:
     """Return the lengths of vectors (n, 3); at 0 the derivative is 0."""
-    squared = (vectors**2).sum(-1)
+    xp, squared = module_of(vectors), (vectors**2).sum(-1)
     return xp.where(squared > 0.0, xp.sqrt(xp.where(squared > 0.0, squared, 1.0)), 0.0)

@@ -16,16 +16,9 @@ from jaxtyping import ArrayLike, Num
 
 from .._errors import OsikKeyError, OsikValueError, unknown_name
 from ._load_report import LoadReport
-from ._look import UnreadLook
 
 FREE, BALL, SLIDE, HINGE = (
-    int(t)
-    for t in (
-        mujoco.mjtJoint.mjJNT_FREE,
-        mujoco.mjtJoint.mjJNT_BALL,
-        mujoco.mjtJoint.mjJNT_SLIDE,
-        mujoco.mjtJoint.mjJNT_HINGE,
-    )
+    int(getattr(mujoco.mjtJoint, f"mjJNT_{kind}")) for kind in ("FREE", "BALL", "SLIDE", "HINGE")
 )
 QPOS_WIDTH = {FREE: 7, BALL: 4, SLIDE: 1, HINGE: 1}
 DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
@@ -35,6 +28,7 @@ DOF_WIDTH = {FREE: 6, BALL: 3, SLIDE: 1, HINGE: 1}
 class UnreadMesh:
     """Collision mesh of a URDF, whose file is read when distances to it are needed."""
 
+    name: str  # its own; empty where it has none
     link: str  # name of its link
     file: str  # its address, as the URDF has it
     scale: tuple[float, ...]  # of the file's numbers along x, y and z
@@ -57,8 +51,8 @@ class ModelHolder:
     report: LoadReport = dataclasses.field(default_factory=LoadReport)
     # collision meshes whose files are not read; they are the last of the tree's geoms
     meshes: tuple[UnreadMesh, ...] = dataclasses.field(default=(), repr=False)
-    # visual shapes of a URDF, read when they are drawn; None: those of the model
-    look: UnreadLook | None = dataclasses.field(default=None, repr=False)
+    # visual shapes of a URDF, an ``UnreadLook`` of ``loading``, read when they are drawn; None: those of the model
+    look: Any = dataclasses.field(default=None, repr=False)
     # URDF file, whose SRDF is looked for beside it; None: the robot was made from a text or an MJCF
     path: Path | None = dataclasses.field(default=None, repr=False)
 
@@ -111,39 +105,24 @@ class KinematicTree:
     """Names and topology of a robot. Two robots with equal trees can be stacked and vmapped over.
 
     Joints are all of the MuJoCo model's, in its order. A joint is *independent* (it owns entries of ``q`` and ``v``),
-    a *follower* (``q_follower = multiplier * q_leader + offset``) or *locked* (its value is a constant).
-
-    Attributes:
-        body_names: name of each moving body; body 0 is the world. Links without a joint are fused into the body they
-            are fixed to and stay as frames.
-        body_parents: index of each body's parent (0 for the world itself).
-        joint_names: name of each joint.
-        joint_types: MuJoCo's joint types.
-        joint_bodies: the body that each joint moves.
-        frame_names: every name that can be asked for: bodies, URDF links, sites, geoms.
-        frame_bodies: the body that each frame is fixed to.
-        geom_names: name of each of the MuJoCo model's geoms, in its order, then of the collision meshes that it does
-            not hold (``ModelHolder.meshes``).
-        geom_types: MuJoCo's geom types.
-        geom_bodies: the body that each geom is fixed to.
-        followers: ``(follower, leader, multiplier)`` by joint index, hinges and slides only.
-        locked: indices of locked joints.
-        robots: for each tree of the scene that may be the robot, its topmost bodies. Empty: all that moves is one
-            robot.
+    a *follower* (``q_follower = multiplier * q_leader + offset``) or *locked* (its value is a constant). Links without
+    a joint are fused into the body they are fixed to and stay as frames. Geoms are the MuJoCo model's, in its order,
+    then the collision meshes that it does not hold (``ModelHolder.meshes``).
     """
 
-    body_names: tuple[str, ...]
-    body_parents: tuple[int, ...]
+    body_names: tuple[str, ...]  # name of each moving body; body 0 is the world
+    body_parents: tuple[int, ...]  # index of each body's parent (0 for the world itself)
     joint_names: tuple[str, ...]
-    joint_types: tuple[int, ...]
-    joint_bodies: tuple[int, ...]
-    frame_names: tuple[str, ...]
-    frame_bodies: tuple[int, ...]
+    joint_types: tuple[int, ...]  # MuJoCo's joint types
+    joint_bodies: tuple[int, ...]  # the body that each joint moves
+    frame_names: tuple[str, ...]  # every name that can be asked for: bodies, URDF links, sites, geoms
+    frame_bodies: tuple[int, ...]  # the body that each frame is fixed to
     geom_names: tuple[str, ...] = ()
-    geom_types: tuple[int, ...] = ()
-    geom_bodies: tuple[int, ...] = ()
-    followers: tuple[tuple[int, int, float], ...] = ()
-    locked: tuple[int, ...] = ()
+    geom_types: tuple[int, ...] = ()  # MuJoCo's geom types
+    geom_bodies: tuple[int, ...] = ()  # the body that each geom is fixed to
+    followers: tuple[tuple[int, int, float], ...] = ()  # (follower, leader, multiplier), hinges and slides only
+    locked: tuple[int, ...] = ()  # locked joints
+    # topmost bodies of each tree of the scene that may be the robot; empty: all that moves is one robot
     robots: tuple[tuple[int, ...], ...] = ()
 
     def __hash__(self) -> int:
@@ -199,6 +178,11 @@ class KinematicTree:
     def _addresses(self, width: Mapping[int, int]) -> dict[int, int]:
         widths = [width[self.joint_types[j]] for j in self.independent]
         return dict(zip(self.independent, np.cumsum([0, *widths])[:-1].tolist(), strict=True))
+
+    def dofs(self, joint: int) -> slice:
+        """Return the entries of v of an independent joint."""
+        start = self.dof_address[joint]
+        return slice(start, start + DOF_WIDTH[self.joint_types[joint]])
 
     @cached_property
     def quaternions(self) -> tuple[int, ...]:
@@ -271,11 +255,7 @@ class KinematicTree:
 
     @cached_property
     def tops(self) -> tuple[int, ...]:
-        """Return topmost bodies of the robot.
-
-        Raises:
-            ValueError: several trees of the scene may be the robot.
-        """
+        """Return topmost bodies of the robot; raise ValueError if several trees of the scene may be the robot."""
         if len(self.robots) > 1:
             found = ", ".join(self.body_names[tops[0]] for tops in self.robots)
             raise OsikValueError(
@@ -287,20 +267,12 @@ class KinematicTree:
 
     @cached_property
     def root(self) -> int:
-        """Return the first body of the robot that moves, or the world where nothing moves.
-
-        Raises:
-            ValueError: as in ``tops``.
-        """
+        """Return the first body of the robot that moves, or the world where nothing moves; ValueError as ``tops``."""
         return self.tops[0] if self.tops else 0
 
     @cached_arrays
     def is_own(self) -> np.ndarray:
-        """Return which bodies belong to the robot and not to the scene. (nbody,), bool.
-
-        Raises:
-            ValueError: as in ``tops``.
-        """
+        """Return which bodies belong to the robot and not to the scene; ValueError as ``tops``. (nbody,), bool."""
         return np.asarray(self.descendants[list(self.tops)].any(0))
 
     @cached_property
@@ -337,33 +309,21 @@ class KinematicTree:
         return self.descendants[self.dof_body].T
 
     def frame(self, name: str) -> int:
-        """Return the index of a frame.
-
-        Raises:
-            KeyError: no such frame; the message lists those that exist.
-        """
+        """Return the index of a frame; raise KeyError with the existing frames if there is no such frame."""
         try:
             return self._frame_index[name]
         except (KeyError, TypeError):
             raise unknown_name("frame", name, self.frame_names) from None
 
     def joint(self, name: str) -> int:
-        """Return the index of a joint (independent, follower or locked).
-
-        Raises:
-            KeyError: no such joint; the message lists those that exist.
-        """
+        """Return the index of any joint; raise KeyError with the existing joints if there is no such joint."""
         try:
             return self._joint_index[name]
         except (KeyError, TypeError):
             raise unknown_name("joint", name, self.joint_names) from None
 
     def owner(self, name: str) -> int:
-        """Return the index of the independent joint whose entries of q and v move a joint: its leader, or itself.
-
-        Raises:
-            KeyError: no such joint, or it is locked.
-        """
+        """Return the independent joint that moves a joint: its leader, or itself; raise KeyError if it is locked."""
         joint = self.joint(name)
         if joint in self.locked:
             names = (self.joint_names[j] for j in self.independent if self.joint_types[j] != FREE)

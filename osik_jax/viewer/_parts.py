@@ -17,8 +17,8 @@ from .._errors import OsikValueError
 from ..collision import CollisionShape
 from ..collision._geometry import Kind
 from ..robot import Robot
-from ..robot._look import Look
 from ..robot._mujoco import home_poses, model_bodies
+from ..robot.loading._look import Look
 from ..robot.loading._poses import rotation_matrix
 
 _GEOM = mujoco.mjtGeom

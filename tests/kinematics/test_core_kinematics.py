@@ -146,9 +146,12 @@ def pose_tasks(robot: osik.Robot, **options) -> dict[str, osik.Task]:
     return tasks | {"relative": osik.RelativeFrameTask(robot, one, other, **given)}
 
 
-def with_squares(rows: Any) -> Any:
-    """Rows with the squared lengths, which a kernel returns with them."""
-    return {name: replace(one, squares=one.squared_lengths()) for name, one in rows.items()}
+def rows_by(backend, robot, q, tasks) -> Any:
+    """Rows of all tasks at once and of each alone, with the squared lengths that a kernel returns with them."""
+    kin = forward_kinematics(robot, q) if backend == "jax" else kinematics_by(backend, robot, q)
+    alone = {name: task.rows(robot, kin, q) for name, task in tasks.items()}
+    both = rows_of(robot, kin, q, tasks), alone
+    return [{name: replace(one, squares=one.squared_lengths()) for name, one in rows.items()} for rows in both]
 
 
 @pytest.mark.variants(ordinary=[], slow=["bounds"])
@@ -159,11 +162,9 @@ def test_rows_of_poses(robots, case):
     tasks = pose_tasks(robot, **OPTIONS[case])
 
     def rows(q, backend):
-        kin = forward_kinematics(robot, q) if backend == "jax" else kinematics_by(backend, robot, q)
-        found = rows_of(robot, kin, q, tasks)
+        found, alone = rows_by(backend, robot, q, tasks)
         assert all(task.is_equality == (case != "bounds") for task in found.values())
-        alone = {name: task.rows(robot, kin, q) for name, task in tasks.items()}
-        return with_squares(found), with_squares(alone)
+        return found, alone
 
     half = robot.q0.at[3:7].set(jnp.array([1e-9, 0.6, 0.0, 0.8]))
     q = jnp.concatenate([jnp.asarray(random_configurations(robot, 6, 4)), robot.q0[None], half[None]])
@@ -178,9 +179,7 @@ def test_derivatives_of_rows(robots):
     q = jnp.asarray(random_configurations(robot, 7, 1)[0])
 
     def total(q, tasks, backend):
-        kin = forward_kinematics(robot, q) if backend == "jax" else kinematics_by(backend, robot, q)
-        alone = {name: task.rows(robot, kin, q) for name, task in tasks.items()}
-        return sum(map(_total, jax.tree.leaves((with_squares(rows_of(robot, kin, q, tasks)), with_squares(alone)))))
+        return sum(map(_total, jax.tree.leaves(rows_by(backend, robot, q, tasks))))
 
     ours, theirs = (
         quick_jit(jax.grad(partial(total, backend=backend), argnums=(0, 1)))(q, tasks) for backend in ("core", "jax")

@@ -116,20 +116,24 @@ def test_quaternions_of_any_length_come_back_as_unit_quaternions(robot, integrat
     np.testing.assert_allclose(difference(long, other), difference(q, other), atol=1e-12, rtol=0)
 
 
+def central_differences(function, inputs: tuple[np.ndarray, ...], argument: int) -> np.ndarray:
+    """Return the derivative of a batched function by one of its arguments."""
+    step, size = 1e-6, len(inputs[argument])
+    moves = step * np.concatenate([np.eye(size), -np.eye(size)])
+    wide = [np.broadcast_to(x, (len(moves), len(x))) for x in inputs]
+    wide[argument] = wide[argument] + moves
+    moved = np.asarray(function(*wide))
+    return (moved[:size] - moved[size:]).T / (2 * step)
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, 1e-3, 1.0, np.pi - 1e-3])
 def test_derivative_of_integrate_equals_central_differences(robot, integrate, integrate_slopes, rng, angle):
     q = random_configurations(robot, rng, 1)[0]
     v = np.zeros(robot.nv)
     for part in ROTATIONS.values():
         v[part] = angle * np.array([0.48, -0.6, 0.64])
-    step = 1e-6
-    for argument, at in enumerate((q, v)):
-        moves = step * np.concatenate([np.eye(len(at)), -np.eye(len(at))])
-        rows = len(moves)
-        inputs = [np.broadcast_to(q, (rows, robot.nq)), np.broadcast_to(v, (rows, robot.nv))]
-        inputs[argument] = inputs[argument] + moves
-        moved = np.asarray(integrate(*inputs, np.ones(rows)))
-        numeric = (moved[: len(at)] - moved[len(at) :]).T / (2 * step)
+    for argument in range(2):
+        numeric = central_differences(lambda q, v: integrate(q, v, np.ones(len(q))), (q, v), argument)
         for actual in integrate_slopes(q, v):
             np.testing.assert_allclose(actual[argument], numeric, atol=1e-8, rtol=0)
 
@@ -141,12 +145,7 @@ def test_derivative_of_difference_equals_central_differences(
 ):
     qa = random_configurations(robot, rng, 1)[0]
     qb = turned(robot, turned(robot, qa, "root", angle), "shoulder", angle)
-    step = 1e-6
-    moves = step * np.concatenate([np.eye(robot.nq), -np.eye(robot.nq)])
-    inputs = [np.broadcast_to(x, moves.shape) for x in (qa, qb)]
-    inputs[argument] = inputs[argument] + moves
-    moved = np.asarray(difference(*inputs))
-    numeric = (moved[: robot.nq] - moved[robot.nq :]).T / (2 * step)
+    numeric = central_differences(difference, (qa, qb), argument)
     for actual in difference_slopes(qa, qb):
         np.testing.assert_allclose(actual[argument], numeric, atol=1e-7, rtol=1e-8)
 

@@ -33,11 +33,6 @@ PANDA_SPEED = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
 
 
 @pytest.fixture(scope="module")
-def arm7() -> osik.Robot:
-    return osik.load_robot("arm7")
-
-
-@pytest.fixture(scope="module")
 def nao_poses(nao):
     """Poses of all frames and the centre of mass, jitted."""
 

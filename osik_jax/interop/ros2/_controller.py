@@ -32,64 +32,37 @@ class Received(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Command: positions and velocities of joints.
+    """Command: positions and velocities of joints."""
 
-    Attributes:
-        names: ROS names. (n,)
-        positions: [rad or m]. (n,)
-        velocities: [rad/s or m/s]. (n,)
-    """
-
-    names: tuple[str, ...]
-    positions: np.ndarray
-    velocities: np.ndarray
+    names: tuple[str, ...]  # ROS names. (n,)
+    positions: np.ndarray  # [rad or m]. (n,)
+    velocities: np.ndarray  # [rad/s or m/s]. (n,)
 
 
 class Output(NamedTuple):
-    """Output of a period: a command once every joint was measured, and the state of the controller.
+    """Output of a period: a command, and the state of the controller."""
 
-    Attributes:
-        command: None until every joint was measured.
-        phase: whether it waits for the first states, moves, or holds because states stopped.
-        level: 0 OK, 1 WARN, 2 ERROR, as in a DiagnosticStatus.
-        message: one sentence.
-        values: what there is to know, by name.
-    """
-
-    command: Command | None
-    phase: Phase
-    level: int
-    message: str
-    values: dict[str, str]
+    command: Command | None  # None until every joint was measured
+    phase: Phase  # it waits for the first states, moves, or holds because states stopped
+    level: int  # 0 OK, 1 WARN, 2 ERROR, as in a DiagnosticStatus
+    message: str  # one sentence
+    values: dict[str, str]  # numbers and texts for diagnostics, by name
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """State passed from period to period.
+    """State passed from period to period."""
 
-    Attributes:
-        measured: position of each joint [rad or m], NaN until it is measured. (n,)
-        measured_ns: when that was received. (n,)
-        stamps_ns: last stamps, by joint (as arrays (n,)) under ``""``, and by frame.
-        targets: target of each frame, world axes.
-        unknown: names that no joint has, and when each came last [ns].
-        refused: number of refused messages, the time of the last one and the reason.
-        phase: see ``Output``.
-        q: the commanded configuration; None before the start. (nq,)
-        velocity: the last one. (nv,)
-        warm_start, tasks, poses: of ``Steps``.
-    """
-
-    measured: np.ndarray
-    measured_ns: np.ndarray
-    stamps_ns: Mapping[str, Any]
-    targets: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    unknown: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    refused: tuple[int, int, str] = (0, _NEVER, "")
+    measured: np.ndarray  # position of each joint [rad or m], NaN until it is measured. (n,)
+    measured_ns: np.ndarray  # when that was received. (n,)
+    stamps_ns: Mapping[str, Any]  # last stamps, by joint (an array (n,)) under "", and by frame
+    targets: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of each frame, world axes
+    unknown: Mapping[str, int] = dataclasses.field(default_factory=dict)  # names that no joint has; when last told [ns]
+    refused: tuple[int, int, str] = (0, _NEVER, "")  # number of refused messages; time and reason of the last one
     phase: Phase = "waiting"
-    q: Any = None
-    velocity: Any = None
-    warm_start: Any = None
+    q: Any = None  # the commanded configuration; None before the start. (nq,)
+    velocity: Any = None  # the last one. (nv,)
+    warm_start: Any = None  # this one, tasks and poses: see ``Steps``
     tasks: Any = None
     poses: Any = None
 
@@ -109,8 +82,9 @@ class Controller:
         settings: the settings.
 
     Raises:
-        FileNotFoundError, KeyError, TypeError, ValueError: see ``Steps`` and ``joint_names``; frames that share a
-            topic; joints of a Float64MultiArray that are not the robot's, each once.
+        FileNotFoundError, KeyError, TypeError, ValueError: the controller's file cannot be read, or something is given
+            that it has; a frame does not exist, or shares its topic with another; there is nothing to lead or to stand
+            on; a joint has no place in a JointState; joints of a Float64MultiArray are not the robot's, each once.
     """
 
     def __init__(self, robot: Robot | None, settings: Settings):

@@ -57,17 +57,13 @@ def _made(name: str) -> Any:
     """Return the class of a message type: a dataclass with zeros, empty text and empty lists as defaults."""
     package, _, short = name.partition("/")
     namespace: dict[str, Any] = {"__doc__": f"{name} of ROS 2.", "__annotations__": {}, "__module__": __name__}
-    for text, own in _fields(name):
+    for text, own in (part.split() for part in _DEFINITIONS[name].split(", ")):
         kind, empty = _PLAIN.get(text.removesuffix("[]")) or (_TYPES[text.removesuffix("[]")],) * 2
         listed = text.endswith("[]")
         namespace["__annotations__"][own] = idl.sequence[kind] if listed else kind
         namespace[own] = field(default_factory=list if listed else empty)
     options = {"typename": f"{package}::msg::dds_::{short}_"}
     return dataclass(final(types.new_class(short, (IdlStruct,), options, lambda body: body.update(namespace))))
-
-
-def _fields(name: str) -> list[tuple[str, str]]:
-    return [(text, own) for text, own in (part.split() for part in _DEFINITIONS[name].split(", "))]
 
 
 for _name in _DEFINITIONS:

@@ -74,12 +74,7 @@ def _qos(reliable: bool) -> Qos:
 
 
 class Node:
-    """Controller with its subscriptions and publishers.
-
-    Args:
-        controller: the controller.
-        endpoints: where it speaks.
-    """
+    """Controller with its subscriptions and publishers."""
 
     def __init__(self, controller: Controller, endpoints: Endpoints):
         self.controller = controller
@@ -128,17 +123,15 @@ class Node:
         """Return the received messages in order, grouped by reader."""
         received = []
         for kind, frame, reader in self._sources:
-            for message in self._taken(reader):
+            try:
+                messages = reader.take(N=20)
+            except Exception:  # bytes that are no such message: the others go on, and a robot without states is held
+                self.unread += 1
+                continue
+            for message in messages:
                 if type(message).__name__ != "InvalidSample":  # a publisher went away
                     received.append(Received(kind, frame, time.time_ns(), message))
         return received
-
-    def _taken(self, reader: DataReader) -> list[Any]:
-        try:
-            return reader.take(N=20)
-        except Exception:  # bytes that are no such message: the others go on, and a robot without states is held
-            self.unread += 1
-            return []
 
     def _write(self, writer: DataWriter, message: Any) -> None:
         try:

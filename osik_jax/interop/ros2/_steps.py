@@ -44,16 +44,7 @@ class Advance(NamedTuple):
 
 
 class Steps:
-    """Tasks, scheme and limits of a robot, and their compiled programs.
-
-    Args:
-        robot: the robot; None where the settings name a controller's file.
-        settings: the settings.
-
-    Raises:
-        FileNotFoundError, KeyError, TypeError, ValueError: the controller's file cannot be read, a frame does not
-            exist, there is nothing to lead or to stand on, or something is given that the controller's file has.
-    """
+    """Tasks, scheme and limits of a robot, and their compiled programs; for the arguments see ``Controller``."""
 
     def __init__(self, robot: Robot | None, settings: Settings):
         self.scheme: Scheme = WeightedQP()

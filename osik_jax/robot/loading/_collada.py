@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -95,10 +95,9 @@ class _Document:
     def _positions(self, group: _Element) -> Float[np.ndarray, "k 3"]:
         vertices = self._linked(_input(group, "VERTEX"), "source")
         source = self._linked(_input(vertices, "POSITION"), "source")
-        accessor, array = source.find("technique_common/accessor"), source.find("float_array")
+        accessor = source.find("technique_common/accessor")
         stride = 3 if accessor is None else int(accessor.get("stride", "3"))
-        numbers = _numbers(None if array is None else array.text)
-        return numbers.reshape(-1, stride)[:, :3]
+        return _numbers(source.findtext("float_array")).reshape(-1, stride)[:, :3]
 
     def _color(self, material: _Element | None) -> _Color | None:
         """Return the diffuse colour of a material; of a texture, the mean."""
@@ -150,20 +149,18 @@ def _faces(group: _Element) -> Int[np.ndarray, "m 3"]:
     stride = 1 + max(int(e.get("offset", "0")) for e in group.findall("input"))
     offset = int(_input(group, "VERTEX").get("offset", "0"))
     lists = [_numbers(p.text, int).reshape(-1, stride)[:, offset] for p in group.findall("p")]
-    if group.tag == "polygons":
-        return _fans(np.concatenate(lists) if lists else np.zeros(0, int), [len(corners) for corners in lists])
-    corners = lists[0] if lists else np.zeros(0, int)
+    corners = np.concatenate([np.zeros(0, int), *lists])
     if group.tag == "triangles":
         return corners.reshape(-1, 3)
+    if group.tag == "polygons":  # each in a <p> of its own
+        return _fans(corners, np.array([len(own) for own in lists], int))
     return _fans(corners, _numbers(group.findtext("vcount"), int))
 
 
-def _fans(corners: np.ndarray, counts: Sequence[int] | np.ndarray) -> Int[np.ndarray, "m 3"]:
+def _fans(corners: Int[np.ndarray, " k"], counts: Int[np.ndarray, " polygons"]) -> Int[np.ndarray, "m 3"]:
     """Return triangles about the first corner of each polygon."""
-    counts = np.asarray(counts, int)
-    first = np.concatenate([[0], np.cumsum(counts)[:-1]]) if len(counts) else np.zeros(0, int)
-    start = np.repeat(first, np.maximum(counts - 2, 0))
-    step = np.concatenate([np.arange(1, count - 1) for count in counts]) if len(counts) else np.zeros(0, int)
+    start = np.repeat(np.cumsum(counts) - counts, np.maximum(counts - 2, 0))
+    step = np.concatenate([np.zeros(0, int), *(np.arange(1, count - 1) for count in counts)])
     return np.stack([corners[start], corners[start + step], corners[start + step + 1]], -1)
 
 

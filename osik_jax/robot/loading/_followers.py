@@ -50,11 +50,6 @@ def number(value: Any, what: str) -> float:
         raise OsikTypeError(f"{what} is {value!r}; it is a number") from None
 
 
-def match_joints(pattern: str, names: tuple[str, ...]) -> list[int]:
-    """Return the joints named ``pattern``, else those that match it as a glob; raise KeyError if there are none."""
-    return match_names("joint", pattern, names)
-
-
 def match_names(kind: str, pattern: str, names: tuple[str, ...]) -> list[int]:
     """Return the places of a name, else of those that match it as a glob; raise KeyError if there are none."""
     if pattern in names:
@@ -76,7 +71,7 @@ def asked_locks(model: mujoco.MjModel, names: tuple[str, ...], asked: Mapping[st
     """Return the requested value of each locked joint, by joint index; the default is its value in qpos0."""
     out: dict[int, Lock] = {}
     for pattern, value in asked.items():
-        for joint in match_joints(pattern, names):
+        for joint in match_names("joint", pattern, names):
             start, kind = model.jnt_qposadr[joint], int(model.jnt_type[joint])
             if value is None:
                 out[joint] = Lock(model.qpos0[start : start + QPOS_WIDTH[kind]].copy(), given=False)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
-from .._look import LinkShape, Look
 from ._collada import Triangles
 from ._meshes import read_mesh
 from ._packages import Packages
@@ -25,17 +27,26 @@ _NEAR = 3
 _Y_TO_Z = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
-def read_look(urdf: Urdf, packages: Packages, beside: Path | None) -> Look:
-    """Return the visual shapes of a URDF with their meshes (DAE, STL, OBJ, MSH).
+@dataclasses.dataclass(frozen=True)
+class LinkShape:
+    """A shape of a link, in the link's frame."""
 
-    Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
-    both ways that one is taken that puts the meshes nearer to the joints of their links.
+    link: str  # name of the link
+    kind: mujoco.mjtGeom  # MuJoCo's geom type
+    size: Float[np.ndarray, "3"]  # MuJoCo's geom sizes [m]
+    # centre of a simple shape [m]; 0 for a mesh, whose vertices are in the link's frame
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]  # rotation of a simple shape in the link's frame
+    color: tuple[float, ...] | None  # red, green, blue, alpha, 0 to 1; ``None``: the URDF gives none
+    mesh: tuple[np.ndarray, np.ndarray] | None = None  # vertices (k, 3) [m] and triangles (m, 3) of a mesh
 
-    Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
-    shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
-    whatever the package is called there. ``beside`` is the path of the URDF; None if it was given as text.
-    """
-    return _Reader(urdf, packages, beside).look()
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """Visual shapes of a robot's links."""
+
+    shapes: tuple[LinkShape, ...]
+    missing: tuple[str, ...]  # addresses of mesh files that were not found or could not be read
 
 
 def geom_size(shape: Shape) -> list[float]:
@@ -46,20 +57,30 @@ def geom_size(shape: Shape) -> list[float]:
     return [radius, *(value / 2.0 for value in length), 0.0, 0.0][:3]
 
 
-class _Reader:
-    """Reader that reads each mesh file once."""
+class UnreadLook:
+    """Visual shapes of a URDF and their meshes (DAE, STL, OBJ, MSH), whose files are read at most once, when asked for.
+
+    Some programs turn COLLADA files whose ``up_axis`` is y, others (RViz) do not, and URDFs are made for either. Of
+    both ways that one is taken that puts the meshes nearer to the joints of their links.
+
+    Of a link whose visual meshes cannot be read, and of all links where the URDF has no visual shape, the collision
+    shapes are taken. Last of all, the rest of a ``package://`` address is looked for in the folders above the file,
+    whatever the package is called there. ``beside`` is the path of the URDF; None if it was given as text.
+    """
 
     def __init__(self, urdf: Urdf, packages: Packages, beside: Path | None) -> None:
         self._urdf, self._packages, self._beside = urdf, packages, beside
-        self._read: dict[str, list[Triangles]] = {}
+        self._parts: dict[str, list[Triangles]] = {}
         self._turned = False
 
-    def look(self) -> Look:
+    @cached_property
+    def read(self) -> Look:
+        """Return the shapes."""
         visible = any(shape.visual for link in self._urdf.links.values() for shape in link.shapes)
         shapes = self._shapes(visual=visible, turned=False)
-        if any(part.y_up for parts in self._read.values() for part in parts):
+        if any(part.y_up for parts in self._parts.values() for part in parts):
             shapes = min(shapes, self._shapes(visual=visible, turned=True), key=self._from_joints)
-        return Look(shapes, tuple(address for address, parts in self._read.items() if not parts))
+        return Look(shapes, tuple(address for address, parts in self._parts.items() if not parts))
 
     def _shapes(self, *, visual: bool, turned: bool) -> tuple[LinkShape, ...]:
         self._turned = turned
@@ -108,12 +129,12 @@ class _Reader:
 
     def _triangles(self, shape: Shape) -> list[Triangles]:
         """Return the triangles of a mesh file; empty if the file cannot be read."""
-        if shape.file not in self._read:
+        if shape.file not in self._parts:
             try:
-                self._read[shape.file] = read_mesh(self._path(shape.file))
+                self._parts[shape.file] = read_mesh(self._path(shape.file))
             except (OSError, ValueError):
-                self._read[shape.file] = []
-        return self._read[shape.file]
+                self._parts[shape.file] = []
+        return self._parts[shape.file]
 
     def _path(self, address: str) -> Path:
         try:

@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from ..._errors import OsikTypeError, OsikValueError, warn
 from ...numerics._host import to_jax
 from .._load_report import LoadNote, LoadReport
-from .._look import UnreadLook
 from .._model import RobotModel
 from .._ranges import first_of, inside, warn_of_fast_joints
 from .._tree import BALL, FREE, HINGE, SLIDE, KinematicTree, ModelHolder, UnreadMesh
@@ -23,13 +22,13 @@ from ._followers import (
     asked_locks,
     equality_followers,
     free_name,
-    match_joints,
+    match_names,
     number,
     qpos_offset,
     resolve_followers,
 )
-from ._keyframes import home_notes, keyframe_names
-from ._notes import model_notes
+from ._look import UnreadLook
+from ._notes import home_notes, keyframe_names, model_notes
 from ._options import LoadOptions, PositionLimits
 from ._poses import IDENTITY, Pose, quaternion, rotation_matrix
 from ._robots import robot_trees
@@ -72,33 +71,21 @@ class Placement(NamedTuple):
         return Placement(self.body, self.pose @ pose)
 
 
-class NamedMesh(NamedTuple):
-    """A collision mesh that the model does not hold, and its name; empty where it has none."""
-
-    name: str
-    mesh: UnreadMesh
-
-
 def from_mjmodel(
     model: mujoco.MjModel,
     options: LoadOptions,
     *,
     fixed: Iterable[str] = (),
     notes: Iterable[LoadNote] = (),
-    meshes: Sequence[NamedMesh] = (),
+    meshes: Sequence[UnreadMesh] = (),
     look: UnreadLook | None = None,
     path: Path | None = None,
 ) -> RobotModel:
     """Return names and numbers of a robot from a MuJoCo model; see ``Robot.from_mjmodel``.
 
-    Args:
-        model: the model, with the floating base that it is to have.
-        options: of which limits and locked joints are honoured here.
-        fixed: names of free joints that are locked where the model has them, unless ``options`` lock them too.
-        notes: what the file that the model was made from asks for and the model does not have.
-        meshes: collision meshes that the model does not hold; they become the last of the robot's geoms.
-        look: visual shapes of a URDF.
-        path: of a URDF file.
+    The model has its floating base already. ``fixed`` names free joints that are locked where the model has them,
+    unless ``options`` lock them too. ``notes`` are on elements of the file that the model lacks. ``meshes``, which the
+    model does not hold, become the last of the robot's geoms. ``look`` and ``path`` are those of a URDF.
     """
     if not isinstance(model, mujoco.MjModel):
         raise OsikTypeError(f"model is {model!r}; it is a mujoco.MjModel: for files there are from_mjcf and from_urdf")
@@ -109,9 +96,10 @@ def from_mjmodel(
     followers, locked = resolve_followers(names, *equality_followers(model), asked)
     bodies, placement = _moving_bodies(model)
     frames = _frames(model, body_names, placement)
-    mesh_poses = [Pose(np.array(mesh.position), np.array(mesh.rotation)) for _, mesh in meshes]
-    carriers = [placement[body_names.index(mesh.link)] for _, mesh in meshes]
-    mesh_places = [on.carrying(pose) for on, pose in zip(carriers, mesh_poses, strict=True)]
+    mesh_places = [
+        placement[body_names.index(mesh.link)].carrying(Pose(np.array(mesh.position), np.array(mesh.rotation)))
+        for mesh in meshes
+    ]
     tree = KinematicTree(
         body_names=tuple(body_names[b] for b in bodies),
         body_parents=tuple(placement[model.body_parentid[b]].body for b in bodies),
@@ -159,7 +147,7 @@ def from_mjmodel(
         acceleration_limit=_rate_limits(tree, followers, accelerations),
         q0=inside(tree, home, lower, upper),
     )
-    holder = ModelHolder(model, report, tuple(named.mesh for named in meshes), look, path)
+    holder = ModelHolder(model, report, tuple(meshes), look, path)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
 
 
@@ -266,15 +254,15 @@ def _body_arrays(model: mujoco.MjModel, bodies: list[int], placement: list[Place
     )
 
 
-def _geom_names(model: mujoco.MjModel, body_names: Sequence[str], meshes: Sequence[NamedMesh]) -> tuple[str, ...]:
+def _geom_names(model: mujoco.MjModel, body_names: Sequence[str], meshes: Sequence[UnreadMesh]) -> tuple[str, ...]:
     """Return the names of the geoms, then of the collision meshes that the model does not hold.
 
     One without a name is called by its link and its number among the link's shapes, of which those that collide come
     first: ``forearm_link:0``.
     """
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, g) for g in range(model.ngeom)]
-    given += [placed.name for placed in meshes]
-    links = [*(body_names[b] for b in model.geom_bodyid), *(placed.mesh.link for placed in meshes)]
+    given += [mesh.name for mesh in meshes]
+    links = [*(body_names[b] for b in model.geom_bodyid), *(mesh.link for mesh in meshes)]
     collides = [*((model.geom_contype | model.geom_conaffinity) != 0), *[True] * len(meshes)]
     order = sorted(range(len(links)), key=lambda k: not collides[k])
     numbers = [[links[m] for m in order[: order.index(k)]].count(link) for k, link in enumerate(links)]
@@ -312,7 +300,7 @@ def _rates(
     if not isinstance(given, Mapping):
         raise OsikTypeError(f"{what}_limits is {given!r}; it maps joint names or globs to numbers")
     for pattern, value in (*own.items(), *given.items()):
-        for joint in match_joints(pattern, names):
+        for joint in match_names("joint", pattern, names):
             limit = number(value, f"the {what} limit of joint {names[joint]!r}")
             if not limit > 0.0:
                 raise OsikValueError(f"the {what} limit of joint {names[joint]!r} is {value}; it has to be positive")
@@ -333,7 +321,7 @@ def _ranges(model: mujoco.MjModel, names: tuple[str, ...], given: PositionLimits
         low[joint], high[joint] = _ball_range((0.0, model.jnt_range[joint].max()), names[joint])
     for pattern, limits in given.items():
         lower, upper = _range(limits, pattern)
-        found = [joint for joint in match_joints(pattern, names) if model.jnt_type[joint] != FREE]
+        found = [joint for joint in match_names("joint", pattern, names) if model.jnt_type[joint] != FREE]
         if not found and pattern in names:
             raise OsikValueError(f"joint {pattern!r} is free; only hinges, slides and balls have a range")
         scalar = [joint for joint in found if not ball[joint]]
@@ -395,7 +383,7 @@ def _over_dofs(tree: KinematicTree, values: np.ndarray) -> np.ndarray:
 
 def _warn_of_frozen(tree: KinematicTree, lower: np.ndarray, upper: np.ndarray, given: PositionLimits) -> None:
     """Name the joints whose range is one value, but for those whose range the user gave."""
-    stated = {joint for pattern in given for joint in match_joints(pattern, tree.joint_names)}
+    stated = {joint for pattern in given for joint in match_names("joint", pattern, tree.joint_names)}
     frozen = [j for j, dof in tree.dof_address.items() if upper[dof] - lower[dof] <= _ONE_VALUE and j not in stated]
     if frozen:
         names = [tree.joint_names[j] for j in frozen]

@@ -40,12 +40,7 @@ _NEAREST = 8
 
 
 def example_urdf(name: str) -> Path:
-    """Return the URDF of one of ``EXAMPLES``, in the package example-robot-data.
-
-    Raises:
-        KeyError: no such robot.
-        FileNotFoundError: example-robot-data is not installed.
-    """
+    """Return the URDF of one of ``EXAMPLES``; raise FileNotFoundError if example-robot-data is not installed."""
     if name not in EXAMPLES:
         raise unknown_name("robot", name, tuple(EXAMPLES))
     for folder in sys.path:
@@ -62,13 +57,11 @@ def example_urdf(name: str) -> Path:
 def named(name: str, options: LoadOptions) -> RobotModel:
     """Return names and numbers of a robot by its name.
 
-    Raises:
-        FileNotFoundError: the robot is one of ``EXAMPLES``, and neither example-robot-data nor robot_descriptions is
-            installed.
-        ImportError, KeyError, ValueError: as ``described``.
+    One of ``EXAMPLES`` raises FileNotFoundError if neither example-robot-data nor robot_descriptions is installed.
     """
     if name in ROBOTS:
-        return embedded(name, options)
+        model = resources.files("osik_jax") / "robot" / "models" / f"{name}.xml"
+        return from_mjcf(model.read_text(encoding="utf-8"), options)
     if name not in EXAMPLES:
         return described(name, options)
     try:
@@ -82,12 +75,6 @@ def named(name: str, options: LoadOptions) -> RobotModel:
             return described(ELSEWHERE[name], options)
         except ImportError:
             raise missing from None
-
-
-def embedded(name: str, options: LoadOptions) -> RobotModel:
-    """Return names and numbers of an embedded robot, one of ``ROBOTS``."""
-    text = (resources.files("osik_jax") / "robot" / "models" / f"{name}.xml").read_text(encoding="utf-8")
-    return from_mjcf(text, options)
 
 
 def described(name: str, options: LoadOptions) -> RobotModel:

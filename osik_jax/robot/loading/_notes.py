@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 
 from .._load_report import LoadNote
+from .._ranges import joints_outside
+from .._tree import KinematicTree
 from ._urdf_elements import SCALAR, Joint
 
 
@@ -20,6 +22,23 @@ def model_notes(model: mujoco.MjModel, joints: tuple[str, ...]) -> Iterator[Load
     """Yield notes on a model, given the names of its joints."""
     yield from _equality_notes(model)
     yield from _tendon_notes(model, joints)
+
+
+_KEY_ROUNDING = 1e-3
+"""Distance by which a keyframe's joint may be outside its range [rad or m]: files are rounded."""
+
+
+def home_notes(
+    tree: KinematicTree, key: str, q: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> Iterator[LoadNote]:
+    """Yield notes on the joints that a keyframe has outside their range."""
+    for text in joints_outside(tree, q, lower, upper, _KEY_ROUNDING).values():
+        yield LoadNote("keyframe", key, f"{text}: in q0 it is at the end of that")
+
+
+def keyframe_names(model: mujoco.MjModel) -> list[str]:
+    """Return the names of the keyframes; one without a name is called by its number."""
+    return [_name(model, mujoco.mjtObj.mjOBJ_KEY, k) for k in range(model.nkey)]
 
 
 def _name(model: mujoco.MjModel, kind: mujoco.mjtObj, index: int) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from ..._errors import OsikValueError
 from ._source import check_root, parse_xml, read_source
+from ._urdf_elements import finite_numbers
 
 
 class Srdf(NamedTuple):
@@ -109,17 +110,10 @@ def _states(root: ElementTree.Element) -> dict[str, dict[str, float]]:
     for element in root.findall("group_state"):
         state = states.setdefault(_attribute(element, "name"), {})
         for joint in element.findall("joint"):
-            values = _attribute(joint, "value").split()
-            if len(values) == 1:
-                state[_attribute(joint, "name")] = _number(values[0], joint)
+            name, value = _attribute(joint, "name"), _attribute(joint, "value")
+            if len(value.split()) == 1:
+                state[name] = float(finite_numbers(value, 1, f"joint {name!r}, value")[0])
     return states
-
-
-def _number(text: str, joint: ElementTree.Element) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise OsikValueError(f"joint {joint.get('name')!r} has the value {text!r}, which is not a number") from None
 
 
 def _attribute(element: ElementTree.Element, name: str) -> str:

@@ -6,7 +6,6 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 
 import mujoco
@@ -15,19 +14,11 @@ import numpy as np
 from ..._errors import OsikValueError, warn
 from .._guesses import find_feet
 from .._load_report import LoadNote
-from .._look import UnreadLook
 from .._model import RobotModel
 from .._tree import UnreadMesh
 from ._followers import free_name
-from ._look import GEOMS, geom_size, read_look
-from ._mjmodel import (
-    ACCELERATION_LIMIT_PREFIX,
-    INERTIA,
-    LEAST_INERTIA,
-    VELOCITY_LIMIT_PREFIX,
-    NamedMesh,
-    from_mjmodel,
-)
+from ._look import GEOMS, UnreadLook, geom_size
+from ._mjmodel import ACCELERATION_LIMIT_PREFIX, INERTIA, LEAST_INERTIA, VELOCITY_LIMIT_PREFIX, from_mjmodel
 from ._notes import urdf_notes
 from ._options import LoadOptions
 from ._packages import Packages, is_uri
@@ -66,7 +57,7 @@ def from_urdf(urdf: str | os.PathLike[str], options: LoadOptions) -> RobotModel:
     }
     options = options._replace(position_limits={**one_sided, **(options.position_limits or {})})
     fixed = floating if options.floating_base is False else ()
-    look = UnreadLook(partial(read_look, description, packages, source.path))
+    look = UnreadLook(description, packages, source.path)
     unread = tuple(unread_meshes(description, packages, source.path))
     return from_mjmodel(model, options, fixed=fixed, notes=notes, meshes=unread, look=look, path=source.path)
 
@@ -165,7 +156,9 @@ def urdf_spec(urdf: Urdf) -> mujoco.MjSpec:
         bodies[joint.child] = _add_body(parent, pose, urdf.links[joint.child], moving=joint.kind != "fixed")
         _add_joint(spec, bodies[joint.child], joint)
     for joint in urdf.joints:
-        _add_mimic(spec, joint)
+        if joint.mimic is not None:
+            equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name, name2=joint.mimic.leader)
+            equality.data[:5] = joint.mimic.offset, joint.mimic.multiplier, 0.0, 0.0, 0.0
     return spec
 
 
@@ -215,14 +208,13 @@ def _add_shapes(body: mujoco.MjsBody, link: Link) -> None:
         )
 
 
-def unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Iterator[NamedMesh]:
+def unread_meshes(urdf: Urdf, packages: Packages, beside: Path | None) -> Iterator[UnreadMesh]:
     """Yield the collision shapes that are meshes, without a look at their files."""
     urdf_path, folders = None if beside is None else str(beside.absolute()), tuple(map(str, packages.folders))
     for link in urdf.links.values():
         for shape in (shape for shape in link.shapes if shape.kind == "mesh" and not shape.visual):
             position, rotation = tuple(shape.pose.position.tolist()), tuple(map(tuple, shape.pose.rotation.tolist()))
-            mesh = UnreadMesh(link.name, shape.file, shape.size, position, rotation, urdf_path, folders)
-            yield NamedMesh(shape.name, mesh)
+            yield UnreadMesh(shape.name, link.name, shape.file, shape.size, position, rotation, urdf_path, folders)
 
 
 def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
@@ -245,10 +237,3 @@ def _add_joint(spec: mujoco.MjSpec, body: mujoco.MjsBody, joint: Joint) -> None:
         for prefix, rate in rates.items():
             if math.isfinite(rate):
                 spec.add_numeric(name=prefix + joint.name, data=[rate], size=1)
-
-
-def _add_mimic(spec: mujoco.MjSpec, joint: Joint) -> None:
-    if joint.mimic is not None:
-        equality = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint.name, name2=joint.mimic.leader)
-        equality.data[:2] = joint.mimic.offset, joint.mimic.multiplier
-        equality.data[2:5] = 0.0

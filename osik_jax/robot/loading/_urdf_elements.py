@@ -90,31 +90,14 @@ def read_urdf(element: ElementTree.Element) -> Urdf:
     _refuse_xacro(element)
     notes: list[LoadNote] = []
     colors = {m.get("name", ""): color for m in element.findall("material") if (color := _rgba(m))}
-    links = _by_name("link", (_link(e, colors, notes) for e in element.findall("link")))
+    taken: set[str] = set()  # names of collision shapes
+    links = _by_name("link", (_link(e, colors, taken, notes) for e in element.findall("link")))
     if not links:
         raise OsikValueError("the URDF has no <link>")
     joints = _by_name("joint", (_joint(e) for e in element.findall("joint")))
     root = _root(links, joints)
     _check_mimics(joints)
-    named = _with_unique_shape_names(links)
-    return Urdf(element.get("name", ""), named, tuple(_parents_first(root, links, joints)), root, tuple(notes))
-
-
-def _with_unique_shape_names(links: Mapping[str, Link]) -> dict[str, Link]:
-    """Return the links with each collision shape's name used once: a name that is taken gets its link's before it."""
-    taken: set[str] = set()
-
-    def unique(shape: Shape, link: str) -> Shape:
-        if shape.visual or not shape.name:
-            return shape
-        name = shape.name if shape.name not in taken else free_name(f"{link}/{shape.name}", taken)
-        taken.add(name)
-        return dataclasses.replace(shape, name=name)
-
-    return {
-        name: dataclasses.replace(link, shapes=tuple(unique(shape, name) for shape in link.shapes))
-        for name, link in links.items()
-    }
+    return Urdf(element.get("name", ""), links, tuple(_parents_first(root, links, joints)), root, tuple(notes))
 
 
 def _refuse_xacro(element: ElementTree.Element) -> None:
@@ -143,7 +126,8 @@ def _attribute(element: ElementTree.Element | None, name: str, where: str) -> st
     return value
 
 
-def _numbers(text: str, count: int, where: str) -> np.ndarray:
+def finite_numbers(text: str, count: int, where: str) -> np.ndarray:
+    """Return the finite numbers in a text; raise ValueError unless there are ``count`` of them."""
     values = _floats(text)
     if len(values) != count or not np.isfinite(values).all():
         raise OsikValueError(
@@ -167,7 +151,7 @@ def _text(element: ElementTree.Element, name: str, default: str) -> str:
 
 def _number(element: ElementTree.Element, name: str, where: str, default: str | None = None) -> float:
     text = _attribute(element, name, where) if default is None else _text(element, name, default)
-    return float(_numbers(text, 1, f"{where}, {name}")[0])
+    return float(finite_numbers(text, 1, f"{where}, {name}")[0])
 
 
 def _bound(element: ElementTree.Element, name: str, where: str) -> float:
@@ -183,19 +167,19 @@ def _origin(element: ElementTree.Element, where: str) -> Pose:
     origin = element.find("origin")
     if origin is None:
         return IDENTITY
-    position = _numbers(_text(origin, "xyz", "0 0 0"), 3, f"{where}, origin xyz")
+    position = finite_numbers(_text(origin, "xyz", "0 0 0"), 3, f"{where}, origin xyz")
     if "quat_xyzw" in origin.attrib:
-        quaternion = _numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
+        quaternion = finite_numbers(origin.attrib["quat_xyzw"], 4, f"{where}, origin quat_xyzw")
         if not quaternion.any():
             raise OsikValueError(f"{where}: the quaternion is zero")
         return Pose(position, rotation_matrix(np.roll(quaternion / np.linalg.norm(quaternion), 1)))
-    angles = _numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")
+    angles = finite_numbers(_text(origin, "rpy", "0 0 0"), 3, f"{where}, origin rpy")
     turn = np.zeros(4)
     mujoco.mju_euler2Quat(turn, angles, "XYZ")  # about fixed axes
     return Pose(position, rotation_matrix(turn))
 
 
-def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: list[LoadNote]) -> Link:
+def _link(element: ElementTree.Element, colors: Mapping[str, _Color], taken: set[str], notes: list[LoadNote]) -> Link:
     """Return a link.
 
     Shapes that are broken are left out: no kinematics needs them, and those for collisions are noted.
@@ -205,7 +189,7 @@ def _link(element: ElementTree.Element, colors: Mapping[str, _Color], notes: lis
     shapes = []
     for shape in (e for e in element if e.tag in ("visual", "collision")):
         try:
-            shapes.append(_shape(shape, colors, where))
+            shapes.append(_shape(shape, colors, name, taken))
         except OsikValueError as error:
             if shape.tag == "collision":
                 notes.append(LoadNote("collision", name, f"the shape is left out: {error}"))
@@ -241,12 +225,12 @@ def _rgba(material: ElementTree.Element | None) -> _Color | None:
     return (*values[:3].tolist(), values[3] if len(values) == 4 else 1.0)
 
 
-def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: str) -> Shape | None:
-    """Return a shape; None for one without size."""
+def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], link: str, taken: set[str]) -> Shape | None:
+    """Return a shape, None for one without size; a collision shape whose name is taken gets the link's before it."""
     shapes = [e for e in element.findall("geometry/*") if e.tag in ("box", "sphere", "cylinder", "capsule", "mesh")]
     if not shapes:
         return None
-    (shape, *_), where = shapes, f"{where}, {element.tag}"
+    (shape, *_), where = shapes, f"link {link!r}, {element.tag}"
     size, file = _size(shape, where), ""
     if shape.tag == "mesh":
         file = _attribute(shape, "filename", f"{where}, mesh")
@@ -254,19 +238,21 @@ def _shape(element: ElementTree.Element, colors: Mapping[str, _Color], where: st
         return None
     material = element.find("material")
     color = _rgba(material) or (None if material is None else colors.get(material.get("name", "")))
-    return Shape(
-        shape.tag, size, _origin(element, where), color, element.tag == "visual", file, element.get("name", "")
-    )
+    pose, visual, name = _origin(element, where), element.tag == "visual", element.get("name", "")
+    if name and not visual:
+        name = name if name not in taken else free_name(f"{link}/{name}", taken)
+        taken.add(name)
+    return Shape(shape.tag, size, pose, color, visual, file, name)
 
 
 def _size(shape: ElementTree.Element, where: str) -> tuple[float, ...]:
     if shape.tag == "mesh":
         scale = _text(shape, "scale", "1 1 1")
         return tuple(
-            _numbers(scale if len(scale.split()) > 1 else f"{scale} {scale} {scale}", 3, f"{where}, mesh scale")
+            finite_numbers(scale if len(scale.split()) > 1 else f"{scale} {scale} {scale}", 3, f"{where}, mesh scale")
         )
     if shape.tag == "box":
-        return tuple(_numbers(_attribute(shape, "size", where), 3, f"{where}, box size"))
+        return tuple(finite_numbers(_attribute(shape, "size", where), 3, f"{where}, box size"))
     lengths = ("radius",) if shape.tag == "sphere" else ("radius", "length")
     return tuple(_number(shape, name, f"{where}, {shape.tag}") for name in lengths)
 
@@ -280,7 +266,6 @@ def _joint(element: ElementTree.Element) -> Joint:
         raise OsikValueError(
             f"{where} has the type {kind!r}, which is not supported{advice}. Types: {', '.join(JOINT_KINDS)}"
         )
-    lower, upper, speed, acceleration = _joint_limits(element.find("limit"), kind, where)
     return Joint(
         name=name,
         kind=kind,
@@ -288,43 +273,41 @@ def _joint(element: ElementTree.Element) -> Joint:
         child=_attribute(element.find("child"), "link", f"{where}, child"),
         origin=_origin(element, where),
         axis=_axis(element.find("axis"), where) if kind in SCALAR else np.array([1.0, 0.0, 0.0]),
-        lower=lower,
-        upper=upper,
-        speed=speed,
-        acceleration=acceleration,
         mimic=_mimic(element.find("mimic"), where) if kind in SCALAR else None,
+        **_joint_limits(element.find("limit"), kind, where),
     )
 
 
 def _axis(element: ElementTree.Element | None, where: str) -> np.ndarray:
-    axis = (
-        np.array([1.0, 0.0, 0.0]) if element is None else _numbers(_text(element, "xyz", "1 0 0"), 3, f"{where}, axis")
-    )
+    axis = np.array([1.0, 0.0, 0.0])
+    if element is not None:
+        axis = finite_numbers(_text(element, "xyz", "1 0 0"), 3, f"{where}, axis")
     length = np.linalg.norm(axis)
     if length == 0.0:
         raise OsikValueError(f"{where}: the axis is zero")
     return axis / length
 
 
-def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float, float, float]:
-    """Return ``(lower, upper, speed, acceleration)``; without ``<limit>`` no limit, and a speed of 0 counts as unknown.
+def _joint_limits(element: ElementTree.Element | None, kind: str, where: str) -> dict[str, float]:
+    """Return the limits of a ``Joint`` by field; a speed of 0 counts as unknown.
 
     URDF 1.2 has an acceleration and a deceleration; the lesser holds for both.
     """
     if element is None or kind not in SCALAR:
-        return -math.inf, math.inf, math.inf, math.inf
+        return {}
     where = f"{where}, limit"
     rates = {name: _bound(element, name, where) for name in ("velocity", "acceleration", "deceleration")}
     for name, rate in rates.items():
         if rate < 0.0:
             raise OsikValueError(f"{where}: the {name} {rate} is negative")
     speed, *accelerations = (rate or math.inf for rate in rates.values())
+    limits = dict(speed=speed, acceleration=min(accelerations))
     if kind == "continuous":
-        return -math.inf, math.inf, speed, min(accelerations)
+        return limits
     lower, upper = (_bound(element, name, where) for name in ("lower", "upper"))
     if lower > upper or lower == math.inf or upper == -math.inf:
         raise OsikValueError(f"{where}: lower {lower} > upper {upper}")
-    return lower, upper, speed, min(accelerations)
+    return limits | dict(lower=lower, upper=upper)
 
 
 def _mimic(element: ElementTree.Element | None, where: str) -> Mimic | None:
@@ -375,21 +358,17 @@ def _parents_first(root: str, links: Mapping[str, Link], joints: Mapping[str, Jo
 
 
 def _check_mimics(joints: Mapping[str, Joint]) -> None:
-    for joint in joints.values():
-        if joint.mimic is None:
-            continue
-        leader = joints.get(joint.mimic.leader)
-        if leader is None:
-            missing = unknown_name("joint", joint.mimic.leader, tuple(joints))
-            raise OsikValueError(f"joint {joint.name!r} mimics what is not there: {missing}")
-        if leader.kind not in SCALAR:
-            raise OsikValueError(f"joint {joint.name!r} mimics {leader.name!r}, which is {leader.kind}")
-        _check_chain(joint, joints)
-
-
-def _check_chain(joint: Joint, joints: Mapping[str, Joint]) -> None:
-    chain = [joint.name]
-    while (mimic := joints[chain[-1]].mimic) is not None and mimic.leader in joints:
-        if mimic.leader in chain:
-            raise OsikValueError(f"mimic joints follow each other in a circle: {' -> '.join([*chain, mimic.leader])}")
-        chain.append(mimic.leader)
+    """Raise ValueError unless each chain of followers ends at a joint that follows none."""
+    for name in joints:
+        chain = [name]
+        while (mimic := joints[chain[-1]].mimic) is not None:
+            leader = joints.get(mimic.leader)
+            if leader is None:
+                missing = unknown_name("joint", mimic.leader, tuple(joints))
+                raise OsikValueError(f"joint {chain[-1]!r} mimics what is not there: {missing}")
+            if leader.kind not in SCALAR:
+                raise OsikValueError(f"joint {chain[-1]!r} mimics {leader.name!r}, which is {leader.kind}")
+            if leader.name in chain:
+                circle = " -> ".join([*chain, leader.name])
+                raise OsikValueError(f"mimic joints follow each other in a circle: {circle}")
+            chain.append(leader.name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -39,8 +40,8 @@ _SAME = 1e-6
 """Up to this, a frame and what it is the frame of are in one place [m, or entries of a rotation matrix]."""
 
 
-class _JointPlace(NamedTuple):
-    """Independent or follower joint to write, with its anchor and axis in its body."""
+class JointPlace(NamedTuple):
+    """A joint, with its anchor and axis in its body."""
 
     joint: int
     anchor: np.ndarray
@@ -99,7 +100,7 @@ def _body(robot: RobotModel, body: int, parent: ElementTree.Element) -> ElementT
     return element
 
 
-def placed_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]]:
+def placed_joints(robot: RobotModel, body: int) -> tuple[Pose, list[JointPlace]]:
     """Return the body's pose in its parent, locked joints at their values, and the joints that remain.
 
     A locked joint moves the body's frame, so the anchors and axes of the joints before it are told from there.
@@ -108,13 +109,13 @@ def placed_joints(robot: RobotModel, body: int) -> tuple[Pose, list[_JointPlace]
     position, axes = (np.asarray(leaf[body], float) for leaf in (robot.body_position, robot.body_quaternion))
     pose, joints = Pose(position, rotation_matrix(axes)), []
     for joint in (j for j, owner in enumerate(tree.joint_bodies) if owner == body):
-        place = _JointPlace(
-            joint, *(np.asarray(leaf[joint], float) for leaf in (robot.joint_position, robot.joint_axis))
-        )
+        leaves = robot.joint_position, robot.joint_axis
+        place = JointPlace(joint, *(np.asarray(leaf[joint], float) for leaf in leaves))
         if joint not in tree.locked:
             joints.append(place)
         elif tree.joint_types[joint] == FREE:
-            pose = _free_pose(robot, joint)
+            values = _values(robot, joint)
+            pose = Pose(values[:3], rotation_matrix(values[3:]))
         else:
             motion = _motion(robot, place)
             pose = pose @ motion
@@ -132,33 +133,29 @@ def _reference(robot: RobotModel, joint: int) -> float:
     return float(robot.joint_reference[robot.tree.full_qpos_address[joint]])
 
 
-def _free_pose(robot: RobotModel, joint: int) -> Pose:
-    values = _values(robot, joint)
-    return Pose(values[:3], rotation_matrix(values[3:]))
-
-
-def _motion(robot: RobotModel, place: _JointPlace) -> Pose:
+def _motion(robot: RobotModel, place: JointPlace) -> Pose:
     """Return the fixed transform of a locked joint, in its body's frame."""
-    kind, values = robot.tree.joint_types[place.joint], _values(robot, place.joint)
-    if kind == BALL:
-        return _about(place.anchor, rotation_matrix(values))
-    moved = float(values[0]) - _reference(robot, place.joint)
-    if kind == SLIDE:
-        return Pose(moved * place.axis, np.eye(3))
-    return _about(place.anchor, scipy.spatial.transform.Rotation.from_rotvec(moved * place.axis).as_matrix())
+    values = _values(robot, place.joint)
+    is_ball = robot.tree.joint_types[place.joint] == BALL
+    moved = Pose(np.zeros(3), rotation_matrix(values)) if is_ball else motion_to(robot, place, float(values[0]))
+    return Pose(place.anchor + moved.position - moved.rotation @ place.anchor, moved.rotation)
 
 
-def _about(anchor: np.ndarray, rotation: np.ndarray) -> Pose:
-    return Pose(anchor - rotation @ anchor, rotation)
+def motion_to(robot: RobotModel, place: JointPlace, value: float) -> Pose:
+    """Return the motion of a hinge or slide about its anchor, from its reference to a value [rad or m]."""
+    way = (value - _reference(robot, place.joint)) * place.axis
+    if robot.tree.joint_types[place.joint] == SLIDE:
+        return Pose(way, np.eye(3))
+    return Pose(np.zeros(3), scipy.spatial.transform.Rotation.from_rotvec(way).as_matrix())
 
 
-def _seen_from(motion: Pose, place: _JointPlace) -> _JointPlace:
+def _seen_from(motion: Pose, place: JointPlace) -> JointPlace:
     """Return a joint of the same body, in the frame moved by a locked joint after it.
 
     That does not change its coordinate: MuJoCo lets nothing that turns come after a ball joint.
     """
     back = motion.rotation.T
-    return _JointPlace(place.joint, back @ (place.anchor - motion.position), back @ place.axis)
+    return JointPlace(place.joint, back @ (place.anchor - motion.position), back @ place.axis)
 
 
 def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *, moving: bool) -> None:
@@ -181,7 +178,7 @@ def _add_inertial(robot: RobotModel, body: int, element: ElementTree.Element, *,
     )
 
 
-def _add_joint(robot: RobotModel, place: _JointPlace, element: ElementTree.Element) -> None:
+def _add_joint(robot: RobotModel, place: JointPlace, element: ElementTree.Element) -> None:
     tree, joint = robot.tree, place.joint
     kind, name = tree.joint_types[joint], tree.joint_names[joint]
     values: dict[str, str | ArrayLike] = {}
@@ -201,8 +198,7 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
     tree, name = robot.tree, robot.tree.joint_names[joint]
     if joint not in tree.dof_address:
         return {}
-    dof = dofs_of_joint(robot, joint)
-    lower, upper = (np.asarray(leaf[dof], float) for leaf in (robot.position_lower, robot.position_upper))
+    lower, upper = (np.asarray(leaf[tree.dofs(joint)], float) for leaf in (robot.position_lower, robot.position_upper))
     if np.isinf(lower).all() and np.isinf(upper).all():
         return {}
     if tree.joint_types[joint] == FREE:
@@ -214,13 +210,6 @@ def _range(robot: RobotModel, joint: int) -> dict[str, ArrayLike]:
         raise OsikValueError(f"joint {name!r} is limited on one side, [{low}, {high}]: MJCF has both limits or none")
     # MuJoCo asks for lower < upper: equal limits are one unit in the last place apart.
     return dict(range=(low, max(high, math.nextafter(low, math.inf))))
-
-
-def dofs_of_joint(robot: RobotModel, joint: int) -> slice:
-    """Return the entries of v that belong to an independent joint."""
-    tree = robot.tree
-    start = tree.dof_address[joint]
-    return slice(start, start + tree.full_dof_address[joint + 1] - tree.full_dof_address[joint])
 
 
 def one_for_all(values: ArrayLike, joint: str, what: str) -> float:
@@ -236,27 +225,34 @@ def one_for_all(values: ArrayLike, joint: str, what: str) -> float:
 
 def _add_frames(robot: RobotModel, bodies: list[ElementTree.Element]) -> None:
     """Write geoms of simple shapes, and as sites all frames that are neither those nor bodies."""
-    tree = robot.tree
-    done = dict.fromkeys(tree.body_names, IDENTITY) | _add_geoms(robot, bodies)
+    for name, body, pose in other_frames(robot, _add_geoms(robot, bodies)):
+        put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
+
+
+def other_frames(robot: RobotModel, geoms: dict[str, Pose]) -> Iterator[tuple[str, int, Pose]]:
+    """Yield name, body and pose of the frames that are neither bodies nor geoms.
+
+    A frame of a body or of one of ``geoms`` that is not where that is raises ValueError.
+    """
+    tree, places = robot.tree, dict.fromkeys(robot.tree.body_names, IDENTITY) | geoms
     for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
-        pose = pose_of(robot.frame_position[k], robot.frame_rotation[k])
-        if name not in done:
-            put(bodies[body], "site", name=name, pos=pose.position, quat=quaternion(pose.rotation))
-        else:
-            check_same_place(name, pose, done[name])
-
-
-def check_same_place(name: str, frame: Pose, own: Pose) -> None:
-    """Raise ValueError if the frame of a body or geom is not where that is."""
-    if not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(frame, own, strict=True)):
-        raise OsikValueError(
-            f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
-        )
+        pose = frame_pose(robot, k)
+        if name not in places:
+            yield name, body, pose
+        elif not all(np.allclose(a, b, rtol=0.0, atol=_SAME) for a, b in zip(pose, places[name], strict=True)):
+            raise OsikValueError(
+                f"frame {name!r} is a body or geom of its own and not where that is: move both, or neither"
+            )
 
 
 def pose_of(position: ArrayLike, rotation: ArrayLike) -> Pose:
     """Return a pose of NumPy's arrays in double precision."""
     return Pose(np.asarray(position, float), np.asarray(rotation, float))
+
+
+def frame_pose(robot: RobotModel, frame: int) -> Pose:
+    """Return the pose of a frame in its body."""
+    return pose_of(robot.frame_position[frame], robot.frame_rotation[frame])
 
 
 def _add_geoms(robot: RobotModel, bodies: list[ElementTree.Element]) -> dict[str, Pose]:
@@ -299,7 +295,7 @@ def _add_rates(robot: RobotModel, element: ElementTree.Element) -> None:
     for joint in robot.tree.independent:
         name = robot.tree.joint_names[joint]
         for prefix, (values, what) in rates.items():
-            rate = one_for_all(values[dofs_of_joint(robot, joint)], name, what)
+            rate = one_for_all(values[robot.tree.dofs(joint)], name, what)
             if math.isfinite(rate):
                 put(element, "numeric", name=prefix + name, data=rate)
 
@@ -345,7 +341,7 @@ def _add_constraints(robot: RobotModel, bodies: list[ElementTree.Element], eleme
 def _end_sites(robot: RobotModel, bodies: list[ElementTree.Element], ends: Ends, name: str) -> list[str]:
     """Add sites at the ends of a constraint; return their names."""
     numbers = [robot.tree.frame(frame) for frame in ends.frames]
-    first, second = (pose_of(robot.frame_position[k], robot.frame_rotation[k]) for k in numbers)
+    first, second = (frame_pose(robot, k) for k in numbers)
     turns = first.rotation @ ends.relative @ second.rotation.T, np.eye(3)  # of a weld the two are to agree
     made = []
     for k, pose, anchor, turn in zip(numbers, (first, second), ends.anchors, turns, strict=True):

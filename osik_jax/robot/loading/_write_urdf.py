@@ -7,7 +7,6 @@ import xml.etree.ElementTree as ElementTree
 
 import mujoco
 import numpy as np
-import scipy  # loads its parts when they are used
 
 from ..._errors import OsikValueError
 from .._describe import model_name
@@ -16,7 +15,7 @@ from .._tree import BALL, FREE, SLIDE
 from ._followers import free_name
 from ._mjmodel import LEAST_INERTIA
 from ._poses import IDENTITY, Pose
-from ._write import check_same_place, dofs_of_joint, one_for_all, placed_joints, pose_of, put, refuse_stack
+from ._write import frame_pose, motion_to, one_for_all, other_frames, placed_joints, pose_of, put, refuse_stack
 
 _UNLIMITED = 1e9
 """Written for an infinite limit of a slide or of one side: URDF has no word for it."""
@@ -34,15 +33,12 @@ def to_urdf(robot: RobotModel) -> str:
         if body:
             _add_inertial(robot, body, links[name])
             _add_body(robot, body, root)
-    done = dict.fromkeys(tree.body_names, IDENTITY)
+    done: dict[str, Pose] = {}
     for geom, body in enumerate(tree.geom_bodies):
         done |= _add_geom(robot, geom, links[tree.body_names[body]])
-    for k, (name, body) in enumerate(zip(tree.frame_names, tree.frame_bodies, strict=True)):
-        if name in done:
-            check_same_place(name, _frame_pose(robot, k), done[name])
-        else:
-            put(root, "link", name=name)
-            _add_joint(root, f"{name}_fixed", "fixed", tree.body_names[body], name, _frame_pose(robot, k))
+    for name, body, pose in other_frames(robot, done):
+        put(root, "link", name=name)
+        _add_joint(root, f"{name}_fixed", "fixed", tree.body_names[body], name, pose)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -53,7 +49,7 @@ def _add_body(robot: RobotModel, body: int, root: ElementTree.Element) -> None:
     parent, name = tree.body_names[tree.body_parents[body]], tree.body_names[body]
     base = _base_link(robot) if tree.body_parents[body] == 0 else None
     if base is not None and not any(tree.joint_types[place.joint] == FREE for place in joints):
-        parent, pose = tree.frame_names[base], _inverse(_frame_pose(robot, base)) @ pose
+        parent, pose = tree.frame_names[base], _inverse(frame_pose(robot, base)) @ pose
     for place in joints:
         kind, own = tree.joint_types[place.joint], tree.joint_names[place.joint]
         if kind == BALL:
@@ -61,15 +57,14 @@ def _add_body(robot: RobotModel, body: int, root: ElementTree.Element) -> None:
         if kind == FREE:
             _add_joint(root, own, "floating", parent, name, IDENTITY)
             return
-        before = pose @ Pose(place.anchor, np.eye(3)) @ _at_zero(robot, place.joint, place.axis)
+        before = pose @ Pose(place.anchor, np.eye(3)) @ motion_to(robot, place, 0.0)  # where URDF has its origin
         pose = Pose(-place.anchor, np.eye(3))
         last = place is joints[-1] and not place.anchor.any()
         child = name if last else free_name(f"{name}_{own}", tree.frame_names)
         if not last:
             put(root, "link", name=child)
-        _add_moving(
-            robot, place.joint, _add_joint(root, own, _kind(robot, place.joint), parent, child, before), place.axis
-        )
+        element = _add_joint(root, own, _kind(robot, place.joint), parent, child, before)
+        _add_moving(robot, place.joint, element, place.axis)
         parent = child
     if parent != name:
         _add_joint(root, f"{name}_fixed", "fixed", parent, name, pose)
@@ -85,20 +80,8 @@ def _base_link(robot: RobotModel) -> int | None:
     return next((k for k in fixed if tree.frame_names[k] not in (tree.body_names[0], *tree.geom_names)), None)
 
 
-def _frame_pose(robot: RobotModel, frame: int) -> Pose:
-    return pose_of(robot.frame_position[frame], robot.frame_rotation[frame])
-
-
 def _inverse(pose: Pose) -> Pose:
     return Pose(-pose.rotation.T @ pose.position, pose.rotation.T)
-
-
-def _at_zero(robot: RobotModel, joint: int, axis: np.ndarray) -> Pose:
-    """Return the motion of a hinge or slide from its reference to 0, where URDF has its origin."""
-    moved = -float(robot.joint_reference[robot.tree.full_qpos_address[joint]])
-    if robot.tree.joint_types[joint] == SLIDE:
-        return Pose(moved * axis, np.eye(3))
-    return Pose(np.zeros(3), scipy.spatial.transform.Rotation.from_rotvec(moved * axis).as_matrix())
 
 
 def _kind(robot: RobotModel, joint: int) -> str:
@@ -112,7 +95,7 @@ def _limits(robot: RobotModel, joint: int) -> tuple[float, float, float, float]:
     """Return lower and upper limit, greatest speed and acceleration; a follower's are its leader's to keep."""
     if joint not in robot.tree.dof_address:
         return -math.inf, math.inf, math.inf, math.inf
-    name, dof = robot.tree.joint_names[joint], dofs_of_joint(robot, joint)
+    name, dof = robot.tree.joint_names[joint], robot.tree.dofs(joint)
     fields = "position_lower", "position_upper", "velocity_limit", "acceleration_limit"
     low, high, speed, acceleration = (one_for_all(getattr(robot, field)[dof], name, field) for field in fields)
     return low, high, speed, acceleration
