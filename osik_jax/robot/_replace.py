@@ -52,8 +52,12 @@ def _replaced(robot: RobotModel, field: str, value: Any) -> Array:
     new, rows = on_host(old), _rows_of(robot.tree, field)
     for pattern in value:
         _refuse_frame(robot.tree, field, pattern)
-    for name, pattern in _matched(field.split("_")[0].replace("dof", "joint"), value, field, tuple(rows)).items():
+    matched = _matched(field.split("_")[0].replace("dof", "joint"), value, field, tuple(rows))
+    one_number = {pattern for name, pattern in matched.items() if not isinstance(rows[name], slice)}
+    for name, pattern in matched.items():
         row, what = rows[name], f"{field}[{pattern!r}]"
+        if isinstance(row, slice) and pattern in one_number and np.ndim(value[pattern]) == 0:
+            continue  # a number for many joints is meant for those that have one, not for a floating base
         new = replaced_at(new, row, _checked(field, value[pattern], old[row].shape, old.dtype, what))
     return to_jax(new)
 

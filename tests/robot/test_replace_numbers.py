@@ -61,6 +61,16 @@ def test_names_globs_and_whole_arrays(arm: Robot):
     assert float(arm.replace(q0={"joint2": 0.4}).q0[1]) == 0.4
 
 
+def test_a_number_for_many_joints_is_not_for_a_base_or_a_ball(robot: Robot):
+    slow = robot.replace(velocity_limit={"*": 0.5}).velocity_limit
+    starts = [start for j, start in robot.tree.dof_address.items() if robot.tree.joint_types[j] > 1]
+    rest = np.setdiff1d(np.arange(robot.nv), starts)
+    assert (np.asarray(slow)[starts] == 0.5).all() and len(rest) >= 9
+    np.testing.assert_array_equal(slow[rest], robot.velocity_limit[rest])
+    with pytest.raises(ValueError, match=r"velocity_limit\['fl\*'\] has shape"):
+        robot.replace(velocity_limit={"fl*": 0.5})
+
+
 def test_a_free_joint_and_a_ball_take_all_their_entries(robot: Robot):
     moved = robot.replace(joint_reference={"fly": (1, 2, 3, 1, 0, 0, 0)}, dof_armature={"ball": (1, 2, 3)})
     at = robot.tree.full_qpos_address[robot.tree.joint("fly")]
