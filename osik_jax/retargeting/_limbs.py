@@ -16,7 +16,7 @@ from ..robot import Robot
 from ..robot._mujoco import home_poses
 from ..robot._tree import BALL, HINGE
 from ._link_shapes import SHAPES, geom_points
-from ._profile import Place, Point
+from ._profile import Place, Point, as_place
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
 # Joints closer than this [m] are at one place, as the three hinges of a hip.
@@ -120,17 +120,13 @@ def _limb(robot: Robot, own: Chain, elbow: int, wrist: Place) -> Limb:
 
 
 def _body(robot: Robot, body: int) -> Place:
-    return _name(robot, body), ORIGIN
-
-
-def _name(robot: Robot, body: int) -> str:
-    return robot.tree.body_names[body]
+    return robot.tree.body_names[body], ORIGIN
 
 
 def _stiff(robot: Robot, limb: Chain) -> ValueError:
     return OsikValueError(
-        f"the limb that ends in {_name(robot, limb.bodies[-1])} has no joint between its ends that bends it as a "
-        "person's does; give a profile that says where its keypoints are"
+        f"the limb that ends in {robot.tree.body_names[limb.bodies[-1]]} has no joint between its ends that bends it "
+        "as a person's does; give a profile that says where its keypoints are"
     )
 
 
@@ -224,9 +220,7 @@ def find_end(
             return (nearest, ORIGIN), at[nearest]
     most = _MOST_FOREARM * upper if upper > 0.0 else np.inf  # no upper arm to compare with
     end = _far_end(robot, body, anchor, most)
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, _name(robot, body)))
-    x, y, z = np.round((end - position) @ rotation, 6).tolist()
-    return (_name(robot, body), (x, y, z)), end
+    return as_place(robot, kinematics, tree.body_names[body], end), end
 
 
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:

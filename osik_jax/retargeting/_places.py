@@ -106,14 +106,5 @@ def pairs_at_home(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
 
 def joints_between(robot: Robot, a: int, b: int) -> int:
     """Return the number of joints on the tree path between two bodies."""
-    parents = robot.tree.body_parents
-
-    def chain(body: int) -> list[int]:
-        out = [body]
-        while out[-1] != parents[out[-1]]:
-            out.append(parents[out[-1]])
-        return out
-
-    first, second = chain(a), chain(b)
-    common = next(body for body in first if body in second)
-    return first.index(common) + second.index(common)
+    above = robot.tree.descendants
+    return int((above[:, a] != above[:, b]).sum())
