@@ -95,9 +95,7 @@ class LiveRetargeter(OnRobot):
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         mapping: role to joint name of the stream. None: by common names.
-        profile: as in ``Retargeter``.
-        acceleration: as in ``Retargeter``.
-        balance: as in ``Retargeter``.
+        profile, acceleration, balance: as in ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
 
@@ -129,7 +127,7 @@ class LiveRetargeter(OnRobot):
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)
-        self._window_bounds = self._bounds(self._dt)
+        self._bounds = self._build.bounds(self._acceleration, self._dt)
         self.reset()
 
     @property
@@ -234,7 +232,7 @@ class LiveRetargeter(OnRobot):
 
     def _advanced(self, goals: Goals, contact: Bool[np.ndarray, "4"]) -> _Plan:
         """Return the plan moved on by one frame."""
-        weights, bounds, guess = self.profile.weights, self._window_bounds, self._build.first_guess(goals)
+        weights, bounds, guess = self.profile.weights, self._bounds, self._build.first_guess(goals)
         if self._plan is None:
             first = make_plan(self._body, goals, weights, bounds, guess, _FIRST_ITERATIONS).q
             # start at rest: the first frame is repeated _PAST times

@@ -18,7 +18,7 @@ from ._profile_file import check_profile, find_profile
 from ._roles import chain
 from ._skeletons import find_roles
 from ._source_motion import SourceMotion
-from ._terms import Body, Bounds
+from ._terms import Body
 
 ACCELERATION = 240.0
 
@@ -26,17 +26,13 @@ ACCELERATION = 240.0
 class OnRobot:
     """Robot with profile, limits and derived data, computed once for all clips.
 
-    Arguments are those of ``Retargeter``.
+    Arguments and errors are those of ``Retargeter``.
 
     Attributes:
         robot: the robot, with its home turned to face x if necessary.
         profile: its profile.
         balance: as given.
         limits: limits of position, speed and acceleration, which hold exactly.
-
-    Raises:
-        ValueError: no limbs are found, nothing holds a free base, or a number is out of range.
-        KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
 
     def __init__(
@@ -95,10 +91,6 @@ class OnRobot:
                 f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
             )
         return {}
-
-    def _bounds(self, dt: float) -> Bounds:
-        """Return the joint bounds of a plan with one frame per ``dt`` seconds."""
-        return self._build.bounds(self._acceleration, dt)
 
 
 def _on_joints(robot: Robot, acceleration: float | Mapping[str, float]) -> AccelerationLimit:

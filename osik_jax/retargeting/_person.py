@@ -107,8 +107,11 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
-    if not on_four:
-        _check_up(motion, roles)
+    if not on_four and (up := find_up(motion, "z", roles)) != "z":
+        warn(
+            f"{motion.name}: z is taken to point up, and the motion looks as if {up} did; "
+            f"load_motion(path, up={up!r}) and --up={up} turn {up} up"
+        )
     straight, flat = None, {}
     if legs:
         flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
@@ -143,16 +146,6 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
         # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
         ankle = float(np.percentile(heights.min(1), 5)) - floor
     return Measures(lengths, ankle, floor, noise, flat, straight)
-
-
-def _check_up(motion: HumanMotion, roles: Mapping[str, str]) -> None:
-    """Warn if z does not seem to point up."""
-    up = find_up(motion, "z", roles)
-    if up != "z":
-        warn(
-            f"{motion.name}: z is taken to point up, and the motion looks as if {up} did; "
-            f"load_motion(path, up={up!r}) and --up={up} turn {up} up"
-        )
 
 
 def read_person(

@@ -18,6 +18,7 @@ from ._facing import facing_at_home
 from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
 from ._roles import CHAINS, SIDES
+from ._skeletons import shortened
 
 JUMP, AT_SPEED, AT_END = 15.0, 0.97, 0.01
 """A change of joint speed from one frame to the next that counts as a jump [rad/s], the share of its speed limit at
@@ -278,7 +279,6 @@ def _posture(figures: Mapping[str, Any]) -> list[str]:
     share: Mapping[str, float] = figures["joints"]["at_end_share"]
     rests = sorted((name for name in share if share[name] > _RESTS), key=lambda name: -share[name])
     if rests:
-        named = ", ".join(f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests[:_MOST_JOINTS])
-        more = f" and {len(rests) - _MOST_JOINTS} more" if len(rests) > _MOST_JOINTS else ""
-        out.append(f"joints rest at an end of their range: {named}{more}")
+        told = [f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests]
+        out.append(f"joints rest at an end of their range: {shortened(told, _MOST_JOINTS)}")
     return out

@@ -105,7 +105,7 @@ def test_a_step_whose_bounds_let_no_foot_hold_is_no_worse_than_planned(nao, live
     @partial(jax.vmap, in_axes=(0, 0, 0))
     def held(step, lower, upper):
         found = hold_feet(live._body, nao.q0, step, lower, upper, jnp.ones(4, bool), stance)
-        return found.q, found.step, found.off
+        return osik.integrate(nao, nao.q0, found.step), found.step, found.off
 
     q, found, off = (np.asarray(part) for part in held(step, lower, upper))
     planned = np.asarray(held(step, step, step)[2])
