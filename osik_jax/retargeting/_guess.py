@@ -301,22 +301,19 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     """Return capsules from the links' inertias; limbs without usable inertias get capsules from joint to joint."""
     tree = robot.tree
     seen = _massive(robot, (profile.pelvis, profile.torso), _frames_of_hands(robot, profile))
-    bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
-
+    bodies = [tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen]
     shoulders = [profile.keypoints[f"{side}_shoulder"][0] for side in SIDES if f"{side}_shoulder" in profile.keypoints]
 
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
+        last = first if end is None else tree.frame_bodies[tree.frame(end)]
+        part = tree.descendants[first]
         if end in shoulders and frame not in shoulders:  # the trunk carries both arms
             arms = [tree.frame_bodies[tree.frame(shoulder)] for shoulder in shoulders]
-            return bool(
-                bodies & set(np.flatnonzero(tree.descendants[first] & tree.descendants[:, arms].all(1)).tolist())
-            )
-        below = set(np.flatnonzero(tree.descendants[first]).tolist())
-        last = None if end is None else tree.frame_bodies[tree.frame(end)]
-        # a limb that ends in its own link has all bodies below that link
-        behind = set() if last in (None, first) else set(np.flatnonzero(tree.descendants[last]).tolist())
-        return bool(bodies & (below - behind))
+            part = part & tree.descendants[:, arms].all(1)
+        elif last != first:  # a limb that ends in its own link has all bodies below that link
+            part = part & ~tree.descendants[last]
+        return bool(part[bodies].any())
 
     plain = _plain_capsules(kinematics, profile, robot)
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]

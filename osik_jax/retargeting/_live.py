@@ -209,13 +209,8 @@ class LiveRetargeter(OnRobot):
         seen = np.array(self._seen)
         gone = np.isnan(seen[..., 0])
         contact = None if self._stands[0] is None else np.array(self._stands)
-        motion = HumanMotion(
-            "stream",
-            self._standing.fps,
-            self._standing.joint_names,
-            _filled(seen, self._known),
-            contact=contact,
-        )
+        names, positions = self._standing.joint_names, _filled(seen, self._known)
+        motion = HumanMotion("stream", self._standing.fps, names, positions, contact=contact)
         own = read_person(motion, self.roles, self._measures, self.profile.standing)
         person, now = self._build.seen(own), self._history
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
@@ -248,8 +243,8 @@ class LiveRetargeter(OnRobot):
                 q[-1, at : at + 3] += guess[-1, at : at + 3] - guess[-2, at : at + 3]
             velocity, stance, damping = self._plan.velocity, self._plan.stance, self._plan.damping
         before = velocity, stance, damping
-        known = self._body, goals, weights, bounds, q, before, contact, self.limits
-        return _advance(*known, self._dt, self.iterations)
+        more = contact, self.limits, self._dt, self.iterations
+        return _advance(self._body, goals, weights, bounds, q, before, *more)
 
 
 @jax.jit

@@ -36,11 +36,7 @@ class OnRobot:
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        profile: Profile | None,
-        acceleration: float | Mapping[str, float],
-        balance: float | None,
+        self, robot: Robot, profile: Profile | None, acceleration: float | Mapping[str, float], balance: float | None
     ):
         if balance is not None and not (np.isfinite(balance) and balance >= 0.0):
             raise OsikValueError(f"balance is {balance}; it is a length in metres, 0 or more")
@@ -80,16 +76,14 @@ class OnRobot:
             return find_roles(motion.joint_names, mapping, needed, motion.positions)
         if mapping is not None:
             raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
-        missing = [role for limb in self.profile.followed for role in limb if role not in motion.seen.keypoints]
+        roles = dict.fromkeys(role for limb in self.profile.followed for role in limb)
+        missing = [role for role in roles if role not in motion.seen.keypoints]
         if missing:
-            raise OsikValueError(
-                f"the robot that is followed has no {', '.join(dict.fromkeys(missing))}; give a profile without these "
-                "keypoints"
-            )
+            text = f"the robot that is followed has no {', '.join(missing)}; give a profile without these keypoints"
+            raise OsikValueError(text)
         if self.profile.walks and motion.seen.standing != self.profile.standing:
-            raise OsikValueError(
-                f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
-            )
+            count, other = len(self.profile.feet), len(motion.seen.feet)
+            raise OsikValueError(f"{count} feet cannot follow {other}: they walk otherwise")
         return {}
 
 
