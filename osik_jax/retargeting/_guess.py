@@ -203,12 +203,9 @@ def _torso(robot: Robot, arms: list[Chain]) -> str | None:
     tree = robot.tree
     base = base_body(robot)
     trunk = tree.body_parents[arms[0].bodies[0]] if arms else base
-    above = set(np.flatnonzero(tree.descendants[:, trunk]).tolist()) - {0, base}
-    turns = any(
-        body in above and kind in (HINGE, BALL) and joint not in tree.locked
-        for joint, (body, kind) in enumerate(zip(tree.joint_bodies, tree.joint_types, strict=True))
-    )
-    return tree.body_names[trunk] if turns else None
+    turning = [j for j, kind in enumerate(tree.joint_types) if kind in (HINGE, BALL) and j not in tree.locked]
+    turned = {tree.joint_bodies[joint] for joint in turning} - {0, base}
+    return tree.body_names[trunk] if any(tree.descendants[body, trunk] for body in turned) else None
 
 
 def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
@@ -236,8 +233,9 @@ def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
     feet = {}
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         edges = sorted((0.5 * sign * wide, sign * wide), reverse=True)
-        ends = (np.array([[x, y, low] for y in edges]) for x in (rear, front))
-        feet[side] = Foot(root, *(_pair(in_frame(robot, kinematics, root, end)) for end in ends))
+        heel, toe = (np.array([[x, y, low] for y in edges]) for x in (rear, front))
+        heel, toe = (_pair(in_frame(robot, kinematics, root, end)) for end in (heel, toe))
+        feet[side] = Foot(root, heel, toe)
     return feet
 
 
@@ -360,10 +358,8 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
 def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
     """Return the frames moved by the wrists' last joints."""
     tree = robot.tree
-    elbows, wrists = (
-        {tree.frame_bodies[tree.frame(place[0])] for name, place in profile.keypoints.items() if name.endswith(role)}
-        for role in ("elbow", "wrist")
-    )
+    at = {role: tree.frame_bodies[tree.frame(frame)] for role, (frame, _) in profile.keypoints.items()}
+    elbows, wrists = ({body for role, body in at.items() if role.endswith(end)} for end in ("elbow", "wrist"))
     hands = np.array(sorted(wrists - elbows), int)  # without a wrist joint the hand belongs to the forearm
     turned = set(np.flatnonzero(tree.descendants[hands].any(0)).tolist())
     return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}

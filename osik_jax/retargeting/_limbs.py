@@ -160,14 +160,10 @@ def _bends(robot: Robot, kinematics: Kinematics, limb: Chain, i: int) -> bool:
         return False
     along = limb.anchors[behind] - limb.anchors[i]
     turn, axes = np.asarray(kinematics.body_rotation[limb.bodies[i]]), np.asarray(robot.joint_axis)
-    for joint, body in enumerate(tree.joint_bodies):
-        if body == limb.bodies[i] and joint not in tree.locked:
-            if tree.joint_types[joint] == BALL:
-                return True
-            across = np.linalg.norm(np.cross(turn @ axes[joint], along)) / np.linalg.norm(along)
-            if tree.joint_types[joint] == HINGE and across > _BENDS:
-                return True
-    return False
+    own = [j for j, body in enumerate(tree.joint_bodies) if body == limb.bodies[i] and j not in tree.locked]
+    across = np.linalg.norm(np.cross(axes[own] @ turn.T, along), axis=-1) / np.linalg.norm(along)
+    kinds = [tree.joint_types[joint] for joint in own]
+    return BALL in kinds or any(kind == HINGE and sine > _BENDS for kind, sine in zip(kinds, across, strict=True))
 
 
 def _after(anchors: np.ndarray, joint: int) -> int | None:
@@ -208,11 +204,8 @@ def find_end(
     upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
     names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
     for pattern in patterns:
-        at = {
-            name: np.asarray(kinematics.frame_pose(robot, name)[0])
-            for name in names
-            if re.search(pattern, name, re.IGNORECASE)
-        }
+        named = [name for name in names if re.search(pattern, name, re.IGNORECASE)]
+        at = {name: np.asarray(kinematics.frame_pose(robot, name)[0]) for name in named}
         far = {name: float(np.linalg.norm(place - anchor)) for name, place in at.items()}
         far = {name: length for name, length in far.items() if length > max(least_share * upper, _SAME)}
         if far:

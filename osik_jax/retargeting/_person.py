@@ -231,22 +231,17 @@ def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
     high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
     chest = points.get("chest", low)
-    across = {
-        part: points[f"left_{part}"] - points[f"right_{part}"]
-        for part in ("hip", "shoulder")
-        if f"left_{part}" in points and f"right_{part}" in points
-    }
 
-    def axes(parts: tuple[str, str], up: np.ndarray) -> np.ndarray:
-        up = np.where(np.linalg.norm(up, axis=-1, keepdims=True) > _SPINE, up, vertical)
-        left = next((across[part] for part in parts if part in across), np.broadcast_to(np.eye(3)[1], up.shape))
-        return axes_from(left, up)
+    def or_else(part: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.where(np.linalg.norm(part, axis=-1, keepdims=True) > _SPINE, part, other)
 
-    lower, upper = (
-        np.where(np.linalg.norm(part, axis=-1, keepdims=True) > _SPINE, part, high - low)
-        for part in (chest - low, high - chest)
-    )
-    return axes(("hip", "shoulder"), lower), axes(("shoulder", "hip"), upper)
+    def axes(parts: tuple[str, str], part: np.ndarray) -> np.ndarray:
+        up = or_else(or_else(part, high - low), vertical)
+        pairs = [(f"left_{name}", f"right_{name}") for name in parts]
+        known = [points[left] - points[right] for left, right in pairs if {left, right} <= set(points)]
+        return axes_from(known[0] if known else np.broadcast_to(np.eye(3)[1], up.shape), up)
+
+    return axes(("hip", "shoulder"), chest - low), axes(("shoulder", "hip"), high - chest)
 
 
 def _upright(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -99,13 +99,7 @@ def _rows(
     points, rates = soles(body, forward_kinematics(body.robot, q))
     middles, moves = points.reshape(4, 2, 3).mean(1), rates.reshape(4, 2, 3, -1).mean(1)
     counts = jnp.repeat(contact, 2) | (points[:, 2] < 0.0)
-    residual = jnp.concatenate(
-        [jnp.where(held[:, None], middles[:, :2] - landed, 0.0).ravel(), jnp.where(counts, points[:, 2], 0.0)]
-    )
-    jacobian = jnp.concatenate(
-        [
-            jnp.where(held[:, None, None], moves[:, :2], 0.0).reshape(8, -1),
-            jnp.where(counts[:, None], rates[:, 2], 0.0),
-        ]
-    )
-    return residual, jacobian
+    off, above = jnp.where(held[:, None], middles[:, :2] - landed, 0.0), jnp.where(counts, points[:, 2], 0.0)
+    sideways = jnp.where(held[:, None, None], moves[:, :2], 0.0).reshape(8, -1)
+    upwards = jnp.where(counts[:, None], rates[:, 2], 0.0)
+    return jnp.concatenate([off.ravel(), above]), jnp.concatenate([sideways, upwards])

@@ -80,15 +80,9 @@ def _tracks(
             return None
         return motion.positions[:, heads[-1]], motion.positions[:, feet].mean(1), motion.positions
     at = {role: motion.track(name) for role, name in roles.items()}
-    middles = {
-        part: 0.5 * (at[f"left_{part}"] + at[f"right_{part}"])
-        for part in ("shoulder", "hip", "ankle")
-        if {f"left_{part}", f"right_{part}"} <= set(at)
-    }
-    if len(middles) < 2:
-        return None
-    top, *_, bottom = middles.values()
-    return top, bottom, np.stack(list(at.values()), 1)
+    pairs = [(f"left_{part}", f"right_{part}") for part in ("shoulder", "hip", "ankle")]
+    middles = [0.5 * (at[left] + at[right]) for left, right in pairs if {left, right} <= set(at)]
+    return (middles[0], middles[-1], np.stack(list(at.values()), 1)) if len(middles) > 1 else None
 
 
 def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
