@@ -135,9 +135,8 @@ def _rms(values: np.ndarray) -> float:
 
 def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
     """Return what ``report`` says of the feet: None without feet or with a fixed base; slip is None for wheels."""
-    names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
     if not result.profile.feet or not result.robot.floating_base:
-        return dict.fromkeys(names)
+        return dict.fromkeys(("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max"))
     points, contact = places.standing, result.contact
     slip = [0.0]
     for k in range(4):
@@ -145,13 +144,12 @@ def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
             track = points[start:end, k, :2]
             slip.append(float(np.linalg.norm(track - track[0], axis=-1).max()))
     heights = points[..., 2][contact]
-    values = (
-        float(contact.any(1).mean()),
-        None if result.profile.rolls else 1e3 * max(slip),
-        1e3 * float(max(0.0, heights.max(initial=0.0))),
-        1e3 * float(max(0.0, -places.soles[..., 2].min())),
-    )
-    return dict(zip(names, values, strict=True))
+    return {
+        "contact_share": float(contact.any(1).mean()),
+        "slip_mm_max": None if result.profile.rolls else 1e3 * max(slip),
+        "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
+        "below_floor_mm_max": 1e3 * float(max(0.0, -places.soles[..., 2].min())),
+    }
 
 
 def _balance(

@@ -277,10 +277,7 @@ def _limbs(place: _Places, body: Body, goals: Goals, weights: Weights) -> _Rows:
     directed = (np.arange(len(first)) < len(first) - reaches)[:, None, None]
     sideways = jnp.eye(3, dtype=length.dtype) - directed * direction[:, :, None] * direction[:, None]
     sideways = (sideways / length[..., None]).reshape(-1, 3)
-    ends = []
-    for index in (first, second):
-        index = np.repeat(index, 3)
-        ends.append(place.motion.rates(place.moves[index], sideways, place.points[index]))
+    ends = [place.motion.rates(place.moves[i], sideways, place.points[i]) for i in (first.repeat(3), second.repeat(3))]
     residual = (direction - goals.directions).ravel()
     weight = jnp.concatenate([jnp.ones(len(first) - reaches, residual.dtype), goals.held])
     return _Rows(residual, ends[1] - ends[0], weights.limb * jnp.repeat(weight, 3))
@@ -294,12 +291,9 @@ def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weigh
 
 
 def _root(place: _Places, roots: tuple[int, ...], goals: Goals, weights: Weights) -> _Rows:
-    rates = []
-    for root in roots:
-        point = jnp.broadcast_to(place.points[root], (3, 3))
-        rates.append(place.motion.rates(place.moves[np.full(3, root)], 0.5 * jnp.eye(3, dtype=point.dtype), point))
-    residual = place.points[np.array(roots)].mean(0) - goals.root
-    return _Rows(residual, rates[0] + rates[1], weights.root)
+    both, axes = np.repeat(roots, 3), jnp.tile(0.5 * jnp.eye(3, dtype=place.points.dtype), (2, 1))
+    rates = place.motion.rates(place.moves[both], axes, place.points[both]).reshape(2, 3, -1).sum(0)
+    return _Rows(place.points[np.array(roots)].mean(0) - goals.root, rates, weights.root)
 
 
 def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
