@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._errors import OsikValueError
 from ..kinematics import difference
 from ..limits import Limit
+from ..numerics._arguments import check_count
 from ..robot import Robot
 from ._finish import inside_ranges, moved, velocity_inside
 from ._goals import Goals, Weights
@@ -118,12 +119,11 @@ class LiveRetargeter(OnRobot):
     ):
         if not 0.0 < look_ahead <= _LONGEST:
             raise OsikValueError(f"look_ahead is {look_ahead}; it is a time in seconds, over 0 and up to {_LONGEST:g}")
-        if not iterations >= 1:
-            raise OsikValueError(f"iterations is {iterations}; it is 1 at least")
+        check_count("iterations", iterations)
         super().__init__(robot, profile, acceleration, balance)
         self._dt = 1.0 / standing.fps
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
-        self.iterations = int(iterations)
+        self.iterations = iterations
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)

@@ -94,6 +94,7 @@ class Retargeter(OnRobot):
         super().__init__(robot, profile, acceleration, balance)
         if not (np.isfinite(smoothness) and smoothness >= 0.0):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
+        check_count("max_iterations", max_iterations)
         self.smoothness = smoothness
         self.max_iterations = max_iterations
 

@@ -185,14 +185,8 @@ BROKEN = {
     "two roots": (lambda t: t.replace("MOTION\n", "ROOT Other\n{\n}\nMOTION\n"), r"line 112: MOTION should come here"),
     "cut": (lambda t: t[: t.index("MOTION")], r"ends where MOTION should come"),
     "no frame time": (lambda t: t.replace("Frame Time: 0.033333333\n", ""), r"line 114: FRAME should come here"),
-    "milliseconds": (
-        lambda t: t.replace("Time: 0.033333333", "Time: 33.3"),
-        r"line 114: the frame time is 33.3; .*seconds",
-    ),
-    "negative time": (
-        lambda t: t.replace("Frame Time: 0.03", "Frame Time: -0.03"),
-        r"line 114: the frame time is -",
-    ),
+    "milliseconds": (lambda t: t.replace("Time: 0.033333333", "Time: 33.3"), r"line 114: .* time is 33.3; .*seconds"),
+    "negative time": (lambda t: t.replace("Time: 0.03", "Time: -0.03"), r"line 114: the frame time is -"),
     "frames": (lambda t: t.replace("Frames: 24", "Frames: 25"), r"says Frames: 25, and has 24"),
     "nan": (lambda t: t[: t.rindex(" ")] + " nan\n", r"line 138: nan is no length and no angle"),
     "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line 138: a frame has 56 numbers where there should be 57"),

@@ -50,11 +50,8 @@ def with_more(own):
     """With fingers, eyes and a second joint in the neck's place, which nobody asked for."""
     hands = [(f"{side}HandIndex{k}", NAMES.index(f"{side}Hand"), (0.02, 0.0, 0.03)) for side in ("Left", "Right")
              for k in (1, 2)]  # fmt: skip
-    more = [
-        *hands,
-        ("LeftEye", NAMES.index("Head"), (0.03, 0.05, 0.08)),
-        ("RightEye", NAMES.index("Head"), (-0.03, 0.05, 0.08)),
-    ]
+    eyes = [(name, NAMES.index("Head"), (x, 0.05, 0.08)) for name, x in (("LeftEye", 0.03), ("RightEye", -0.03))]
+    more = [*hands, *eyes]
     angles = np.concatenate([own.angles, np.full((len(own.root), len(more), 3), 20.0)], 1)
     joints, orders = (*own.joints, *more), own.orders + own.orders[:1] * len(more)
     return Figure(joints, own.root, angles, orders, own.fps)

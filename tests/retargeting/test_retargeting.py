@@ -65,6 +65,13 @@ def danced(nao, dance):
     return retarget(nao, load_motion(dance))
 
 
+@pytest.fixture
+def prepared(nao, dance):
+    """A retargeter, and the figure's clip as it plans it."""
+    own = Retargeter(nao)
+    return own, own._prepared(load_motion(dance), None, None)
+
+
 def banded_and_dense(rng, frames, n, m=2):
     """A positive definite system with its dense matrix."""
     dense = np.zeros((frames * n, frames * n))
@@ -393,10 +400,7 @@ def test_the_command_writes_its_files(dance, tmp_path, capsys):
     [
         (["none.bvh"], "no such file"),
         (["none"], "no such file: none"),
-        (
-            ["DANCE", "--robot", "g2"],
-            "no such file: g2 (robots by name: nao, arm7, g1, talos, ",
-        ),
+        (["DANCE", "--robot", "g2"], "no such file: g2 (robots by name: nao, arm7, g1, talos, "),
         (["DANCE", "--smooth", "-1"], "smoothness is -1.0; it is a time in seconds, 0 or more"),
         (["DANCE", "--balance", "-0.01"], "balance is -0.01; it is a length in metres, 0 or more"),
         (["DANCE", "--robot", "none.urdf"], "no such file: none.urdf"),
@@ -438,6 +442,8 @@ def test_joints_are_found_by_the_names_that_files_use():
     assert short["right_elbow"] == "R_Elbow"
     with pytest.raises(ValueError, match="no left_wrist that can be told.*left_elbow=left_elbow.* joints: spine1"):
         find_roles(tuple(name for name in SMPL if name != "left_wrist"))
+    with pytest.raises(KeyError, match="no joint of the clip 'hip'.* joints of the clip: pelvis, left_hip"):
+        find_roles(SMPL, {"left_hip": "hip"})
     with pytest.raises(KeyError, match="no role 'left_hand'"):
         find_roles(SMPL, {"left_hand": "left_wrist"})
     with pytest.raises(ValueError, match="no right_hip"):
@@ -506,9 +512,8 @@ def test_feet_stay_where_limbs_pull_at_them(nao):
 
 
 @pytest.mark.slow
-def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(nao, dance):
-    own = Retargeter(nao)
-    asked = own._prepared(load_motion(dance), None, None)
+def test_a_step_that_is_damped_does_not_end_a_plan_whose_bounds_are_broken(prepared):
+    own, asked = prepared
     weights = own.profile.weights
     clip = _Clip(own._body, asked.goals, weights, asked.bounds, jnp.ones(len(asked.start)))
     plan = make_plan(own._body, asked.goals, weights, asked.bounds, asked.start, 100)
@@ -721,10 +726,9 @@ def test_robots_that_cannot_walk_are_refused():
 
 
 @pytest.mark.slow
-def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, dance):
+def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, prepared):
     """On their backs, feet have their corners on the floor too, which is what bounds ask for."""
-    own = Retargeter(nao)
-    clip = own._prepared(load_motion(dance), None, None)
+    own, clip = prepared
     start = clip.start.copy()
     rolled = Rotation.from_euler("x", 120.0, degrees=True) * Rotation.from_quat(start[:, 3:7], scalar_first=True)
     start[:, 3:7] = rolled.as_quat(scalar_first=True)
@@ -734,10 +738,9 @@ def test_a_plan_that_begins_on_its_side_ends_on_its_soles(nao, dance):
     assert float(plan.cost[1]) < 1e-4
 
 
-def test_products_are_in_full_precision(nao, dance):
+def test_products_are_in_full_precision(prepared):
     """A GPU takes TF32 otherwise, and a plan in single precision does not see its end."""
-    own = Retargeter(nao)
-    clip = own._prepared(load_motion(dance), None, None)
+    own, clip = prepared
     program = jax.make_jaxpr(make_plan)(own._body, clip.goals, own.profile.weights, clip.bounds, clip.start, 1)
     products = list(products_of(program.jaxpr))
     assert len(products) > 20 and all(precision == (HIGHEST, HIGHEST) for precision in products)
@@ -771,5 +774,9 @@ def test_clips_that_are_too_short_or_lack_joints_are_refused(nao, dance):
     short = dataclasses.replace(motion, positions=motion.positions[:2], rotations=None)
     with pytest.raises(ValueError, match="2 frames; it takes three"):
         retarget(nao, short)
+    wrong: Any
+    for wrong in (0, -3, 2.5, None):
+        with pytest.raises(ValueError, match=f"max_iterations is {wrong}; it is an integer, at least 1"):
+            Retargeter(nao, max_iterations=wrong)
     with pytest.raises(ValueError, match="has no left_hip"):
         retarget(nao, HumanMotion("clip", 30.0, ("Hips",), np.zeros((5, 1, 3))))

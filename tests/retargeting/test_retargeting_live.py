@@ -174,7 +174,7 @@ def test_short_streams_and_wrong_frames(nao, motion, live):
     for wrong, message in (
         (dict(look_ahead=0), "look_ahead is 0; it is a time in seconds"),
         (dict(look_ahead=8), "look_ahead is 8; it is a time in seconds, over 0 and up to 2"),
-        (dict(iterations=0), "iterations is 0"),
+        (dict(iterations=0), "iterations is 0; it is an integer, at least 1"),
     ):
         with pytest.raises(ValueError, match=message):
             LiveRetargeter(live.robot, motion, **wrong)
