@@ -243,7 +243,7 @@ def _descended_by_core(
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
     rules += (_CAREFUL, little, float(_SETTLED), stiffness)
-    return Plan(*_plan_kernel.descended(call, *clip, q, rules, damping, most, endings))
+    return Plan(*_plan_kernel.descended(call, clip, q, rules, damping, most, endings))
 
 
 _by_kernel = by_kernel(_descended_plain, _descended_by_core, on_gpu=False)
