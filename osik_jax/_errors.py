@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -55,7 +56,8 @@ def unknown_name(kind: str, name: object, available: tuple[str, ...]) -> KeyErro
     """Return the exception for a name that does not exist: the nearest one that does, and all of them."""
     close = difflib.get_close_matches(str(name), available, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else "."
-    kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+    noun = re.split(" of | with ", kind)[0]
+    kinds = (f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s") + kind[len(noun) :]
     return OsikKeyError(f"no {kind} {name!r}{hint} {kinds}: {', '.join(available) or '(none)'}")
 
 

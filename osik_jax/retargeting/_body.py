@@ -70,7 +70,8 @@ def pairs_apart(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
 class Build:
     """Dimensions and limits of a robot with its profile, taken at its home configuration, as NumPy arrays."""
 
-    profile: Profile  # the robot's profile
+    robot: Robot
+    profile: Profile
     points: Mapping[str, Float[np.ndarray, "3"]]  # world positions of the keypoints [m]
     lengths: Mapping[Limb, float]  # lengths of the limbs that give the scale (``measured``) [m]
     ankle: float  # height of the ankles above the soles, or of the pelvis if the robot does not walk [m]
@@ -81,9 +82,6 @@ class Build:
     facing: Float[np.ndarray, "3 3"]  # forward, left and up axes of the robot as columns
     start: Float[np.ndarray, " nq"]  # the home configuration with limbs bent (``_with_bent_limbs``)
     free: int | None  # index of the base's free joint in q; None: the base is fixed
-    lower: Float[np.ndarray, " nv"]  # lower joint limits [rad or m]
-    upper: Float[np.ndarray, " nv"]  # upper joint limits [rad or m]
-    speed: Float[np.ndarray, " nv"]  # speed limits [rad/s or m/s]
 
     @classmethod
     def of(cls, robot: Robot, profile: Profile) -> Build:
@@ -102,6 +100,7 @@ class Build:
             ankle = float(np.mean(above) - np.mean(positions[len(points) : -2, 2] - profile.rises))
         bases = robot.tree.free_bases
         return cls(
+            robot=robot,
             profile=profile,
             points=points,
             lengths=lengths,
@@ -112,15 +111,7 @@ class Build:
             facing=palm_axes(points) if profile.is_hand else facing_at_home(robot, profile.across),
             start=_with_bent_limbs(robot, profile),
             free=robot.tree.qpos_address[bases[0]] if bases else None,
-            lower=np.asarray(robot.position_lower),
-            upper=np.asarray(robot.position_upper),
-            speed=np.asarray(robot.velocity_limit),
         )
-
-    @property
-    def size(self) -> float:
-        """Return the total length of the limbs that give the scale [m]."""
-        return sum(self.lengths.values())
 
     def seen(self, person: Person) -> Person:
         """Return the person without the motion that the robot's base cannot follow.
@@ -161,7 +152,7 @@ class Build:
         profile = self.profile
         if profile.scale is not None:
             return profile.scale
-        return profile.stretch * self.size / sum(person.lengths[limb] for limb in measured(profile))
+        return profile.stretch * sum(self.lengths.values()) / sum(person.lengths[limb] for limb in measured(profile))
 
     def goals(self, person: Person, firm: bool = True) -> Goals:
         """Return the goals for a person (``seen``): hip path, ankle height and directions on the robot.
@@ -178,15 +169,12 @@ class Build:
         for k, (a, b) in enumerate(reached, len(followed) - len(reached)):
             length = person.lengths[a, b] if profile.walks else self.lengths[a, b] / self.scale(person)
             wanted[:, k] = (person.points[b] - person.points[a]) / length
+        pulls = [_pull(touch.held, person.fps)[:, None] for touch in touches]
         dtype = self.start.dtype
         parts: dict[str, Any] = {  # NumPy's arrays: each one of JAX's would cost more than its numbers
             **{name: getattr(person, name) for name in ("pelvis", "torso", "feet")},
             "directions": np.concatenate([wanted, *(touch.goal[:, None] for touch in touches)], 1),
-            "held": np.stack(
-                [*np.ones((len(reached), len(root))), *(_pull(touch.held, person.fps) for touch in touches)], -1
-            )
-            if reached or touches
-            else np.zeros((len(root), 0)),
+            "held": np.concatenate([np.ones((len(root), len(reached))), *pulls], 1),
             "contact": _firmness(person.contact) if firm and dtype == np.float64 else person.contact,
             "root": root,
             "present": np.ones(len(root)),
@@ -233,9 +221,10 @@ class Build:
 
     def bounds(self, acceleration: Float[np.ndarray, " nv"], dt: float) -> Bounds:
         """Return the joint bounds of a plan, slightly inside the robot's limits so that the last pass has room."""
-        inset = np.minimum(_INSET, 0.01 * (self.upper - self.lower))
-        step, change = _SHARE * self.speed * dt, _SHARE * np.asarray(acceleration) * dt**2
-        parts: list[Any] = [self.lower + inset, self.upper - inset, step, change]
+        robot = self.robot
+        lower, upper, speed = map(np.asarray, (robot.position_lower, robot.position_upper, robot.velocity_limit))
+        inset = np.minimum(_INSET, 0.01 * (upper - lower))
+        parts: list[Any] = [lower + inset, upper - inset, _SHARE * speed * dt, _SHARE * acceleration * dt**2]
         return Bounds(*(part.astype(self.start.dtype) for part in parts))
 
 

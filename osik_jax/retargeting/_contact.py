@@ -82,11 +82,7 @@ def mean_over(values: Float[np.ndarray, "F k"], steps: int) -> Float[np.ndarray,
 
 
 def find_contact(
-    points: Float[np.ndarray, "F k 3"],
-    fps: float,
-    ground: float,
-    *,
-    noise: float = 0.0,
+    points: Float[np.ndarray, "F k 3"], fps: float, ground: float, *, noise: float = 0.0
 ) -> Bool[np.ndarray, "F k"]:
     """Return whether each point stands on the ground. (F, k).
 

@@ -31,18 +31,18 @@ _JOB = "job.json"
 
 
 def write_folder(result: Retargeted, name: str, out: Path) -> dict[str, Any]:
-    """Write motion (.npz and .csv), report and profile; return the report."""
-    figures = {"clip": name, **report(result)}
-    _write_motion(result, figures, out)
+    """Write motion (.npz and .csv), report and profile to an existing folder; return the report."""
     save_profile(result.profile, out / "profile.toml")
-    return figures
+    return _write_motion(result, {"clip": name}, out)
 
 
-def _write_motion(result: Retargeted, figures: dict[str, Any], out: Path) -> None:
-    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json`` to an existing folder."""
+def _write_motion(result: Retargeted, source: dict[str, str], out: Path) -> dict[str, Any]:
+    """Write ``motion.npz``, ``motion.csv`` and, last of all, ``report.json``; return the report."""
+    figures = {**source, **report(result)}
     result.save(out / "motion.npz")
     result.motion.save_csv(out / "motion.csv")
     _write_json(figures, out / "report.json")
+    return figures
 
 
 def _write_json(figures: dict[str, Any], path: Path) -> None:
@@ -73,10 +73,8 @@ def retarget_folder(
         retargeter: the retargeter of the robot.
         folder: folder of the clips; folders inside it are not searched.
         out: output folder.
-        unit: as of ``load_motion``, of the BVH files.
-        up: as of ``load_motion``.
-        mapping: as of ``Retargeter.retarget``, the same for all clips.
-        fps: as of ``Retargeter.retarget``, the same for all clips.
+        unit, up: as of ``load_motion``; ``unit`` is that of the BVH files.
+        mapping, fps: as of ``Retargeter.retarget``, the same for all clips.
         chunk: number of clips per batch on a GPU; on a CPU each core works on one clip.
         progress: whether to show a bar; or a function of the numbers of finished clips and of all clips.
 
@@ -110,9 +108,8 @@ def retarget_folder(
             except Exception as error:  # a broken file may raise anything in a reader; the job goes on with other clips
                 failed[name] = _reason(error)
                 return
-            found[name] = {"clip": name, **sources[name], **report(result)}
             (out / name).mkdir(exist_ok=True)
-            _write_motion(result, found[name], out / name)
+            found[name] = _write_motion(result, {"clip": name, **sources[name]}, out / name)
 
         def read(name: str) -> Clip:
             path = files[name]

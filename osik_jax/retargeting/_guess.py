@@ -17,13 +17,15 @@ from ..robot import Robot
 from ..robot._guesses import find_feet
 from ..robot._mujoco import own_masses
 from ..robot._tree import BALL, FREE, HINGE
+from ..robot.loading._poses import rotation_matrix
 from ._facing import by_name, facing_x
 from ._hand import guess_hand
 from ._limbs import ORIGIN, Chain, Limb, base_body, find_arm, find_chains, find_leg
 from ._link_shapes import by_inertia, by_shapes, is_credible, shrunk
 from ._places import JOINTS_APART, joints_between
-from ._profile import Capsule, Foot, Place, Point, Profile, world_points
+from ._profile import Capsule, Foot, Place, Point, Profile, in_frame, world_points
 from ._roles import CHAINS, FINGERS, LEGS, LIMBS, NEEDED, SIDES
+from ._skeletons import shortened
 
 # A foot without shapes, as shares of half the leg (ankle height: of the leg); the heel's share of its length.
 _FOOT_LENGTH, _FOOT_WIDTH, _FOOT_HEIGHT, _HEEL = 0.36, 0.12, 0.08, 0.3
@@ -36,8 +38,6 @@ _NO_ARM = r"head|neck|camera|wheel|caster|laser|antenna|tail"
 _LEAST_ARM = 4
 """Joints that two bodies have in common where they belong to one arm, at least: a trunk has three at most."""
 _ARMS = ("left_arm", "right_arm")
-_NAMED = 8
-"""Joints that a description names, at most."""
 _LEAST_MASS, _LEAST_SIZE, _THINNEST, _WIDE, _LONG, _SHELL = 3e-3, 1e-3, 0.1, 1.6, 1.15, 1.2
 """Thresholds of capsules: least link mass (share of the robot's), least half thickness [m] and least thickness over
 length, width over thickness above which a trunk gets two capsules, and capsule length and radius over the inertia
@@ -122,8 +122,7 @@ def describe_profile(robot: Robot, profile: Profile) -> str:
         for name, body, kind in zip(tree.joint_names, tree.joint_bodies, tree.joint_types, strict=True)
         if kind != FREE and body not in moved and name in robot.joint_names
     ]
-    shown = ", ".join(idle[:_NAMED]) + (f" and {len(idle) - _NAMED} more" if len(idle) > _NAMED else "")
-    return "; ".join(parts) + (f"; joints that move nothing of it stay at home: {shown}" if idle else "")
+    return "; ".join(parts) + (f"; joints that move nothing of it stay at home: {shortened(idle)}" if idle else "")
 
 
 def _limbs_found(profile: Profile) -> list[str]:
@@ -204,12 +203,9 @@ def _torso(robot: Robot, arms: list[Chain]) -> str | None:
     tree = robot.tree
     base = base_body(robot)
     trunk = tree.body_parents[arms[0].bodies[0]] if arms else base
-    above = set(np.flatnonzero(tree.descendants[:, trunk]).tolist()) - {0, base}
-    turns = any(
-        body in above and kind in (HINGE, BALL) and joint not in tree.locked
-        for joint, (body, kind) in enumerate(zip(tree.joint_bodies, tree.joint_types, strict=True))
-    )
-    return tree.body_names[trunk] if turns else None
+    turning = [j for j, kind in enumerate(tree.joint_types) if kind in (HINGE, BALL) and j not in tree.locked]
+    turned = {tree.joint_bodies[joint] for joint in turning} - {0, base}
+    return tree.body_names[trunk] if any(tree.descendants[body, trunk] for body in turned) else None
 
 
 def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
@@ -226,17 +222,20 @@ def _wheels(robot: Robot, kinematics: Kinematics) -> dict[str, Foot]:
     for geom, body in enumerate(tree.geom_bodies):
         if body in wheels:
             radii[wheels.index(body)] = max(radii[wheels.index(body)], float(robot.geom_size[geom, 0]))
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, tree.body_names[tree.root]))
+    root = tree.body_names[tree.root]
     # without shapes, the floor is where the root is: base_footprint and its like
-    low = float((at[:, 2] - radii).min() if radii.any() else min(float(position[2]), at[:, 2].min()))
+    low = float(
+        (at[:, 2] - radii if radii.any() else np.append(at[:, 2], kinematics.frame_pose(robot, root)[0][2])).min()
+    )
     rear, front = float(at[:, 0].min()), float(at[:, 0].max())
     wide = float(np.abs(at[:, 1]).max())
     front, rear = (front, rear) if front - rear > wide else (rear + wide, rear - wide)
     feet = {}
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         edges = sorted((0.5 * sign * wide, sign * wide), reverse=True)
-        heel, toe = (_pair((np.array([[x, y, low] for y in edges]) - position) @ rotation) for x in (rear, front))
-        feet[side] = Foot(tree.body_names[tree.root], heel, toe)
+        heel, toe = (np.array([[x, y, low] for y in edges]) for x in (rear, front))
+        heel, toe = (_pair(in_frame(robot, kinematics, root, end)) for end in (heel, toe))
+        feet[side] = Foot(root, heel, toe)
     return feet
 
 
@@ -262,11 +261,11 @@ def _foot(robot: Robot, kinematics: Kinematics, frame: str, leg: Chain, limb: Li
 
 def _ball(robot: Robot, kinematics: Kinematics, frame: str) -> Foot:
     """Return a round foot: the sphere nearest to a frame on its body, or the frame as a point."""
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    found = [(float(np.linalg.norm(at - position)), at, radius) for at, radius in _spheres(robot, kinematics, frame)]
-    distance, at, radius = min(found, key=lambda ball: ball[0], default=(0.0, position, 0.0))
-    at, radius = (at, radius) if distance <= 2.0 * radius else (position, 0.0)
-    point = _pair(np.tile((at - position) @ rotation, (2, 1)))
+    balls = [(in_frame(robot, kinematics, frame, at), radius) for at, radius in _spheres(robot, kinematics, frame)]
+    at, radius = min(balls, key=lambda ball: float(np.linalg.norm(ball[0])), default=(np.zeros(3), 0.0))
+    if np.linalg.norm(at) > 2.0 * radius:
+        at, radius = np.zeros(3), 0.0
+    point = _pair(np.tile(at, (2, 1)))
     return Foot(frame, point, point, round(radius, 6))
 
 
@@ -287,10 +286,8 @@ def _corners(robot: Robot, kinematics: Kinematics, frame: str) -> np.ndarray:
     for corners in (contact_corners(robot, frame), sole_points(robot, frame)):
         if len(corners):
             return corners
-    balls = _spheres(robot, kinematics, frame)
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    points = np.array([at - [0.0, 0.0, radius] for at, radius in balls]).reshape(-1, 3)
-    return (points - position) @ rotation
+    lowest = [at - [0.0, 0.0, radius] for at, radius in _spheres(robot, kinematics, frame)]
+    return in_frame(robot, kinematics, frame, np.array(lowest).reshape(-1, 3))
 
 
 def _pair(points: np.ndarray) -> tuple[Point, Point]:
@@ -302,22 +299,19 @@ def _capsules(robot: Robot, kinematics: Kinematics, profile: Profile) -> tuple[C
     """Return capsules from the links' inertias; limbs without usable inertias get capsules from joint to joint."""
     tree = robot.tree
     seen = _massive(robot, (profile.pelvis, profile.torso), _frames_of_hands(robot, profile))
-    bodies = {tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen}
-
+    bodies = [tree.frame_bodies[tree.frame(capsule.frame)] for capsule in seen]
     shoulders = [profile.keypoints[f"{side}_shoulder"][0] for side in SIDES if f"{side}_shoulder" in profile.keypoints]
 
     def is_seen(frame: str, end: str | None) -> bool:
         first = tree.frame_bodies[tree.frame(frame)]
+        last = first if end is None else tree.frame_bodies[tree.frame(end)]
+        part = tree.descendants[first]
         if end in shoulders and frame not in shoulders:  # the trunk carries both arms
             arms = [tree.frame_bodies[tree.frame(shoulder)] for shoulder in shoulders]
-            return bool(
-                bodies & set(np.flatnonzero(tree.descendants[first] & tree.descendants[:, arms].all(1)).tolist())
-            )
-        below = set(np.flatnonzero(tree.descendants[first]).tolist())
-        last = None if end is None else tree.frame_bodies[tree.frame(end)]
-        # a limb that ends in its own link has all bodies below that link
-        behind = set() if last in (None, first) else set(np.flatnonzero(tree.descendants[last]).tolist())
-        return bool(bodies & (below - behind))
+            part = part & tree.descendants[:, arms].all(1)
+        elif last != first:  # a limb that ends in its own link has all bodies below that link
+            part = part & ~tree.descendants[last]
+        return bool(part[bodies].any())
 
     plain = _plain_capsules(kinematics, profile, robot)
     missing = [capsule for capsule, end in plain if not is_seen(capsule.frame, end)]
@@ -364,10 +358,8 @@ def _between(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> floa
 def _frames_of_hands(robot: Robot, profile: Profile) -> set[str]:
     """Return the frames moved by the wrists' last joints."""
     tree = robot.tree
-    elbows, wrists = (
-        {tree.frame_bodies[tree.frame(place[0])] for name, place in profile.keypoints.items() if name.endswith(role)}
-        for role in ("elbow", "wrist")
-    )
+    at = {role: tree.frame_bodies[tree.frame(frame)] for role, (frame, _) in profile.keypoints.items()}
+    elbows, wrists = ({body for role, body in at.items() if role.endswith(end)} for end in ("elbow", "wrist"))
     hands = np.array(sorted(wrists - elbows), int)  # without a wrist joint the hand belongs to the forearm
     turned = set(np.flatnonzero(tree.descendants[hands].any(0)).tolist())
     return {name for name, body in zip(tree.frame_names, tree.frame_bodies, strict=True) if body in turned}
@@ -407,10 +399,13 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> li
         along, aside = extent.axes[:, long], extent.axes[:, wide]
         reach = max(float((_LONG if by_file is None else 1.0) * half[long] - radius), 0.05 * radius)
         middle = float((extent.center - model.body_ipos[body]) @ along)
-        spans = [middle - reach, middle + reach]
+        spans, carried = [middle - reach, middle + reach], _carried_joints(model, body, along)
         if name not in trunk and by_file is None:
-            spans += _spanned(model, body, along, radius, least)
-        spans = _between_joints(model, body, along, radius, spans)
+            spans += [float(np.copysign(max(abs(end) - radius, 0.0), end)) for end in carried]
+            spans += [float((joint - model.body_ipos[body]) @ along) for joint in _own_joint(model, body, least)]
+        if carried:
+            own = [float(-model.body_ipos[body] @ along)] * bool(model.body_jntnum[body])
+            spans = _between_joints(carried, own, radius, spans)
         aside_by = shell * half[wide] - radius
         for shift in (aside_by, -aside_by) if apart else (0.0,):
             centre = extent.center - middle * along + shift * aside
@@ -419,45 +414,37 @@ def _massive(robot: Robot, trunk: tuple[str | None, ...], hands: set[str]) -> li
     return out
 
 
-def _between_joints(
-    model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, spans: list[float]
-) -> list[float]:
+def _carried_joints(model: mujoco.MjModel, body: int, along: np.ndarray) -> list[float]:
+    """Return where the joints of a body's children are along an axis through its centre of mass [m]."""
+    children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
+    return [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
+
+
+def _between_joints(carried: list[float], own: list[float], radius: float, spans: list[float]) -> list[float]:
     """Return a capsule's ends, limited to one radius beyond the link's joints if it is longer than wide between them.
 
     A link with limbs on both sides of its centre of mass ends at their joints.
     """
-    children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
-    limbs = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
-    ends = limbs + [float(-model.body_ipos[body] @ along)] * bool(model.body_jntnum[body])
-    if not children or max(ends) - min(ends) < 2.0 * radius:
+    ends = carried + own
+    if max(ends) - min(ends) < 2.0 * radius:
         return spans
-    room = 0.0 if min(limbs) < 0.0 < max(limbs) else radius
+    room = 0.0 if min(carried) < 0.0 < max(carried) else radius
     return [float(x) for x in np.clip(spans, min(ends) - room, max(ends) + room)]
 
 
-def _spanned(model: mujoco.MjModel, body: int, along: np.ndarray, radius: float, least: float) -> list[float]:
-    """Return the positions along a capsule's axis of the joint that moves a body and of its children's joints [m].
+def _own_joint(model: mujoco.MjModel, body: int, least: float) -> list[np.ndarray]:
+    """Return the position of the joint that moves a body, in its frame [m]; empty if it is fixed to a heavy body.
 
     The housing around a joint belongs to the body it moves. Beside a heavy motor at the other end it is too light to
     show in the ellipsoid. If the body is fixed to one lighter than ``least`` [kg], which gets no capsule, that one's
     joint counts.
     """
-    own = [joint - model.body_ipos[body] for joint in _own_joint(model, body, least)]
-    children = [c for c in range(1, model.nbody) if model.body_parentid[c] == body and model.body_jntnum[c]]
-    ends = [float((model.body_pos[child] - model.body_ipos[body]) @ along) for child in children]
-    short = [float(np.copysign(max(abs(end) - radius, 0.0), end)) for end in ends]
-    return [float(anchor @ along) for anchor in own] + short
-
-
-def _own_joint(model: mujoco.MjModel, body: int, least: float) -> list[np.ndarray]:
-    """Return the position of the joint that moves a body, in its frame [m]; empty if it is fixed to a heavy body."""
     at, turn, fixed = np.zeros(3), np.eye(3), body
     while not model.body_jntnum[fixed]:
-        parent, own = int(model.body_parentid[fixed]), np.zeros(9)
+        parent = int(model.body_parentid[fixed])
         if not parent or model.body_mass[parent] > least:
             return []
-        mujoco.mju_quat2Mat(own, model.body_quat[fixed])
-        turn = turn @ own.reshape(3, 3).T
+        turn = turn @ rotation_matrix(model.body_quat[fixed]).T
         at = at - turn @ model.body_pos[fixed]
         fixed = parent
     return [at]
@@ -469,35 +456,26 @@ def _plain_capsules(kinematics: Kinematics, profile: Profile, robot: Robot) -> l
     Each comes with the frame where the part it stands for ends; None if that is the limb's end.
     """
 
-    def place(role: str) -> np.ndarray:
-        return world_points(robot, kinematics, [profile.keypoints[role]])[0]
-
-    def inside(frame: str, start: np.ndarray, end: np.ndarray) -> tuple[Point, Point]:
-        position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-        return _pair((np.stack([start, end]) - position) @ rotation)
+    def capsule(frame: str, start: np.ndarray, end: np.ndarray, radius: float) -> Capsule:
+        return Capsule(frame, *_pair(in_frame(robot, kinematics, frame, np.stack([start, end]))), round(radius, 6))
 
     out, known = [], profile.keypoints
+    at = dict(zip(known, world_points(robot, kinematics, [*known.values()]), strict=True))
     for side in SIDES:
-        limbs = [limb for limb in LIMBS if limb[0].startswith(side) and set(limb) <= set(known)]
-        for a, b in limbs:
-            start, end = place(a), place(b)
-            length = float(np.linalg.norm(end - start))
+        for a, b in (limb for limb in LIMBS if limb[0].startswith(side) and set(limb) <= set(known)):
+            length = float(np.linalg.norm(at[b] - at[a]))
             radius = (_LEG_RADIUS if (a, b) in LEGS else _ARM_RADIUS) * length
-            along = (end - start) / length
-            ends = inside(known[a][0], start + radius * along, end - 0.5 * radius * along)
-            out.append((Capsule(known[a][0], *ends, round(radius, 6)), known[b][0]))
+            inset = radius / length * (at[b] - at[a])
+            out.append((capsule(known[a][0], at[a] + inset, at[b] - 0.5 * inset, radius), known[b][0]))
         if f"{side}_wrist" in known and len(profile.feet) != 4:
-            elbow, wrist = place(f"{side}_elbow"), place(f"{side}_wrist")
-            radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(wrist - elbow))
-            frame = known[f"{side}_wrist"][0]
-            ends = inside(frame, wrist, wrist + _HAND * (wrist - elbow))
-            out.append((Capsule(frame, *ends, round(radius, 6)), None))
+            wrist = at[f"{side}_wrist"]
+            forearm = wrist - at[f"{side}_elbow"]
+            radius = 1.2 * _ARM_RADIUS * float(np.linalg.norm(forearm))
+            out.append((capsule(known[f"{side}_wrist"][0], wrist, wrist + _HAND * forearm, radius), None))
     if not {f"{side}_{role}" for side in SIDES for role in ("shoulder", "hip")} <= set(known):
         return out
-    shoulders, hips = ([place(f"{side}_{role}") for side in SIDES] for role in ("shoulder", "hip"))
-    top, bottom = 0.5 * (shoulders[0] + shoulders[1]), 0.5 * (hips[0] + hips[1])
-    radius = _TRUNK_RADIUS * float(np.linalg.norm(shoulders[0] - shoulders[1]))
-    trunk = profile.torso or profile.pelvis
-    up = (top - bottom) / np.linalg.norm(top - bottom)
-    ends = inside(trunk, bottom + 1.5 * radius * up, top - 0.5 * radius * up)
-    return [*out, (Capsule(trunk, *ends, round(radius, 6)), known["left_shoulder"][0])]
+    top, bottom = (0.5 * (at[f"left_{role}"] + at[f"right_{role}"]) for role in ("shoulder", "hip"))
+    radius = _TRUNK_RADIUS * float(np.linalg.norm(at["left_shoulder"] - at["right_shoulder"]))
+    up = radius * (top - bottom) / np.linalg.norm(top - bottom)
+    trunk = capsule(profile.torso or profile.pelvis, bottom + 1.5 * up, top - 0.5 * up, radius)
+    return [*out, (trunk, known["left_shoulder"][0])]

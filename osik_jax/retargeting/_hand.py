@@ -7,6 +7,7 @@ import re
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import home_kinematics
@@ -14,7 +15,7 @@ from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._goals import Weights
 from ._limbs import ORIGIN, Chain, find_end
-from ._profile import Place, Profile, world_points
+from ._profile import Place, Profile, as_place, world_points
 from ._roles import FINGERS
 
 _PARTS = r"(?=j\d|base|hub|meta|knuck|prox|mid|dist)"
@@ -156,8 +157,8 @@ def _bent(robot: Robot, places: list[Place]) -> np.ndarray:
     return world_points(robot, forward_kinematics(robot, jnp.asarray(q)), places)
 
 
-def _away(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.linalg.norm(a - b))
+def _away(a: ArrayLike, b: ArrayLike) -> float:
+    return float(np.linalg.norm(np.subtract(a, b)))
 
 
 def _knuckles(chain: Chain) -> list[int]:
@@ -176,16 +177,14 @@ def _wrist(robot: Robot, kinematics: Kinematics, palm: int, points: dict[str, np
     fingers = re.compile("|".join(_WORDS.values()), re.IGNORECASE)
     named = [name for name, body in names if body == palm and re.search(_BASE, name, re.IGNORECASE)]
     named = [name for name in named if not fingers.search(name)]
-    length, at = float(np.linalg.norm(along)), {name: kinematics.frame_pose(robot, name) for name in named}
-    far = {name: _away(np.asarray(position), knuckle) for name, (position, _) in at.items()}
-    behind = {name: _away(np.asarray(at[name][0]), knuckle - along) for name in named if far[name] > 0.5 * length}
+    length, at = float(np.linalg.norm(along)), {name: kinematics.frame_pose(robot, name)[0] for name in named}
+    far = {name: _away(position, knuckle) for name, position in at.items()}
+    behind = {name: _away(at[name], knuckle - along) for name in named if far[name] > 0.5 * length}
     nearest = min(behind, key=lambda name: behind[name], default="")
     if nearest and behind[nearest] < 0.5 * length:
         return nearest, ORIGIN
     frame = min(far, key=lambda name: far[name], default=_frame(robot, palm))
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
-    x, y, z = np.round((knuckle - along - position) @ rotation, 6).tolist()
-    return frame, (x, y, z)
+    return as_place(robot, kinematics, frame, knuckle - along)
 
 
 def _frame(robot: Robot, body: int) -> str:

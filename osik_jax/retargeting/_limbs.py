@@ -16,7 +16,7 @@ from ..robot import Robot
 from ..robot._mujoco import home_poses
 from ..robot._tree import BALL, HINGE
 from ._link_shapes import SHAPES, geom_points
-from ._profile import Place, Point
+from ._profile import Place, Point, as_place
 
 ORIGIN: Point = (0.0, 0.0, 0.0)
 # Joints closer than this [m] are at one place, as the three hinges of a hip.
@@ -120,17 +120,13 @@ def _limb(robot: Robot, own: Chain, elbow: int, wrist: Place) -> Limb:
 
 
 def _body(robot: Robot, body: int) -> Place:
-    return _name(robot, body), ORIGIN
-
-
-def _name(robot: Robot, body: int) -> str:
-    return robot.tree.body_names[body]
+    return robot.tree.body_names[body], ORIGIN
 
 
 def _stiff(robot: Robot, limb: Chain) -> ValueError:
     return OsikValueError(
-        f"the limb that ends in {_name(robot, limb.bodies[-1])} has no joint between its ends that bends it as a "
-        "person's does; give a profile that says where its keypoints are"
+        f"the limb that ends in {robot.tree.body_names[limb.bodies[-1]]} has no joint between its ends that bends it "
+        "as a person's does; give a profile that says where its keypoints are"
     )
 
 
@@ -164,14 +160,10 @@ def _bends(robot: Robot, kinematics: Kinematics, limb: Chain, i: int) -> bool:
         return False
     along = limb.anchors[behind] - limb.anchors[i]
     turn, axes = np.asarray(kinematics.body_rotation[limb.bodies[i]]), np.asarray(robot.joint_axis)
-    for joint, body in enumerate(tree.joint_bodies):
-        if body == limb.bodies[i] and joint not in tree.locked:
-            if tree.joint_types[joint] == BALL:
-                return True
-            across = np.linalg.norm(np.cross(turn @ axes[joint], along)) / np.linalg.norm(along)
-            if tree.joint_types[joint] == HINGE and across > _BENDS:
-                return True
-    return False
+    own = [j for j, body in enumerate(tree.joint_bodies) if body == limb.bodies[i] and j not in tree.locked]
+    across = np.linalg.norm(np.cross(axes[own] @ turn.T, along), axis=-1) / np.linalg.norm(along)
+    kinds = [tree.joint_types[joint] for joint in own]
+    return BALL in kinds or any(kind == HINGE and sine > _BENDS for kind, sine in zip(kinds, across, strict=True))
 
 
 def _after(anchors: np.ndarray, joint: int) -> int | None:
@@ -212,11 +204,8 @@ def find_end(
     upper = float(np.linalg.norm(anchor - arm.anchors[min(1, last)]))
     names = [name for name, own in zip(tree.frame_names, tree.frame_bodies, strict=True) if own == body]
     for pattern in patterns:
-        at = {
-            name: np.asarray(kinematics.frame_pose(robot, name)[0])
-            for name in names
-            if re.search(pattern, name, re.IGNORECASE)
-        }
+        named = [name for name in names if re.search(pattern, name, re.IGNORECASE)]
+        at = {name: np.asarray(kinematics.frame_pose(robot, name)[0]) for name in named}
         far = {name: float(np.linalg.norm(place - anchor)) for name, place in at.items()}
         far = {name: length for name, length in far.items() if length > max(least_share * upper, _SAME)}
         if far:
@@ -224,9 +213,7 @@ def find_end(
             return (nearest, ORIGIN), at[nearest]
     most = _MOST_FOREARM * upper if upper > 0.0 else np.inf  # no upper arm to compare with
     end = _far_end(robot, body, anchor, most)
-    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, _name(robot, body)))
-    x, y, z = np.round((end - position) @ rotation, 6).tolist()
-    return (_name(robot, body), (x, y, z)), end
+    return as_place(robot, kinematics, tree.body_names[body], end), end
 
 
 def _far_end(robot: Robot, body: int, anchor: np.ndarray, most: float) -> np.ndarray:

@@ -77,8 +77,10 @@ def by_shapes(robot: Robot, body: int) -> Extent | None:
 
     Mesh files that the model does not contain are read from disk; unreadable files are left out.
     """
-    clouds = [geom_points(robot.mj_model, geom) for geom in _solid_geoms(robot.mj_model, body)]
-    clouds += _unread_points(robot, body)
+    model = robot.mj_model
+    solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    geoms = np.flatnonzero(solid & (model.geom_bodyid == body) & np.isin(model.geom_type, SHAPES))
+    clouds = [*(geom_points(model, int(geom)) for geom in geoms), *_unread_points(robot, body)]
     if not clouds:
         return None
     points = np.concatenate(clouds)
@@ -90,24 +92,15 @@ def by_shapes(robot: Robot, body: int) -> Extent | None:
     return Extent(middle + axes @ (0.5 * (low + high)), axes, 0.5 * (high - low))
 
 
-def _solid_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
-    return np.flatnonzero(solid & (model.geom_bodyid == body) & np.isin(model.geom_type, SHAPES)).tolist()
-
-
 def geom_points(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
     """Return the corners of the box around a geom, or the vertices of a mesh, in the body's frame [m]."""
-    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * model.geom_aabb[geom, 3:]
     if model.geom_type[geom] == _GEOM.mjGEOM_MESH:
-        corners = mesh_vertices(model, geom)
-    return model.geom_pos[geom] + corners @ rotation_matrix(model.geom_quat[geom]).T
-
-
-def mesh_vertices(model: mujoco.MjModel, geom: int) -> Float[np.ndarray, "k 3"]:
-    """Return the vertices of a mesh geom in the geom's frame [m]."""
-    mesh = model.geom_dataid[geom]
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    return model.mesh_vert[first : first + count].astype(float)
+        mesh = model.mesh(model.geom_dataid[geom])
+        first = int(mesh.vertadr[0])
+        points = model.mesh_vert[first : first + int(mesh.vertnum[0])].astype(float)
+    else:
+        points = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), -1).reshape(-1, 3) * model.geom_aabb[geom, 3:]
+    return model.geom_pos[geom] + points @ rotation_matrix(model.geom_quat[geom]).T
 
 
 def _unread_points(robot: Robot, body: int) -> list[Float[np.ndarray, "k 3"]]:

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._errors import OsikValueError
 from ..kinematics import difference
 from ..limits import Limit
+from ..numerics._arguments import check_count
 from ..robot import Robot
 from ._finish import inside_ranges, moved, velocity_inside
 from ._goals import Goals, Weights
@@ -95,9 +96,7 @@ class LiveRetargeter(OnRobot):
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         mapping: role to joint name of the stream. None: by common names.
-        profile: as in ``Retargeter``.
-        acceleration: as in ``Retargeter``.
-        balance: as in ``Retargeter``.
+        profile, acceleration, balance: as in ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
 
@@ -120,16 +119,15 @@ class LiveRetargeter(OnRobot):
     ):
         if not 0.0 < look_ahead <= _LONGEST:
             raise OsikValueError(f"look_ahead is {look_ahead}; it is a time in seconds, over 0 and up to {_LONGEST:g}")
-        if not iterations >= 1:
-            raise OsikValueError(f"iterations is {iterations}; it is 1 at least")
+        check_count("iterations", iterations)
         super().__init__(robot, profile, acceleration, balance)
         self._dt = 1.0 / standing.fps
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
-        self.iterations = int(iterations)
+        self.iterations = iterations
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)
-        self._window_bounds = self._bounds(self._dt)
+        self._bounds = self._build.bounds(self._acceleration, self._dt)
         self.reset()
 
     @property
@@ -211,13 +209,8 @@ class LiveRetargeter(OnRobot):
         seen = np.array(self._seen)
         gone = np.isnan(seen[..., 0])
         contact = None if self._stands[0] is None else np.array(self._stands)
-        motion = HumanMotion(
-            "stream",
-            self._standing.fps,
-            self._standing.joint_names,
-            _filled(seen, self._known),
-            contact=contact,
-        )
+        names, positions = self._standing.joint_names, _filled(seen, self._known)
+        motion = HumanMotion("stream", self._standing.fps, names, positions, contact=contact)
         own = read_person(motion, self.roles, self._measures, self.profile.standing)
         person, now = self._build.seen(own), self._history
         # the last pass holds the feet, so a long contact needs no larger weight, which would take more iterations
@@ -234,7 +227,7 @@ class LiveRetargeter(OnRobot):
 
     def _advanced(self, goals: Goals, contact: Bool[np.ndarray, "4"]) -> _Plan:
         """Return the plan moved on by one frame."""
-        weights, bounds, guess = self.profile.weights, self._window_bounds, self._build.first_guess(goals)
+        weights, bounds, guess = self.profile.weights, self._bounds, self._build.first_guess(goals)
         if self._plan is None:
             first = make_plan(self._body, goals, weights, bounds, guess, _FIRST_ITERATIONS).q
             # start at rest: the first frame is repeated _PAST times
@@ -250,8 +243,8 @@ class LiveRetargeter(OnRobot):
                 q[-1, at : at + 3] += guess[-1, at : at + 3] - guess[-2, at : at + 3]
             velocity, stance, damping = self._plan.velocity, self._plan.stance, self._plan.damping
         before = velocity, stance, damping
-        known = self._body, goals, weights, bounds, q, before, contact, self.limits
-        return _advance(*known, self._dt, self.iterations)
+        more = contact, self.limits, self._dt, self.iterations
+        return _advance(self._body, goals, weights, bounds, q, before, *more)
 
 
 @jax.jit

@@ -64,13 +64,18 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         return {name: data[name] for name in arrays_to_read(data.files)}
 
 
+def check_has(path: Path, arrays: dict[str, np.ndarray], *names: str) -> None:
+    """Raise ValueError if a file lacks an array."""
+    missing = [name for name in names if name not in arrays]
+    if missing:
+        raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+
+
 def _from_npz(path: Path) -> HumanMotion:
     arrays = load_arrays(path)
     if is_smpl(arrays):
         return read_smpl(path, arrays)
-    missing = [name for name in ("fps", "positions", "joint_names") if name not in arrays]
-    if missing:
-        raise OsikValueError(f"{path} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+    check_has(path, arrays, "fps", "positions", "joint_names")
     contact = _numbers(path, arrays, "contact")
     if contact is not None and not np.isin(contact, (0.0, 1.0)).all():
         raise OsikValueError(f"{path}: contact is 0 or 1, not {contact[~np.isin(contact, (0.0, 1.0))][0]:g}")

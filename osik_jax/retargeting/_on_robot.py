@@ -18,7 +18,7 @@ from ._profile_file import check_profile, find_profile
 from ._roles import chain
 from ._skeletons import find_roles
 from ._source_motion import SourceMotion
-from ._terms import Body, Bounds
+from ._terms import Body
 
 ACCELERATION = 240.0
 
@@ -26,25 +26,17 @@ ACCELERATION = 240.0
 class OnRobot:
     """Robot with profile, limits and derived data, computed once for all clips.
 
-    Arguments are those of ``Retargeter``.
+    Arguments and errors are those of ``Retargeter``.
 
     Attributes:
         robot: the robot, with its home turned to face x if necessary.
         profile: its profile.
         balance: as given.
         limits: limits of position, speed and acceleration, which hold exactly.
-
-    Raises:
-        ValueError: no limbs are found, nothing holds a free base, or a number is out of range.
-        KeyError: the profile or ``acceleration`` names something that the robot does not have.
     """
 
     def __init__(
-        self,
-        robot: Robot,
-        profile: Profile | None,
-        acceleration: float | Mapping[str, float],
-        balance: float | None,
+        self, robot: Robot, profile: Profile | None, acceleration: float | Mapping[str, float], balance: float | None
     ):
         if balance is not None and not (np.isfinite(balance) and balance >= 0.0):
             raise OsikValueError(f"balance is {balance}; it is a length in metres, 0 or more")
@@ -84,21 +76,15 @@ class OnRobot:
             return find_roles(motion.joint_names, mapping, needed, motion.positions)
         if mapping is not None:
             raise OsikValueError("mapping names joints of a person's clip; a robot's motion has those of its profile")
-        missing = [role for limb in self.profile.followed for role in limb if role not in motion.seen.keypoints]
+        roles = dict.fromkeys(role for limb in self.profile.followed for role in limb)
+        missing = [role for role in roles if role not in motion.seen.keypoints]
         if missing:
-            raise OsikValueError(
-                f"the robot that is followed has no {', '.join(dict.fromkeys(missing))}; give a profile without these "
-                "keypoints"
-            )
+            text = f"the robot that is followed has no {', '.join(missing)}; give a profile without these keypoints"
+            raise OsikValueError(text)
         if self.profile.walks and motion.seen.standing != self.profile.standing:
-            raise OsikValueError(
-                f"{len(self.profile.feet)} feet cannot follow {len(motion.seen.feet)}: they walk otherwise"
-            )
+            count, other = len(self.profile.feet), len(motion.seen.feet)
+            raise OsikValueError(f"{count} feet cannot follow {other}: they walk otherwise")
         return {}
-
-    def _bounds(self, dt: float) -> Bounds:
-        """Return the joint bounds of a plan with one frame per ``dt`` seconds."""
-        return self._build.bounds(self._acceleration, dt)
 
 
 def _on_joints(robot: Robot, acceleration: float | Mapping[str, float]) -> AccelerationLimit:

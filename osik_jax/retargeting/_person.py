@@ -107,8 +107,11 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
     """
     points = {role: motion.track(name) for role, name in roles.items()}
     legs, on_four = _has_legs(points), bool(standing) and standing != CONTACT_POINTS
-    if not on_four:
-        _check_up(motion, roles)
+    if not on_four and (up := find_up(motion, "z", roles)) != "z":
+        warn(
+            f"{motion.name}: z is taken to point up, and the motion looks as if {up} did; "
+            f"load_motion(path, up={up!r}) and --up={up} turn {up} up"
+        )
     straight, flat = None, {}
     if legs:
         flat = {side: _flat({**points, **_toes(points, side)}, side) for side in SIDES}
@@ -143,16 +146,6 @@ def measure(motion: HumanMotion, roles: Mapping[str, str], standing: tuple[str, 
         # the height of an ankle over a flat foot; single frames may be lower, so not the minimum
         ankle = float(np.percentile(heights.min(1), 5)) - floor
     return Measures(lengths, ankle, floor, noise, flat, straight)
-
-
-def _check_up(motion: HumanMotion, roles: Mapping[str, str]) -> None:
-    """Warn if z does not seem to point up."""
-    up = find_up(motion, "z", roles)
-    if up != "z":
-        warn(
-            f"{motion.name}: z is taken to point up, and the motion looks as if {up} did; "
-            f"load_motion(path, up={up!r}) and --up={up} turn {up} up"
-        )
 
 
 def read_person(
@@ -238,22 +231,17 @@ def _turns(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     low, vertical = _middle(points, "hip", "shoulder"), np.array([0.0, 0.0, 1.0])
     high = points["neck"] if "neck" in points else _middle(points, "shoulder", "hip")
     chest = points.get("chest", low)
-    across = {
-        part: points[f"left_{part}"] - points[f"right_{part}"]
-        for part in ("hip", "shoulder")
-        if f"left_{part}" in points and f"right_{part}" in points
-    }
 
-    def axes(parts: tuple[str, str], up: np.ndarray) -> np.ndarray:
-        up = np.where(np.linalg.norm(up, axis=-1, keepdims=True) > _SPINE, up, vertical)
-        left = next((across[part] for part in parts if part in across), np.broadcast_to(np.eye(3)[1], up.shape))
-        return axes_from(left, up)
+    def or_else(part: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return np.where(np.linalg.norm(part, axis=-1, keepdims=True) > _SPINE, part, other)
 
-    lower, upper = (
-        np.where(np.linalg.norm(part, axis=-1, keepdims=True) > _SPINE, part, high - low)
-        for part in (chest - low, high - chest)
-    )
-    return axes(("hip", "shoulder"), lower), axes(("shoulder", "hip"), upper)
+    def axes(parts: tuple[str, str], part: np.ndarray) -> np.ndarray:
+        up = or_else(or_else(part, high - low), vertical)
+        pairs = [(f"left_{name}", f"right_{name}") for name in parts]
+        known = [points[left] - points[right] for left, right in pairs if {left, right} <= set(points)]
+        return axes_from(known[0] if known else np.broadcast_to(np.eye(3)[1], up.shape), up)
+
+    return axes(("hip", "shoulder"), chest - low), axes(("shoulder", "hip"), high - chest)
 
 
 def _upright(points: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -94,11 +94,8 @@ def pairs_at_home(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
     if not profile.capsules:
         return []
     bodies = [robot.tree.frame_bodies[robot.tree.frame(c.frame)] for c in profile.capsules]
-    pairs = [
-        (i, j)
-        for i, j in itertools.combinations(range(len(bodies)), 2)
-        if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART
-    ]
+    pairs = itertools.combinations(range(len(bodies)), 2)
+    pairs = [(i, j) for i, j in pairs if joints_between(robot, bodies[i], bodies[j]) >= JOINTS_APART]
     home = find_places(robot, profile, model_qpos(robot, robot.q0)).capsules[0]
     distances = CapsuleDistances(profile).of(home, pairs)
     return [pair for pair, distance in zip(pairs, distances, strict=True) if distance >= 0.0]
@@ -106,14 +103,5 @@ def pairs_at_home(robot: Robot, profile: Profile) -> list[tuple[int, int]]:
 
 def joints_between(robot: Robot, a: int, b: int) -> int:
     """Return the number of joints on the tree path between two bodies."""
-    parents = robot.tree.body_parents
-
-    def chain(body: int) -> list[int]:
-        out = [body]
-        while out[-1] != parents[out[-1]]:
-            out.append(parents[out[-1]])
-        return out
-
-    first, second = chain(a), chain(b)
-    common = next(body for body in first if body in second)
-    return first.index(common) + second.index(common)
+    above = robot.tree.descendants
+    return int((above[:, a] != above[:, b]).sum())

@@ -243,7 +243,7 @@ def _descended_by_core(
     stiffness, _, little = _START[until]
     rules = (_LARGEST_STEP, _STIFFENING, _SLOWING, _FIXED, _LEAST_DAMPING, _STIFF_DAMPING, _MOST_DAMPING, _CALMER)
     rules += (_CAREFUL, little, float(_SETTLED), stiffness)
-    return Plan(*_plan_kernel.descended(call, *clip, q, rules, damping, most, endings))
+    return Plan(*_plan_kernel.descended(call, clip, q, rules, damping, most, endings))
 
 
 _by_kernel = by_kernel(_descended_plain, _descended_by_core, on_gpu=False)
@@ -275,12 +275,6 @@ def _improved(clip: _Clip, state: _State, little: float = _LITTLE) -> _State:
     old, new = (state.q, here, state.stiffness), (candidate, there, stiffer)
     q, here, stiffness = jax.tree.map(lambda a, b: jnp.where(better, b, a), old, new)
     return _State(q, here, stiffness, ready, damping, growth, settled, state.iterations + 1)
-
-
-def _weights_between(body: Body, goals: Goals, weights: Weights) -> Float[Array, "F 4"]:
-    """Return the weight of each contact point's motion since the frame before; 0 in the first frame. (F, 4)."""
-    both = goals.contact[1:] * goals.contact[:-1]
-    return (0.0 if body.rolls else weights.stance) * jnp.concatenate([jnp.zeros_like(both[:1]), both])
 
 
 class _Hinge(NamedTuple):
@@ -335,7 +329,8 @@ def _linearised(clip: _Clip, q: Float[Array, "F nq"], stiffness: Float[Array, ""
     # standing points do not move from one frame to the next: p_t - p_t-1, with derivatives in both frames
     point, moving = rows.stance, rows.stance_jacobian
     move = point - jnp.roll(point, 1, 0)
-    held = jnp.repeat(_weights_between(body, goals, weights), 2, axis=-1)
+    both = jnp.concatenate([jnp.zeros_like(goals.contact[:1]), goals.contact[1:] * goals.contact[:-1]])
+    held = jnp.repeat((0.0 if body.rolls else weights.stance) * both, 2, axis=-1)
     soft = _halves(there * rows.soft, rows.residual) + _halves(there * own.soft_weight, own.soft)
     stiff = _halves(there * rows.stiff, rows.residual) + _halves(there * own.stiff_weight, own.stiff)
     stiff += _halves(held, move)

@@ -21,11 +21,7 @@ from ._terms import CLEARANCE, PAIRS, SHORTEST, SWINGING, Body, Bounds
 
 def descended(
     call: Call,
-    body: Body,
-    goals: Goals,
-    weights: Weights,
-    bounds: Bounds,
-    free: Float[Array, "_ F"],
+    clip: tuple[Body, Goals, Weights, Bounds, Float[Array, "_ F"]],
     q: Float[Array, "_ F nq"],
     rules: tuple[float, ...],
     damping: Float[Array, " _"],
@@ -34,10 +30,11 @@ def descended(
 ) -> tuple[Array, Array, Array]:
     """Return configurations, costs and iteration counts of a batch of clips.
 
-    ``rules`` are the constants of the method in the order of ``_plan.py``. ``endings`` says whether it ends when bounds
-    are ready to get stiffer, and when steps gain little (0 or 1 each).
+    ``clip`` ends with 1 for each frame that may move, and 0 for past frames. ``rules`` are the constants of the method
+    in the order of ``_plan.py``. ``endings`` says whether it ends when bounds are ready to get stiffer, and when steps
+    gain little (0 or 1 each).
     """
-    frames, nq = q.shape[1:]
+    (body, goals, weights, bounds, free), (frames, nq) = clip, q.shape[1:]
     integers = _structure(body)
     wishes = goals.directions, goals.pelvis, goals.torso, goals.root, goals.feet, goals.contact
     wishes += goals.held, goals.present

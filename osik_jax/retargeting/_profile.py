@@ -192,6 +192,20 @@ def world_points(robot: Robot, kinematics: Kinematics, places: Sequence[Place]) 
     return positions + np.einsum("kij,kj->ki", rotations, np.array([point for _, point in places]))
 
 
+def in_frame(
+    robot: Robot, kinematics: Kinematics, frame: str, points: Float[np.ndarray, "*k 3"]
+) -> Float[np.ndarray, "*k 3"]:
+    """Return points of the world in a frame [m]."""
+    position, rotation = (np.asarray(x) for x in kinematics.frame_pose(robot, frame))
+    return (points - position) @ rotation
+
+
+def as_place(robot: Robot, kinematics: Kinematics, frame: str, point: Float[np.ndarray, "3"]) -> Place:
+    """Return a point of the world [m] as a place in a frame, rounded to 1 um."""
+    x, y, z = np.round(in_frame(robot, kinematics, frame, point), 6).tolist()
+    return frame, (x, y, z)
+
+
 def _check_points(what: str, points: object, shape: tuple[int, ...]) -> None:
     """Raise ValueError unless these are points, finite and of a shape."""
     numbers = np.asarray(points, float)

@@ -18,6 +18,7 @@ from ._facing import facing_at_home
 from ._places import CapsuleDistances, Places, find_places, pairs_at_home
 from ._retargeted import Retargeted
 from ._roles import CHAINS, SIDES
+from ._skeletons import shortened
 
 JUMP, AT_SPEED, AT_END = 15.0, 0.97, 0.01
 """A change of joint speed from one frame to the next that counts as a jump [rad/s], the share of its speed limit at
@@ -134,9 +135,8 @@ def _rms(values: np.ndarray) -> float:
 
 def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
     """Return what ``report`` says of the feet: None without feet or with a fixed base; slip is None for wheels."""
-    names = ("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max")
     if not result.profile.feet or not result.robot.floating_base:
-        return dict.fromkeys(names)
+        return dict.fromkeys(("contact_share", "slip_mm_max", "float_mm_max", "below_floor_mm_max"))
     points, contact = places.standing, result.contact
     slip = [0.0]
     for k in range(4):
@@ -144,13 +144,12 @@ def _feet(places: Places, result: Retargeted) -> dict[str, Any]:
             track = points[start:end, k, :2]
             slip.append(float(np.linalg.norm(track - track[0], axis=-1).max()))
     heights = points[..., 2][contact]
-    values = (
-        float(contact.any(1).mean()),
-        None if result.profile.rolls else 1e3 * max(slip),
-        1e3 * float(max(0.0, heights.max(initial=0.0))),
-        1e3 * float(max(0.0, -places.soles[..., 2].min())),
-    )
-    return dict(zip(names, values, strict=True))
+    return {
+        "contact_share": float(contact.any(1).mean()),
+        "slip_mm_max": None if result.profile.rolls else 1e3 * max(slip),
+        "float_mm_max": 1e3 * float(max(0.0, heights.max(initial=0.0))),
+        "below_floor_mm_max": 1e3 * float(max(0.0, -places.soles[..., 2].min())),
+    }
 
 
 def _balance(
@@ -278,7 +277,6 @@ def _posture(figures: Mapping[str, Any]) -> list[str]:
     share: Mapping[str, float] = figures["joints"]["at_end_share"]
     rests = sorted((name for name in share if share[name] > _RESTS), key=lambda name: -share[name])
     if rests:
-        named = ", ".join(f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests[:_MOST_JOINTS])
-        more = f" and {len(rests) - _MOST_JOINTS} more" if len(rests) > _MOST_JOINTS else ""
-        out.append(f"joints rest at an end of their range: {named}{more}")
+        told = [f"{name} ({100.0 * share[name]:.0f} % of the frames)" for name in rests]
+        out.append(f"joints rest at an end of their range: {shortened(told, _MOST_JOINTS)}")
     return out

@@ -33,7 +33,6 @@ from ._source_motion import SourceMotion
 from ._terms import Body, Bounds
 
 Source = HumanMotion | SourceMotion
-_Checked = tuple[Source, Mapping[str, str]]
 LENGTHS = 16
 """Programs are compiled for multiples of this number of frames."""
 
@@ -95,6 +94,7 @@ class Retargeter(OnRobot):
         super().__init__(robot, profile, acceleration, balance)
         if not (np.isfinite(smoothness) and smoothness >= 0.0):
             raise OsikValueError(f"smoothness is {smoothness}; it is a time in seconds, 0 or more")
+        check_count("max_iterations", max_iterations)
         self.smoothness = smoothness
         self.max_iterations = max_iterations
 
@@ -132,13 +132,16 @@ class Retargeter(OnRobot):
             ValueError, KeyError: as of ``retarget``; the message starts with the clip's name.
         """
         check_count("chunk", chunk)
-        checked = [self._checked_by_name(motion, mapping, fps) for motion in motions]
-        found: dict[int, Retargeted] = {}
+        reads, found = [], dict[int, Retargeted]()
+        for motion in motions:
+            try:
+                reads.append(partial(self._read, *self._checked(motion, mapping, fps)))
+            except (ValueError, KeyError) as error:
+                raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
         def keep(number: int, make: Callable[[], Retargeted]) -> None:
             found[number] = make()
 
-        reads = [partial(self._read, *one) for one in checked]
         with reported(len(reads), 0, progress, "clips") as advance:
             for _ in self._each(reads, keep, chunk):
                 advance(1)
@@ -175,18 +178,14 @@ class Retargeter(OnRobot):
         """Return a clip as arrays for planning, after checking it."""
         return self._read(*self._checked(motion, mapping, fps))
 
-    def _checked(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
+    def _checked(
+        self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None
+    ) -> tuple[Source, Mapping[str, str]]:
         """Return a clip at the requested rate and its joints by role; raise ValueError if it cannot be retargeted."""
         motion = motion if fps is None else motion.resampled(fps)
         if motion.frames < 3:
             raise OsikValueError(f"the clip has {motion.frames} frames; it takes three to have an acceleration")
         return motion, self._roles(motion, mapping)
-
-    def _checked_by_name(self, motion: Source, mapping: Mapping[str, str] | None, fps: float | None) -> _Checked:
-        try:
-            return self._checked(motion, mapping, fps)
-        except (ValueError, KeyError) as error:
-            raise type(error)(f"{motion.name}: {error.args[0]}") from error
 
     def _read(self, motion: Source, roles: Mapping[str, str]) -> Clip:
         """Return a checked clip as arrays for planning; ``roles`` maps roles to the clip's joint names."""
@@ -198,7 +197,8 @@ class Retargeter(OnRobot):
         goals = self._build.goals(person)
         goals, start = padded(goals, self._build.first_guess(goals), -motion.frames % LENGTHS)
         dt = 1.0 / motion.fps
-        return Clip(person, motion.frames, goals, start, self._bounds(dt), dt, self._build.touches(person))
+        bounds = self._build.bounds(self._acceleration, dt)
+        return Clip(person, motion.frames, goals, start, bounds, dt, self._build.touches(person))
 
     def _solved(
         self, clips: Sequence[tuple[int, Clip]], length: int, lanes: int
@@ -233,10 +233,11 @@ class Retargeter(OnRobot):
 
     def _finished(self, clip: Clip, solved: Solved) -> Retargeted:
         q, off = (np.asarray(part)[: clip.frames] for part in (solved.q, solved.off_plan))
-        cost = float(solved.cost[0]), float(solved.cost[1])
-        objects = self._build.objects(clip.person) if clip.person.objects else {}
-        more: dict[str, Any] = dict(iterations=int(solved.iterations), cost=cost, objects=objects, touches=clip.touches)
-        return Retargeted.of(self.robot, self.profile, clip.person, q, off, **more)
+        return Retargeted.of(
+            self.robot, self.profile, clip.person, q, off,
+            iterations=int(solved.iterations), cost=(float(solved.cost[0]), float(solved.cost[1])),
+            objects=self._build.objects(clip.person), touches=clip.touches,
+        )  # fmt: skip
 
 
 def as_lane(clip: Clip, length: int) -> _Lane:
@@ -317,11 +318,7 @@ def retarget(
         motion: clip of a person, or of another robot (``SourceMotion``).
         mapping: role to joint name of a person's clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
-        profile: as in ``Retargeter``.
-        acceleration: as in ``Retargeter``.
-        smoothness: as in ``Retargeter``.
-        balance: as in ``Retargeter``.
-        max_iterations: as in ``Retargeter``.
+        profile, acceleration, smoothness, balance, max_iterations: as in ``Retargeter``.
 
     Raises:
         ValueError: the clip has fewer than three frames or lacks a needed joint, the robot has no limbs of a person,

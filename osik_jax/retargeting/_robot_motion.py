@@ -15,7 +15,7 @@ from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot._mujoco import model_qpos
 from ..robot._tree import FREE
-from ._load import load_arrays
+from ._load import check_has, load_arrays
 from ._motion import check_rate, instants
 from ._rotations import slerp
 
@@ -79,9 +79,7 @@ class RobotMotion:
             if joint_names is not None or fps is not None:
                 raise OsikValueError(f"{source}: joint_names and fps go with a CSV; a .npz has its own")
             arrays = load_arrays(source)
-            missing = [name for name in ("fps", "qpos", "joint_names") if name not in arrays]
-            if missing:
-                raise OsikValueError(f"{source} has no {', '.join(missing)}; it has {', '.join(arrays) or 'nothing'}")
+            check_has(source, arrays, "fps", "qpos", "joint_names")
             names = tuple(str(name) for name in arrays["joint_names"].ravel())
             contact = None if "contact" not in arrays else arrays["contact"].astype(bool)
             return cls(float(arrays["fps"]), names, arrays["qpos"].astype(float), contact)

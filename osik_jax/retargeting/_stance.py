@@ -29,7 +29,6 @@ class Stance(NamedTuple):
 class Held(NamedTuple):
     """Step of a robot that holds its contacts."""
 
-    q: Float[Array, " nq"]  # the configuration after the step
     step: Float[Array, " nv"]  # the step [rad or m]
     stance: Stance  # contacts after the step
     # largest distance of a contact point from its landing place or the floor, or of a sole below the floor [m]
@@ -63,7 +62,7 @@ def hold_feet(
     rad or m; ``contact`` is that of left heel, left toe, right heel and right toe after the step.
     """
     if not body.corners:
-        return Held(integrate(body.robot, q, step), step, stance, jnp.zeros((), step.dtype))
+        return Held(step, stance, jnp.zeros((), step.dtype))
     held = contact & stance.stands & (not body.rolls)
 
     def goes_on(state: _State) -> Bool[Array, ""]:
@@ -81,19 +80,16 @@ def hold_feet(
         residual, jacobian = _rows(body, integrate(body.robot, q, state.step), contact, held, stance.landed)
         slip = jnp.linalg.norm(residual[:8].reshape(4, 2), axis=-1)
         error = jnp.maximum(slip.max(), jnp.abs(residual[8:]).max())
-        best = jnp.where(error < state.error, state.step, state.best)
-        return residual, jacobian, state._replace(best=best, error=jnp.minimum(error, state.error))
+        is_better = error < state.error  # not so if the step is not finite
+        best, least = jnp.where(is_better, state.step, state.best), jnp.where(is_better, error, state.error)
+        return residual, jacobian, state._replace(best=best, error=least)
 
     first = _State(step, jnp.ones_like(step), step, jnp.asarray(jnp.inf, step.dtype), jnp.array(0))
     # with most dofs at their bounds the others may make steps that the linear model does not describe
-    step = evaluated(jax.lax.while_loop(goes_on, improved, first))[2].best
-    after = integrate(body.robot, q, step)
-    points = soles(body, forward_kinematics(body.robot, after))[0]
-    places = points.reshape(4, 2, 3).mean(1)[:, :2]
-    landed = jnp.where(held[:, None], stance.landed, places)
-    slip = jnp.linalg.norm(places - landed, axis=-1).max()
-    heights = jnp.where(jnp.repeat(contact, 2), jnp.abs(points[:, 2]), jnp.maximum(-points[:, 2], 0.0))
-    return Held(after, step, Stance(landed, contact), jnp.maximum(slip, heights.max()))
+    last = evaluated(jax.lax.while_loop(goes_on, improved, first))[2]
+    points = soles(body, forward_kinematics(body.robot, integrate(body.robot, q, last.best)))[0]
+    landed = jnp.where(held[:, None], stance.landed, points.reshape(4, 2, 3).mean(1)[:, :2])
+    return Held(last.best, Stance(landed, contact), last.error)
 
 
 def _rows(
@@ -103,13 +99,7 @@ def _rows(
     points, rates = soles(body, forward_kinematics(body.robot, q))
     middles, moves = points.reshape(4, 2, 3).mean(1), rates.reshape(4, 2, 3, -1).mean(1)
     counts = jnp.repeat(contact, 2) | (points[:, 2] < 0.0)
-    residual = jnp.concatenate(
-        [jnp.where(held[:, None], middles[:, :2] - landed, 0.0).ravel(), jnp.where(counts, points[:, 2], 0.0)]
-    )
-    jacobian = jnp.concatenate(
-        [
-            jnp.where(held[:, None, None], moves[:, :2], 0.0).reshape(8, -1),
-            jnp.where(counts[:, None], rates[:, 2], 0.0),
-        ]
-    )
-    return residual, jacobian
+    off, above = jnp.where(held[:, None], middles[:, :2] - landed, 0.0), jnp.where(counts, points[:, 2], 0.0)
+    sideways = jnp.where(held[:, None, None], moves[:, :2], 0.0).reshape(8, -1)
+    upwards = jnp.where(counts[:, None], rates[:, 2], 0.0)
+    return jnp.concatenate([off.ravel(), above]), jnp.concatenate([sideways, upwards])

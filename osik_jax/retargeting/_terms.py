@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..collision._distance import Nearest, _across, _parameters, _rounded, _segment_parameters
+from ..collision._distance import _across, _parameters, _rounded, _segment_parameters
 from ..kinematics import Kinematics, forward_kinematics
 from ..kinematics._forward import home_kinematics, independent_columns
 from ..kinematics._rigid import cross, rotate
@@ -77,16 +77,19 @@ class Body(eqx.Module):
         Balance keeps the margin ``inside`` [m]. Reaches ``touching``, of length 1 m, come after those of the profile;
         they may begin at ``ORIGIN``.
         """
-        fixed: dict[str, Place] = {ORIGIN: (robot.tree.body_names[0], (0.0, 0.0, 0.0))} if touching else {}
-        points = {**profile.keypoints, **fixed}
+        points = dict(profile.keypoints)
+        if touching:
+            points[ORIGIN] = robot.tree.body_names[0], (0.0, 0.0, 0.0)
         keys, free = tuple(points), robot.floating_base
         corners = profile.corners if free else ()
         places: list[Place] = [*points.values(), *((frame, (0.0, 0.0, 0.0)) for frame in profile.turned)]
         places += corners
         for capsule in profile.capsules:
             places += [(capsule.frame, capsule.start), (capsule.frame, capsule.end)]
-        feet = {robot.tree.frame_bodies[robot.tree.frame(foot.frame)] for foot in profile.feet.values()}
-        bodies = [robot.tree.frame_bodies[robot.tree.frame(capsule.frame)] for capsule in profile.capsules]
+        tree, capsules = robot.tree, profile.capsules
+        feet = {tree.frame_bodies[tree.frame(foot.frame)] for foot in profile.feet.values()}
+        outer = [i for i, own in enumerate(capsules) if not any(wider.hides(own) for wider in capsules)]
+        above = [i for i in outer if tree.frame_bodies[tree.frame(capsules[i].frame)] not in feet]
         flat = [2 + i for i, side in enumerate(SIDES) if side in profile.feet and not profile.feet[side].radius]
         turned = [*([0] if free else []), *(flat if profile.walks else []), *([] if profile.torso is None else [1])]
         hips = (keys.index("left_hip"), keys.index("right_hip")) if profile.walks else (len(keys), len(keys))
@@ -108,11 +111,7 @@ class Body(eqx.Module):
             roots=hips if free else (),
             corners=len(corners),
             rolls=profile.rolls,
-            above=tuple(
-                i
-                for i, (body, own) in enumerate(zip(bodies, profile.capsules, strict=True))
-                if free and body not in feet and not any(wider.hides(own) for wider in profile.capsules)
-            ),
+            above=tuple(above if free else ()),
             pairs=tuple((int(i), int(j)) for i, j in pairs),
         )
 
@@ -192,6 +191,10 @@ class _Rows(NamedTuple):
     weight: Float[Array, " m"]
 
 
+def _joined(rows: Sequence[_Rows]) -> _Rows:
+    return _Rows(*(jnp.concatenate(column) for column in zip(*rows, strict=True)))
+
+
 def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weights, bounds: Bounds) -> FrameRows:
     """Return all cost terms of one frame, and its contact points."""
     robot = body.robot
@@ -211,10 +214,8 @@ def frame_rows(body: Body, q: Float[Array, " nq"], goals: Goals, weights: Weight
         stiff.append(_apart(place, first, body, weights))
     if body.inside is not None:
         stiff.append(_balanced(place, corners, kinematics, robot, goals.contact, body.inside, weights.balance))
-    wishes = _Rows(*(jnp.concatenate(column) for column in zip(*soft, strict=True)))
-    needs = jax.tree.map(lambda row: row[:0], wishes)
-    if stiff:
-        needs = _Rows(*(jnp.concatenate(column) for column in zip(*stiff, strict=True)))
+    wishes = _joined(soft)
+    needs = _joined(stiff) if stiff else jax.tree.map(lambda row: row[:0], wishes)
     stance, along = jnp.zeros(8, q.dtype), jnp.zeros((8, wishes.rates.shape[1]), q.dtype)
     if body.corners:
         stance, along = _stance(place, corners)
@@ -274,14 +275,9 @@ def _limbs(place: _Places, body: Body, goals: Goals, weights: Weights) -> _Rows:
     length = jnp.maximum(length, SHORTEST)[:, None]
     direction = across / length
     directed = (np.arange(len(first)) < len(first) - reaches)[:, None, None]
-    sideways = (jnp.eye(3, dtype=length.dtype) - directed * direction[:, :, None] * direction[:, None]) / length[
-        ..., None
-    ]
-    sideways = sideways.reshape(-1, 3)
-    ends = []
-    for index in (first, second):
-        index = np.repeat(index, 3)
-        ends.append(place.motion.rates(place.moves[index], sideways, place.points[index]))
+    sideways = jnp.eye(3, dtype=length.dtype) - directed * direction[:, :, None] * direction[:, None]
+    sideways = (sideways / length[..., None]).reshape(-1, 3)
+    ends = [place.motion.rates(place.moves[i], sideways, place.points[i]) for i in (first.repeat(3), second.repeat(3))]
     residual = (direction - goals.directions).ravel()
     weight = jnp.concatenate([jnp.ones(len(first) - reaches, residual.dtype), goals.held])
     return _Rows(residual, ends[1] - ends[0], weights.limb * jnp.repeat(weight, 3))
@@ -295,12 +291,9 @@ def _turn(place: _Places, first: int, i: int, wanted: Float[Array, "3 3"], weigh
 
 
 def _root(place: _Places, roots: tuple[int, ...], goals: Goals, weights: Weights) -> _Rows:
-    rates = []
-    for root in roots:
-        point = jnp.broadcast_to(place.points[root], (3, 3))
-        rates.append(place.motion.rates(place.moves[np.full(3, root)], 0.5 * jnp.eye(3, dtype=point.dtype), point))
-    residual = place.points[np.array(roots)].mean(0) - goals.root
-    return _Rows(residual, rates[0] + rates[1], weights.root)
+    both, axes = np.repeat(roots, 3), jnp.tile(0.5 * jnp.eye(3, dtype=place.points.dtype), (2, 1))
+    rates = place.motion.rates(place.moves[both], axes, place.points[both]).reshape(2, 3, -1).sum(0)
+    return _Rows(place.points[np.array(roots)].mean(0) - goals.root, rates, weights.root)
 
 
 def _heights(place: _Places, some: slice | np.ndarray) -> tuple[Array, Array]:
@@ -389,9 +382,9 @@ def _apart(place: _Places, first: int, body: Body, weights: Weights) -> _Rows:
     a, b = jnp.asarray(pairs)[chosen].T
     s, t = jax.vmap(_segment_parameters)(along[a], along[b], start[a] - start[b])
     on_a, on_b = start[a] + s[:, None] * along[a], start[b] + t[:, None] * along[b]
-    middle, radii = start + 0.5 * along, jnp.stack([body.radii[a], body.radii[b]], -1)
-    found = jnp.concatenate([on_a, on_b, along[a], along[b], middle[b] - middle[a], radii], -1)
-    near = jax.vmap(_nearest)(found)
+    middle = start + 0.5 * along
+    sideways = jax.vmap(_across)(along[a], along[b], middle[b] - middle[a])
+    near = jax.vmap(_rounded)(on_a, on_b, body.radii[a], body.radii[b], sideways)
     moves = jnp.asarray(place.moves[first::2][pairs])[chosen]
     rates = [place.motion.rates(moves[:, i], near.normal, p) for i, p in enumerate((near.point_a, near.point_b))]
     gap = near.distance - weights.margin
@@ -413,12 +406,3 @@ def _ways(
     s, t = _parameters(aa, bb, ab, ao, bo)
     square = oo + s * (s * aa + 2.0 * (ao - t * ab)) + t * (t * bb - 2.0 * bo)
     return jnp.sqrt(jnp.maximum(square, 0.0)) - (radii[a] + radii[b]).astype(jnp.float32)
-
-
-def _nearest(found: Float[Array, "17"]) -> Nearest:
-    """Return the nearest points of two capsules.
-
-    ``found``: nearest points of their axes, the axes, the offset of their middles, and the radii.
-    """
-    on_a, on_b, along_a, along_b, outward, radii = jnp.split(found, (3, 6, 9, 12, 15))
-    return _rounded(on_a, on_b, radii[0], radii[1], _across(along_a, along_b, outward))

@@ -80,15 +80,9 @@ def _tracks(
             return None
         return motion.positions[:, heads[-1]], motion.positions[:, feet].mean(1), motion.positions
     at = {role: motion.track(name) for role, name in roles.items()}
-    middles = {
-        part: 0.5 * (at[f"left_{part}"] + at[f"right_{part}"])
-        for part in ("shoulder", "hip", "ankle")
-        if {f"left_{part}", f"right_{part}"} <= set(at)
-    }
-    if len(middles) < 2:
-        return None
-    top, *_, bottom = middles.values()
-    return top, bottom, np.stack(list(at.values()), 1)
+    pairs = [(f"left_{part}", f"right_{part}") for part in ("shoulder", "hip", "ankle")]
+    middles = [0.5 * (at[left] + at[right]) for left, right in pairs if {left, right} <= set(at)]
+    return (middles[0], middles[-1], np.stack(list(at.values()), 1)) if len(middles) > 1 else None
 
 
 def named(joint_names: tuple[str, ...], *words: str) -> list[int]:
@@ -102,30 +96,6 @@ def _to_z_up(up: Up) -> Float[np.ndarray, "3 3"]:
     return np.diag([1.0, -1.0, -1.0]) @ turn if up[0] == "-" else turn
 
 
-def turned_up(motion: HumanMotion, up: Up, rest_up: Up | None = None) -> HumanMotion:
-    """Return a motion rotated so that ``up`` becomes z.
-
-    Rotations are relative to the rest pose, which is rotated separately if it stands along another axis, ``rest_up``.
-    """
-    rest_up = up if rest_up is None else rest_up
-    turn, rest_turn = _to_z_up(up), _to_z_up(rest_up)
-    rotations, rest = motion.rotations, motion.rest_positions
-    if rotations is not None:
-        rotations = np.concatenate([rotations[..., :1], rotations[..., 1:] @ turn.T], -1)
-        if rest_up != up:
-            own = Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)
-            own = own * Rotation.from_matrix(turn @ rest_turn.T)
-            rotations = own.as_quat(scalar_first=True).reshape(rotations.shape)
-        rotations = continuous(rotations)
-    return dataclasses.replace(
-        motion,
-        objects={name: moved_poses(poses, turn[None]) for name, poses in motion.objects.items()},
-        positions=motion.positions @ turn.T,
-        rotations=rotations,
-        rest_positions=None if rest is None else rest @ rest_turn.T,
-    )
-
-
 def checked_up(up: str | None) -> Up | None:
     """Return a given axis, or raise ValueError if there is no such axis."""
     if up is not None and up not in UPS:
@@ -137,7 +107,8 @@ def standing_up(source: str, motion: HumanMotion, up: Up | None, expected: Up, r
     """Return a clip with z up, by the given axis or else by its motion; warn if that is not the expected axis.
 
     ``up`` is the given axis, ``expected`` the one that this kind of file has up, ``rest_up`` that of the rest pose if
-    it differs from the motion's. The warning names ``source``.
+    it differs from the motion's: the rest pose is then rotated separately, and rotations are relative to it. The
+    warning names ``source``.
     """
     own = find_up(motion, expected) if up is None else up
     if up is None and own != expected:
@@ -145,4 +116,22 @@ def standing_up(source: str, motion: HumanMotion, up: Up | None, expected: Up, r
             f"{source}: the person stands along {own} and not along {expected}, so {own} is taken to point up; "
             f"up={expected!r} keeps {expected}"
         )
-    return motion if own == "z" and rest_up in (None, "z") else turned_up(motion, own, rest_up)
+    rest_up = own if rest_up is None else rest_up
+    if own == rest_up == "z":
+        return motion
+    turn, rest_turn = _to_z_up(own), _to_z_up(rest_up)
+    rotations, rest = motion.rotations, motion.rest_positions
+    if rotations is not None:
+        rotations = np.concatenate([rotations[..., :1], rotations[..., 1:] @ turn.T], -1)
+        if rest_up != own:
+            turns = Rotation.from_quat(rotations.reshape(-1, 4), scalar_first=True)
+            turns = turns * Rotation.from_matrix(turn @ rest_turn.T)
+            rotations = turns.as_quat(scalar_first=True).reshape(rotations.shape)
+        rotations = continuous(rotations)
+    return dataclasses.replace(
+        motion,
+        objects={name: moved_poses(poses, turn[None]) for name, poses in motion.objects.items()},
+        positions=motion.positions @ turn.T,
+        rotations=rotations,
+        rest_positions=None if rest is None else rest @ rest_turn.T,
+    )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from small_robots import quietly
+from small_robots import by_mujoco, quietly
 
 import osik_jax as osik
 from osik_jax.retargeting import (
@@ -71,14 +71,13 @@ def profile(hand):
 
 def placed(robot, profile, qpos):
     """The keypoints of a robot by role, by MuJoCo. (F, 3) each."""
-    data, out = mujoco.MjData(robot.mj_model), {role: [] for role in profile.keypoints}
-    for own in qpos:
-        data.qpos[:] = own
-        mujoco.mj_kinematics(robot.mj_model, data)
-        for role, (frame, point) in profile.keypoints.items():
-            own = data.site(frame) if "tip" in frame else data.body(frame)
-            out[role].append(own.xpos + own.xmat.reshape(3, 3) @ np.array(point))
-    return {role: np.array(track) for role, track in out.items()}
+
+    def read(data):
+        frames = [data.site(f) if "tip" in f else data.body(f) for f, _ in profile.keypoints.values()]
+        points = [np.array(point) for _, point in profile.keypoints.values()]
+        return [own.xpos + own.xmat.reshape(3, 3) @ point for own, point in zip(frames, points, strict=True)]
+
+    return dict(zip(profile.keypoints, np.swapaxes(by_mujoco(robot, qpos, read), 0, 1), strict=True))
 
 
 def grasping(robot, profile, frames=24):

@@ -58,13 +58,11 @@ def test_a_bvh_file_is_the_tree_that_was_written(tmp_path_factory, figure, up, u
     assert motion.fps == 50.0 and motion.frames == len(positions)
 
 
-@pytest.mark.parametrize(
-    ("unit", "factor"), [(1.0, 1.0), (0.01, 1.0), (0.001, 1.0), (0.0254, 1.0), (0.0254 / 0.45, 1.0)]
-)
-def test_the_unit_is_found_from_the_size_of_the_skeleton(tmp_path, unit, factor):
+@pytest.mark.parametrize("unit", [1.0, 0.01, 0.001, 0.0254, 0.0254 / 0.45])
+def test_the_unit_is_found_from_the_size_of_the_skeleton(tmp_path, unit):
     motion = load_motion(write_bvh(tmp_path / "clip.bvh", dancer(), unit))
     tall = known(motion.rest_positions)[:, 2].max() - known(motion.rest_positions)[:, 2].min()
-    assert tall == pytest.approx(factor * (0.25 + 0.22 + 0.15 + 0.02 + 0.42 + 0.41 + 0.06), rel=1e-9)
+    assert tall == pytest.approx(0.25 + 0.22 + 0.15 + 0.02 + 0.42 + 0.41 + 0.06, rel=1e-9)
 
 
 def test_the_up_axis_is_found_from_the_head(tmp_path):
@@ -187,14 +185,8 @@ BROKEN = {
     "two roots": (lambda t: t.replace("MOTION\n", "ROOT Other\n{\n}\nMOTION\n"), r"line 112: MOTION should come here"),
     "cut": (lambda t: t[: t.index("MOTION")], r"ends where MOTION should come"),
     "no frame time": (lambda t: t.replace("Frame Time: 0.033333333\n", ""), r"line 114: FRAME should come here"),
-    "milliseconds": (
-        lambda t: t.replace("Time: 0.033333333", "Time: 33.3"),
-        r"line 114: the frame time is 33.3; .*seconds",
-    ),
-    "negative time": (
-        lambda t: t.replace("Frame Time: 0.03", "Frame Time: -0.03"),
-        r"line 114: the frame time is -",
-    ),
+    "milliseconds": (lambda t: t.replace("Time: 0.033333333", "Time: 33.3"), r"line 114: .* time is 33.3; .*seconds"),
+    "negative time": (lambda t: t.replace("Time: 0.03", "Time: -0.03"), r"line 114: the frame time is -"),
     "frames": (lambda t: t.replace("Frames: 24", "Frames: 25"), r"says Frames: 25, and has 24"),
     "nan": (lambda t: t[: t.rindex(" ")] + " nan\n", r"line 138: nan is no length and no angle"),
     "short": (lambda t: t[: t.rindex(" ")] + "\n", r"line 138: a frame has 56 numbers where there should be 57"),

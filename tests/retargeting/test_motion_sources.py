@@ -1,5 +1,7 @@
 """One motion in the ways in which programs write it: names, orders, units, axes, rest poses, more joints."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from motion_files import (
@@ -48,11 +50,8 @@ def with_more(own):
     """With fingers, eyes and a second joint in the neck's place, which nobody asked for."""
     hands = [(f"{side}HandIndex{k}", NAMES.index(f"{side}Hand"), (0.02, 0.0, 0.03)) for side in ("Left", "Right")
              for k in (1, 2)]  # fmt: skip
-    more = [
-        *hands,
-        ("LeftEye", NAMES.index("Head"), (0.03, 0.05, 0.08)),
-        ("RightEye", NAMES.index("Head"), (-0.03, 0.05, 0.08)),
-    ]
+    eyes = [(name, NAMES.index("Head"), (x, 0.05, 0.08)) for name, x in (("LeftEye", 0.03), ("RightEye", -0.03))]
+    more = [*hands, *eyes]
     angles = np.concatenate([own.angles, np.full((len(own.root), len(more), 3), 20.0)], 1)
     joints, orders = (*own.joints, *more), own.orders + own.orders[:1] * len(more)
     return Figure(joints, own.root, angles, orders, own.fps)
@@ -121,25 +120,21 @@ def smpl(name):
     return SMPL[name] if name in SMPL else SMPL[name.replace("Right", "Left")].replace("left", "right")
 
 
-@pytest.mark.parametrize("kind", ["smpl", "smpl short", "roles", "deepmimic"])
+SPELLED = {
+    "smpl": {},
+    "smpl short": {"left_": "L_", "right_": "R_", "_foot": "_toe", "spine2": "spine"},
+    "roles": {"_foot": "_toe", "spine2": "chest"},
+    "deepmimic": {"_foot": "_toe", "spine2": "chest", "pelvis": "root"},
+}
+
+
+@pytest.mark.parametrize("kind", SPELLED)
 def test_keypoints_are_the_same_person_as_the_file(tmp_path, truth, kind):
     source = load_motion(write_bvh(tmp_path / "clip.bvh", turned_dancer()))
     kept = [source.joint_names.index(name) for name in NAMES]
-    names = {
-        "smpl": [smpl(name) for name in NAMES],
-        "smpl short": [
-            smpl(name)
-            .replace("left_", "L_")
-            .replace("right_", "R_")
-            .replace("_foot", "_toe")
-            .replace("spine2", "spine")
-            for name in NAMES
-        ],
-        "roles": [smpl(name).replace("_foot", "_toe").replace("spine2", "chest") for name in NAMES],
-        "deepmimic": [
-            smpl(n).replace("_foot", "_toe").replace("spine2", "chest").replace("pelvis", "root") for n in NAMES
-        ],
-    }[kind]
+    names = [smpl(name) for name in NAMES]
+    for old, new in SPELLED[kind].items():
+        names = [name.replace(old, new) for name in names]
     rest = source.rest_positions
     assert rest is not None
     extra = np.random.default_rng(0).normal(size=(source.frames, 1, 3))  # a joint that no preset knows
@@ -151,30 +146,16 @@ def test_keypoints_are_the_same_person_as_the_file(tmp_path, truth, kind):
 
 def test_limbs_that_end_at_end_sites(tmp_path):
     # skeletons without hands and toes, whose forearms and feet are leaves: the End Sites are wrist and toe
-    names = [name for name in NAMES if "Hand" not in name and "Toe" not in name]
-    left = renamed(turned_up(turned_dancer(), "z"), RIGIFY.__getitem__)
-    path = write_bvh(tmp_path / "clip.bvh", left)
-    lines, out, ends = path.read_text().splitlines(), [], []
-    for line in lines:
-        if "JOINT hand" in line or "JOINT toe" in line:
-            line = (
-                line.replace("JOINT hand", "End Site").replace("JOINT toe", "End Site")[: line.index("JOINT")]
-                + "End Site"
-            )
-            ends.append(len(out))
-        out.append(line)
-    # what is inside an End Site's braces is its OFFSET alone
-    for start in reversed(ends):
-        del out[start + 3 : start + 3 + 5]
-    motion_at = out.index("MOTION")
-    order = [line.split()[-1] for line in lines if "JOINT" in line or "ROOT" in line]
-    gone = [3 + 3 * i + k for i, name in enumerate(order) if name.startswith(("hand", "toe")) for k in range(3)]
-    rows = [" ".join(np.delete(row.split(), gone)) for row in out[motion_at + 3 :]]
-    path.write_text("\n".join(out[: motion_at + 3] + rows) + "\n")
-    motion = load_motion(path)
+    own = renamed(turned_up(turned_dancer(), "z"), RIGIFY.__getitem__)
+    whole = load_motion(write_bvh(tmp_path / "whole.bvh", own))
+    kept = [i for i, (name, _, _) in enumerate(own.joints) if not name.startswith(("hand", "toe"))]
+    ends = {own.joints[parent][0]: offset for i, (_, parent, offset) in enumerate(own.joints) if i not in kept}
+    joints = [own.joints[i] for i in kept]
+    joints = tuple((name, kept.index(parent) if parent >= 0 else -1, offset) for name, parent, offset in joints)
+    cut = dataclasses.replace(own, joints=joints, angles=own.angles[:, kept])
+    motion = load_motion(write_bvh(tmp_path / "clip.bvh", cut, ends=ends))
     roles = find_roles(motion.joint_names)
-    assert roles["left_wrist"] == "forearm.L_end" and roles["right_toe"] == "foot.R_end" and len(names) == 14
-    whole = load_motion(write_bvh(tmp_path / "whole.bvh", left))
+    assert roles["left_wrist"] == "forearm.L_end" and roles["right_toe"] == "foot.R_end" and len(joints) == 14
     for name, own in (("forearm.L_end", "hand.L"), ("foot.R_end", "toe.R")):
         np.testing.assert_allclose(motion.track(name), whole.track(own), atol=1e-12)
 

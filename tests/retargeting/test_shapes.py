@@ -5,13 +5,12 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from core_checks import needs_core
 from motion_files import dancer, write_bvh
 from scipy.spatial.transform import Rotation
-from small_robots import ARM, FOREARM, FPS, SIDES, on_four, quietly, robot_of, trotting
+from small_robots import ARM, FOREARM, FPS, SIDES, by_mujoco, on_four, quietly, robot_of, trotting
 
 import osik_jax as osik
 from osik_jax.retargeting import (
@@ -62,10 +61,10 @@ def test_arms_on_a_fixed_base_follow_beside_the_trunk(motion, tmp_path):
     other, own = quietly(retargeter.retarget, elsewhere), retargeter.retarget(plain)
     np.testing.assert_allclose(other.q, own.q, atol=1e-6)
     # directions by MuJoCo beside those of the clip, turned as the robot faces
-    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
-    data.qpos[:] = result.motion.qpos[7]
-    mujoco.mj_kinematics(model, data)
-    upper = data.body("left_elbow").xpos - data.body("left_roll").xpos
+    ends = by_mujoco(
+        robot, result.motion.qpos[7:8], lambda data: [data.body(f"left_{part}").xpos for part in ("roll", "elbow")]
+    )
+    upper = ends[0, 1] - ends[0, 0]
     names = find_roles(motion.joint_names)
     asked = motion.track(names["left_elbow"])[7] - motion.track(names["left_shoulder"])[7]
     asked = Rotation.from_euler("z", 90.0, degrees=True).apply(asked)
@@ -141,13 +140,8 @@ def test_four_feet_follow_a_dog(tmp_path):
     figures = judged(result)
     np.testing.assert_allclose(result.contact.mean(0), 0.5, atol=0.1)
     # by MuJoCo: balls that stand are where they landed and touch the floor; the others are lifted
-    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
     names = [f"{s}_{row}_ball" for s, _ in SIDES for row in ("hind", "front")]
-    balls = np.zeros((len(result.q), 4, 3))
-    for frame, qpos in enumerate(result.motion.qpos):
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        balls[frame] = [data.geom(name).xpos for name in names]
+    balls = by_mujoco(robot, result.motion.qpos, lambda data: [data.geom(name).xpos for name in names])
     assert np.abs(balls[..., 2][result.contact] - 0.02).max() < 2e-4 and balls[..., 2].min() > 0.0198
     both = result.contact[1:] & result.contact[:-1]
     assert np.linalg.norm(np.diff(balls, axis=0)[..., :2], axis=-1)[both].max() < 5e-5

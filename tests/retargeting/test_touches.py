@@ -4,11 +4,11 @@ import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from core_checks import needs_core
 from scipy.spatial.transform import Rotation
+from small_robots import by_mujoco
 
 import osik_jax as osik
 from osik_jax.retargeting import HumanMotion, Retargeter, load_motion, report
@@ -46,18 +46,12 @@ def carrying(frames=FRAMES):
 
 def wrists(result):
     """The wrists by MuJoCo. (2, F, 3)."""
-    model, out = result.robot.mj_model, []
-    data = mujoco.MjData(model)
-    for q in result.q:
-        data.qpos[:] = np.asarray(result.robot.mujoco_qpos(q))
-        mujoco.mj_kinematics(model, data)
-        own = []
-        for role in WRISTS:
-            frame, point = result.profile.keypoints[role]
-            found = data.body(frame)
-            own.append(found.xpos + found.xmat.reshape(3, 3) @ np.array(point))
-        out.append(own)
-    return np.swapaxes(np.array(out), 0, 1)
+    places = [result.profile.keypoints[role] for role in WRISTS]
+
+    def read(data):
+        return [data.body(f).xpos + data.body(f).xmat.reshape(3, 3) @ np.array(point) for f, point in places]
+
+    return np.swapaxes(by_mujoco(result.robot, map(result.robot.mujoco_qpos, result.q), read), 0, 1)
 
 
 def on(poses, points):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -192,7 +193,13 @@ def with_first(frames: int, own: Figure | None = None) -> Figure:
 
 
 def write_bvh(
-    path: Path, figure: Figure, unit: float = 1.0, *, floor: str | None = None, all_move: bool = False
+    path: Path,
+    figure: Figure,
+    unit: float = 1.0,
+    *,
+    floor: str | None = None,
+    all_move: bool = False,
+    ends: Mapping[str, Sequence[float]] = MappingProxyType({}),
 ) -> Path:
     """A BVH file of a figure, lengths in ``unit`` metres; a joint without children gets an End Site.
 
@@ -202,6 +209,7 @@ def write_bvh(
         unit: [m]
         floor: name of a root at rest on the floor, above the figure's own; None: there is none.
         all_move: whether all joints have position channels, which repeat their offsets.
+        ends: offsets of End Sites by joint [m]; 0 where none is given.
     """
     children = [[j for j, (_, parent, _) in enumerate(figure.joints) if parent == i] for i in range(len(figure.joints))]
     lines, order = ["HIERARCHY"], []
@@ -218,7 +226,8 @@ def write_bvh(
         for child in children[i]:
             write(child, depth + 1)
         if not children[i]:
-            lines.extend([f"{indent}\tEnd Site", f"{indent}\t{{", f"{indent}\t\tOFFSET 0 0 0", f"{indent}\t}}"])
+            end = " ".join(repr(float(x) / unit) for x in ends[name]) if name in ends else "0 0 0"
+            lines.extend([f"{indent}\tEnd Site", f"{indent}\t{{", f"{indent}\t\tOFFSET {end}", f"{indent}\t}}"])
         lines.append(f"{indent}}}")
 
     if floor is not None:

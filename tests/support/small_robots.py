@@ -45,12 +45,31 @@ SIDES = (("left", 1.0), ("right", -1.0))
 
 def nao_soles(nao: osik.Robot, qpos: Iterable[np.ndarray]) -> np.ndarray:
     """Corners of a NAO's soles in the world by MuJoCo, from configurations of its model [m]. (F, 8, 3)."""
-    data, corners = mujoco.MjData(nao.mj_model), []
+    names = [f"{side}_sole_corner_{k}" for side in "lr" for k in range(4)]
+    return by_mujoco(nao, qpos, lambda data: [data.site(name).xpos for name in names])
+
+
+def by_mujoco(robot: osik.Robot, qpos: Iterable[Any], read: Callable[[mujoco.MjData], Any]) -> np.ndarray:
+    """What ``read`` takes from MuJoCo's poses in each configuration of the robot's model. (F, ...)."""
+    data, out = mujoco.MjData(robot.mj_model), []
     for own in qpos:
         data.qpos[:] = own
-        mujoco.mj_kinematics(nao.mj_model, data)
-        corners.append([data.site(f"{side}_sole_corner_{k}").xpos.copy() for side in "lr" for k in range(4)])
-    return np.array(corners)
+        mujoco.mj_kinematics(robot.mj_model, data)
+        mujoco.mj_comPos(robot.mj_model, data)
+        out.append(np.array(read(data)))
+    return np.array(out)
+
+
+def assert_limits_hold(
+    robot: osik.Robot, q: np.ndarray, fps: float, acceleration: float = np.inf, names: Iterable[str] | None = None
+) -> None:
+    """Joints are inside their ranges, their speed limits and this limit of acceleration. ``q``: (F, joints)."""
+    dofs = [robot.joint_dof_index(name) for name in names or robot.joint_names]
+    low, high, fast = (np.asarray(x)[dofs] for x in (robot.position_lower, robot.position_upper, robot.velocity_limit))
+    assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all()
+    speed = np.diff(q, axis=0) * fps
+    assert (np.abs(speed) <= fast * (1.0 + 1e-9)).all()
+    assert np.abs(np.diff(speed, axis=0)).max() * fps <= acceleration * (1.0 + 1e-9)
 
 
 def robot_of(*parts: str, free: bool = True, turn: float = 0.0, forearm: str = FOREARM) -> osik.Robot:
