@@ -80,14 +80,14 @@ template <class Real, int B> struct Columns {
 // An array of a workspace, at the place that At::of says [bytes].
 template <class T, class At, class Sizes> struct PointerArray {
   T* data;
-  OSIK_FN void place(char* space, const Sizes& s) { data = reinterpret_cast<T*>(space + At::of(s)); }
+  OSIK_FN PointerArray(char* space, const Sizes& s) : data(reinterpret_cast<T*>(space + At::of(s))) {}
   OSIK_FN operator T*() const { return data; }
 };
 
 // A number that depends on a problem's sizes, as At::of says.
 template <class At, class Sizes> struct SizeValue {
   int value;
-  OSIK_FN SizeValue(const Sizes& s) : value(At::of(s)) {}
+  OSIK_FN SizeValue(char*, const Sizes& s) : value(At::of(s)) {}
   OSIK_FN operator int() const { return value; }
 };
 

@@ -60,7 +60,7 @@ extern __shared__ __align__(16) double shared_space[];  // of one problem: a blo
 
 // An array of a workspace in shared memory. Its address is a constant, so that no register and no member holds it.
 template <class T, class At, class Sizes> struct SharedArray {
-  OSIK_FN void place(char*, const Sizes&) {}
+  OSIK_FN SharedArray(char*, const Sizes&) {}
   OSIK_FN operator T*() const {
     constexpr int at = At::of(Sizes{});
     return reinterpret_cast<T*>(reinterpret_cast<char*>(shared_space) + at);
@@ -69,7 +69,7 @@ template <class T, class At, class Sizes> struct SharedArray {
 
 // A number that depends on a problem's sizes: a constant too, so that loops have constant ends.
 template <class At, class Sizes> struct SizeConstant {
-  OSIK_FN SizeConstant(const Sizes&) {}
+  OSIK_FN SizeConstant(char*, const Sizes&) {}
   OSIK_FN operator int() const {
     constexpr int value = At::of(Sizes{});
     return value;
