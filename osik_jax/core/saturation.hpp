@@ -426,12 +426,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_METHOD bool attempt(double its_scale, double least, double compliance, bool goes_on) {
     const bool soft = compliance > 0.0;
     const int start = first - soft;
-    if (!goes_on)
-      t.each(start, n, [&](int j) {
-        for (int i = 0; i < n; ++i) BEFORE[j * ld + i] = Z[j * ld + i];
-      });
     if (goes_on) go_on(its_scale);
-    else begin_search(its_scale);
+    else copy_rows(Z, BEFORE, start), begin_search(its_scale);
     if (soft) {
       const double square = t.dot(MOTION, MOTION, 0, n), root = square > 0.0 ? sqrt(compliance / square) : 0.0;
       t.each(0, n, [&](int i) { Z[start * ld + i] = root * MOTION[i]; });
@@ -443,16 +439,16 @@ template <class Team> struct Saturation : NullSpace<Team> {
     if (soft) {
       done = done && stop < 0;
       find_stop();
-      put_back(start);
+      copy_rows(BEFORE, Z, start);
     }
     done = done && holds(size);
     if (soft) t.each(0, n, [&](int i) { NORMAL[i] = fabs(NORMAL[i]) > NEGLIGIBLE_ENTRY ? NORMAL[i] : 0.0; });
-    else if (!done) put_back(start);
+    else if (!done) copy_rows(BEFORE, Z, start);
     return done;
   }
-  OSIK_FN void put_back(int start) {
+  OSIK_FN void copy_rows(const double* from, double* to, int start) {  // from row `start` on
     t.each(start, n, [&](int j) {
-      for (int i = 0; i < n; ++i) Z[j * ld + i] = BEFORE[j * ld + i];
+      for (int i = 0; i < n; ++i) to[j * ld + i] = from[j * ld + i];
     });
   }
 

@@ -16,57 +16,21 @@ constexpr int VECTOR_BYTES = 32;
 constexpr int VECTOR_BYTES = 16;
 #endif
 
-template <class Real> struct Vector {
+template <class R> struct Vector {
+  using Real = R;
   static constexpr int LANES = VECTOR_BYTES / int(sizeof(Real));
   typedef Real Loaded __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(Real)), may_alias));
   typedef Real Value __attribute__((vector_size(VECTOR_BYTES)));
   typedef std::conditional_t<sizeof(Real) == 8, long long, int> Bits;
   typedef Bits Mask __attribute__((vector_size(VECTOR_BYTES)));
-};
-
-// B vectors of neighbouring columns.
-template <class Real, int B> struct Pack {
-  typename Vector<Real>::Value v[B];
-  OSIK_FN Pack() {}
-  OSIK_FN Pack(Real a) {
-    for (int b = 0; b < B; ++b) v[b] = typename Vector<Real>::Value{} + a;
-  }
-  OSIK_FN Pack& operator+=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& operator-=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] -= o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& operator*=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] *= o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack inverse() const {
-    Pack p;
-    for (int b = 0; b < B; ++b) p.v[b] = Real(1) / v[b];
-    return p;
-  }
-  OSIK_FN Pack& fma(Real a, const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += a * o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& square(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += o.v[b] * o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack size() const {
-    Pack p;
-    for (int b = 0; b < B; ++b) p.v[b] = v[b] < 0 ? -v[b] : v[b];
-    return p;
-  }
+  OSIK_FN static Value all(Real a) { return Value{} + a; }
+  OSIK_FN static Value size(Value a) { return a < 0 ? -a : a; }
 };
 
 template <class Real, int B> struct Columns {
   int at;
-  using P = Pack<Real, B>;
   using V = Vector<Real>;
+  using P = Pack<V, B>;
   OSIK_FN P load(const Real* row) const {
     P p;
     for (int b = 0; b < B; ++b) p.v[b] = *(const typename V::Loaded*)(row + at + b * V::LANES);

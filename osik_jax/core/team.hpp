@@ -52,6 +52,43 @@ template <class T> struct NumberOf<const T*> {
 };
 template <class At> using NumberAt = typename NumberOf<At>::Type;
 
+// Numbers of a thread from B columns, or from B vectors of them (Of::Value).
+template <class Of, int B> struct Pack {
+  using Real = typename Of::Real;
+  typename Of::Value v[B];
+  template <class F> OSIK_FN static void each(F f) {
+    OSIK_UNROLL
+    for (int b = 0; b < B; ++b) f(b);
+  }
+  OSIK_FN Pack() {}
+  OSIK_FN Pack(Real a) {
+    each([&](int b) { v[b] = Of::all(a); });
+  }
+  OSIK_FN Pack& operator+=(const Pack& o) {
+    return each([&](int b) { v[b] += o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& operator-=(const Pack& o) {
+    return each([&](int b) { v[b] -= o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& operator*=(const Pack& o) {
+    return each([&](int b) { v[b] *= o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& fma(Real a, const Pack& o) {
+    return each([&](int b) { v[b] += a * o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& square(const Pack& o) {
+    return each([&](int b) { v[b] += o.v[b] * o.v[b]; }), *this;
+  }
+  OSIK_FN Pack inverse() const {
+    Pack p;
+    return each([&](int b) { p.v[b] = Real(1) / v[b]; }), p;
+  }
+  OSIK_FN Pack size() const {
+    Pack p;
+    return each([&](int b) { p.v[b] = Of::size(v[b]); }), p;
+  }
+};
+
 template <class Real> struct Best {
   Real value;
   int which;  // -1 where no value is larger than the start

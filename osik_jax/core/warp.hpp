@@ -4,43 +4,17 @@
 
 namespace osik {
 
+template <class R> struct Number {
+  using Real = R;
+  using Value = R;
+  OSIK_FN static R all(R a) { return a; }
+  OSIK_FN static R size(R a) { return fabs(a); }
+};
+
 // One column of a thread, or two that are 32 apart: of the second one only numbers before `end` count.
 template <class Real, int SLOTS> struct ColumnsOf {
   int at, end;
-  struct P {
-    Real v[SLOTS];
-    OSIK_FN P() {}
-    OSIK_FN P(Real a) {
-      each([&](int s) { v[s] = a; });
-    }
-    template <class F> OSIK_FN static void each(F f) {
-      OSIK_UNROLL
-      for (int s = 0; s < SLOTS; ++s) f(s);
-    }
-    OSIK_FN P& operator+=(const P& o) {
-      return each([&](int s) { v[s] += o.v[s]; }), *this;
-    }
-    OSIK_FN P& operator-=(const P& o) {
-      return each([&](int s) { v[s] -= o.v[s]; }), *this;
-    }
-    OSIK_FN P& operator*=(const P& o) {
-      return each([&](int s) { v[s] *= o.v[s]; }), *this;
-    }
-    OSIK_FN P& fma(Real a, const P& o) {
-      return each([&](int s) { v[s] += a * o.v[s]; }), *this;
-    }
-    OSIK_FN P& square(const P& o) {
-      return each([&](int s) { v[s] += o.v[s] * o.v[s]; }), *this;
-    }
-    OSIK_FN P inverse() const {
-      P p;
-      return each([&](int s) { p.v[s] = Real(1) / v[s]; }), p;
-    }
-    OSIK_FN P size() const {
-      P p;
-      return each([&](int s) { p.v[s] = fabs(v[s]); }), p;
-    }
-  };
+  using P = Pack<Number<Real>, SLOTS>;
   OSIK_FN P load(const Real* row) const {
     P p;
     return P::each([&](int s) { p.v[s] = row[s && at + 32 * s >= end ? at : at + 32 * s]; }), p;
