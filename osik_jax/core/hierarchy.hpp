@@ -659,18 +659,15 @@ template <class Team> struct Hierarchy {
     const double terms = longest * larger(longest * x_max, root_cost);
     return residual / (terms > 0.0 ? terms : 1.0);
   }
-  struct Outcome {
-    bool done;
-    double residual;
-  };
-  // all levels, from the guesses of a warm start or without them
-  OSIK_METHOD Outcome solve_levels(const Problem& p, const Answer& to, bool warm) {
+  // all levels, from the guesses of a warm start or without them; returns whether each is optimal
+  OSIK_METHOD bool solve_levels(const Problem& p, const Answer& to, bool warm) {
     const int L = size.L;
     t.each(0, L * h, [&](int e) { to.multipliers[e] = 0.0, to.active[e] = to.frozen[e] = 0; });
     t.each(0, L * m, [&](int e) { to.in_cost[e] = to.own[e] = 0; });
     t.each(0, L, [&](int k) { to.ranks[k] = 0, to.slack_norms[k] = INFINITE, to.dampings[k] = 0.0; });
     begin(p);
-    Outcome all{true, 0.0};
+    bool done = true;
+    double worst = 0.0;
     for (level = first_row = 0; level < L && first_active < n; ++level) {
       rows = size.row_counts[level], unmet = p.damping[3 * level + 1], demand = p.damping[3 * level + 2];
       has_inequalities = t.count(n, h, [&](int q) { return size.level_of_hard[q] == level; }) > 0;
@@ -679,34 +676,32 @@ template <class Team> struct Hierarchy {
       bool optimal = warm && try_guess(p.guess_hard + level * h, p.guess_own + level * m, factored);
       if (!optimal) optimal = primal_active_set(factored);
       const int in_cost_rank = freeze(to);
-      all.done = all.done && optimal, all.residual = larger(all.residual, relative_residual());
+      done = done && optimal, worst = larger(worst, relative_residual());
       t.once([&] { to.ranks[level] = in_cost_rank, to.slack_norms[level] = slack_norm, to.dampings[level] = damping; });
       narrow_box(p.bends + level * n);
       freeze_columns();
       first_row += rows;
     }
-    return all;
+    t.once([&] { to.residual[0] = worst; });
+    return done;
   }
   OSIK_METHOD void solve(const Problem& p, const Answer& to) {
     rank_tol = p.tolerances[0], step_tol = p.tolerances[1], multiplier_tol = p.tolerances[2];
     feasible_tol = p.tolerances[3];
     const bool warm = t.count(0, size.L * m, [&](int e) { return p.guess_own[e] != 0; }) > 0;
     changes = factorizations = 0;
-    Outcome all;
+    bool done = false;
     for (bool guessed = warm;; guessed = false) {
-      all = solve_levels(p, to, guessed);
+      done = solve_levels(p, to, guessed);
       // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
-      if (!guessed || (all.done && largest <= MAX_DETOUR * x_max)) break;
+      if (!guessed || (done && largest <= MAX_DETOUR * x_max)) break;
     }
     t.each(0, n, [&](int i) {  // a bound that levels narrowed for those below them is none of the box
       const int at = ACTIVE_BOUND[i];
       const bool narrowed = at < 0 ? HARD_LOWER[i] > p.hard_lower[i] : HARD_UPPER[i] < p.hard_upper[i];
       to.x[i] = X[i], to.active_bounds[i] = narrowed ? 0 : at;
     });
-    t.once([&] {
-      to.residual[0] = all.residual;
-      to.report[0] = all.done, to.report[1] = changes, to.report[2] = factorizations;
-    });
+    t.once([&] { to.report[0] = done, to.report[1] = changes, to.report[2] = factorizations; });
   }
 };
 }  // namespace osik

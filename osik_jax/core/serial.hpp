@@ -55,7 +55,7 @@ template <class At, class Sizes> struct SizeValue {
   OSIK_FN operator int() const { return value; }
 };
 
-template <class R> struct Serial {
+template <class R> struct Serial : CommonTeam<R> {
   using Real = R;
   template <class At, class Sizes> using Fixed = SizeValue<At, Sizes>;
   template <class T, class At, class Sizes> using Array = PointerArray<T, At, Sizes>;
@@ -69,16 +69,10 @@ template <class R> struct Serial {
   static constexpr bool SPARES_SPACE = false, HOLDS_COLUMNS = false;
   static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
   static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
-  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
-  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   // a pack that begins at the last column ends within the row
   static constexpr int stride(int n) { return (n + 2 * WIDE - 2) / WIDE * WIDE; }
   // the end of the pack that holds the n-th number
   static constexpr int padded(int n) { return (n + LANES - 1) / LANES * LANES; }
-  // the numbers of variables, rows and hard rows that space is laid out for
-  static constexpr int variables(int n) { return n; }
-  static constexpr int level_rows(int m) { return m; }
-  static constexpr int hard_rows(int h) { return h; }
 
   template <class F> OSIK_FN void each(int a, int b, F f) const {
     for (int i = a; i < b; ++i) f(i);
@@ -328,18 +322,12 @@ template <class R> struct Serial {
     Real* M = rows + at;
     v += at;
     switch ((n - at + LANES - 1) / LANES) {  // with all of v in registers
-      case 1:
-        return reflect_packs<1>(M, ld, count, v, scale);
-      case 2:
-        return reflect_packs<2>(M, ld, count, v, scale);
-      case 3:
-        return reflect_packs<3>(M, ld, count, v, scale);
-      case 4:
-        return reflect_packs<4>(M, ld, count, v, scale);
-      case 5:
-        return reflect_packs<5>(M, ld, count, v, scale);
-      case 6:
-        return reflect_packs<6>(M, ld, count, v, scale);
+      case 1: return reflect_packs<1>(M, ld, count, v, scale);
+      case 2: return reflect_packs<2>(M, ld, count, v, scale);
+      case 3: return reflect_packs<3>(M, ld, count, v, scale);
+      case 4: return reflect_packs<4>(M, ld, count, v, scale);
+      case 5: return reflect_packs<5>(M, ld, count, v, scale);
+      case 6: return reflect_packs<6>(M, ld, count, v, scale);
       default:
         for (int q = 0; q < count; ++q, M += ld) {
           const Real by = -scale * own_dot_on(M, v, 0, n - at);

@@ -103,9 +103,19 @@ template <class Real> struct RowSums {
 template <class T, class At, class Sizes> struct NoArray {};
 template <class At, class Sizes> struct NoSize {};
 
-template <class R = double> struct WarpSizes {
-  using Int = short;
+// What teams share.
+template <class R> struct CommonTeam {
   using Real = R;
+  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
+  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
+  // the numbers of variables, rows and hard rows that space is laid out for
+  static constexpr OSIK_HOST int variables(int n) { return n; }
+  static constexpr OSIK_HOST int level_rows(int m) { return m; }
+  static constexpr OSIK_HOST int hard_rows(int h) { return h; }
+};
+
+template <class R = double> struct WarpSizes : CommonTeam<R> {
+  using Int = short;
   template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
   template <class At, class Sizes> using Fixed = NoSize<At, Sizes>;
   static constexpr bool COPIES = false;        // rows are read from global memory
@@ -114,9 +124,6 @@ template <class R = double> struct WarpSizes {
   static constexpr OSIK_HOST int padded(int n) { return (n + WIDE - 1) / WIDE * WIDE; }
   // an odd number of wide ones, so that threads read different banks of memory
   static constexpr OSIK_HOST int stride(int n) { return WIDE * ((n + WIDE - 1) / WIDE | 1); }
-  static constexpr OSIK_HOST int variables(int n) { return n; }
-  static constexpr OSIK_HOST int level_rows(int m) { return m; }
-  static constexpr OSIK_HOST int hard_rows(int h) { return h; }
 };
 
 constexpr double LARGEST_DOUBLE = 1.7976931348623157e308, INFINITE = __builtin_bit_cast(double, 0x7ff0000000000000ull);

@@ -56,8 +56,6 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   using typename WarpSizes<R>::Int;
   template <class T, class At, class Sizes> using Array = SharedArray<T, At, Sizes>;
   template <class At, class Sizes> using Fixed = SizeConstant<At, Sizes>;
-  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
-  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   static constexpr unsigned ALL = 0xffffffffu;
   static constexpr int SLOTS = sizeof(R) == 4 && N > 32 ? 2 : 1;  // columns of a thread at once
   static constexpr OSIK_HOST int variables(int) { return N; }

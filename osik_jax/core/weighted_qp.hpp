@@ -75,15 +75,10 @@ template <class Team> struct WeightedQP {
   static constexpr OSIK_HOST int numbers_of(int matrix, const QPSizes& s) {
     const int n = Team::variables(s.n), p = Team::hard_rows(s.p), k = Team::level_rows(s.m) + p, q = order(k, n);
     const int kept = q < k || IS_SINGLE ? p : 0;  // rows that are kept where the system is the Hessian's
+    const int of_b = k * Team::stride(n), of_v = kept * Team::stride(n);
     const int of_s = q * Team::stride(q), of_t = kept * Team::stride(p), apart = Team::SPARES_SPACE ? 0 : 1;
-    const int numbers[] = {k * Team::stride(n),
-                           kept * Team::stride(n),
-                           of_s,
-                           apart * of_s,
-                           of_t,
-                           apart * of_t,
-                           apart * DualActiveSet<Team>::doubles(n, p),
-                           Team::stride(0)};
+    const int dual = apart * DualActiveSet<Team>::doubles(n, p);
+    const int numbers[] = {of_b, of_v, of_s, apart * of_s, of_t, apart * of_t, dual, Team::stride(0)};
     return numbers[matrix];
   }
   static constexpr OSIK_HOST int bytes(const QPSizes& s) {
