@@ -25,7 +25,8 @@ struct ClipSystem {
   }
 };
 
-template <class Team> struct Banded {
+struct Banded {
+  using Team = Serial<double>;
   using Algebra = LinearAlgebra<Team>;
   static constexpr int TILE = 8, POINTS = ClipSystem::POINTS;  // rows of a block of the dense factorisations
   Team t;

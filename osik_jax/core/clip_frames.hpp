@@ -24,33 +24,15 @@ struct ClipRobot {
   const double *coefficient, *offset, *reference, *body_position, *body_quaternion, *joint_position, *joint_axis;
   const double *factors, *points, *turns, *home, *reach, *rise, *radii;  // [reaches] and [corners] lengths
   const double *lower, *upper, *rest, *step, *change, *mass, *center;
-  enum Weight {
-    LIMB,
-    PELVIS,
-    TORSO,
-    ROOT_X,
-    ROOT_Y,
-    ROOT_Z,
-    FOOT,
-    POSTURE,
-    STANCE,
-    APART,
-    LIMIT,
-    MARGIN,
-    STIFFNESS,
-    CLEARANCE,
-    SWINGING,
-    SHORTEST,
-    TIED,
-    SMOOTH,
-    SMOOTH_BASE,
-    SPEED,
-    BALANCE,
-    INSIDE,
-    WEIGHTS
-  };
+  // weights of goals and bounds, and other numbers of them
+  enum { LIMB, PELVIS, TORSO, ROOT_X, ROOT_Y, ROOT_Z, FOOT, POSTURE, STANCE, APART, LIMIT, MARGIN, STIFFNESS, CLEARANCE };
+  enum { SWINGING = CLEARANCE + 1, SHORTEST, TIED, SMOOTH, SMOOTH_BASE, SPEED, BALANCE, INSIDE, WEIGHTS };
   double weight[WEIGHTS];
 
+  Tree<const double*> tree() const {
+    return {c.bodies,  c.joints,      c.full,          parents,        types,     owners,
+            reference, body_position, body_quaternion, joint_position, joint_axis};
+  }
   void read(const int* at) {
     auto take = [&](int count) { return at += count, at - count; };
     __builtin_memcpy(&c, take(sizeof c / sizeof(int)), sizeof c);
@@ -84,7 +66,9 @@ struct Cost {
   Cost& operator+=(const Cost& o) { return soft += o.soft, penalty += o.penalty, *this; }
 };
 
-template <class Team> struct ClipFrames {
+struct ClipFrames {
+  using Team = Serial<double>;
+  using Algebra = LinearAlgebra<Team>;
   using V = Vec3<double>;
   using M = Mat3<double>;
   using R = ClipRobot;
@@ -135,18 +119,7 @@ template <class Team> struct ClipFrames {
   void place(const double* q) {
     const R::Counts& c = robot.c;
     for (int i = 0; i < c.values; ++i) value[i] = robot.coefficient[i] * q[robot.source[i]] + robot.offset[i];
-    const Tree<const double*> tree{c.bodies,
-                                   c.joints,
-                                   c.full,
-                                   robot.parents,
-                                   robot.types,
-                                   robot.owners,
-                                   robot.reference,
-                                   robot.body_position,
-                                   robot.body_quaternion,
-                                   robot.joint_position,
-                                   robot.joint_axis};
-    place_bodies(tree, value, Placed<double*>{position, rotation, linear, angular, anchor});
+    place_bodies(robot.tree(), value, Placed<double*>{position, rotation, linear, angular, anchor});
     for (int dof = 0; dof < c.full; ++dof) {
       const V turn = V::of(angular + 3 * dof);
       const V speed = V::of(linear + 3 * dof) + cross(V::of(anchor + 3 * dof) - root(), turn);
@@ -466,9 +439,6 @@ template <class Team> struct ClipFrames {
     finish(out, frames - 1, 2);
     return cost;
   }
-
- private:
-  using Algebra = LinearAlgebra<Team>;
 };
 
 }  // namespace osik

@@ -12,27 +12,27 @@ struct ClipMethod {
   double stiffness, damping, iterations, until_ready, until_settled;
 };
 
-template <class Team> struct ClipPlan {
+struct ClipPlan {
   ClipRobot& robot;
   const ClipGoals& goals;
   const ClipMethod& method;
   int frames, nq, n, N;
-  Banded<Team> banded;
-  ClipFrames<Team> clip;
+  Banded banded;
+  ClipFrames clip;
   Manifold manifold;
   ClipSystem here, there;
   double *before, *step, *damping, *right, *move;  // [n], [n], [F], [F, n], [F, n]
 
   static size_t doubles(const ClipRobot& robot, int frames) {
-    const int n = robot.c.dofs, N = Banded<Team>::stride(n);
-    return Banded<Team>::doubles(frames, N) + ClipFrames<Team>::doubles(robot.c, N) + 2 * ClipSystem::doubles(frames, n, N) +
-           2 * n + frames * (1 + 2 * n) + Banded<Team>::TILE;
+    const int n = robot.c.dofs, N = Banded::stride(n);
+    return Banded::doubles(frames, N) + ClipFrames::doubles(robot.c, N) + 2 * ClipSystem::doubles(frames, n, N) + 2 * n +
+           frames * (1 + 2 * n) + Banded::TILE;
   }
   ClipPlan(ClipRobot& robot, const ClipGoals& goals, const ClipMethod& method, int frames, int nq, double* next)
-      : robot(robot), goals(goals), method(method), frames(frames), nq(nq), n(robot.c.dofs), N(Banded<Team>::stride(n)),
-        banded(n, frames, next), clip(robot, goals, N, next + Banded<Team>::doubles(frames, N)),
+      : robot(robot), goals(goals), method(method), frames(frames), nq(nq), n(robot.c.dofs), N(Banded::stride(n)),
+        banded(n, frames, next), clip(robot, goals, N, next + Banded::doubles(frames, N)),
         manifold{robot.c.scalars, robot.c.quaternions, robot.scalar, robot.quaternion} {
-    next += Banded<Team>::doubles(frames, N) + ClipFrames<Team>::doubles(robot.c, N);
+    next += Banded::doubles(frames, N) + ClipFrames::doubles(robot.c, N);
     next = there.place(here.place(next, frames, n, N), frames, n, N);
     before = next, step = before + n, damping = step + n, right = damping + frames, move = right + frames * n;
   }
@@ -42,7 +42,7 @@ template <class Team> struct ClipPlan {
     double cost = 0.0;
     for (int j = 0; j < n; ++j) {
       const double value = present * step[j], bound = robot.step[j];
-      const double over = value - ClipFrames<Team>::inside(value, -bound, bound);
+      const double over = value - ClipFrames::inside(value, -bound, bound);
       if (over == 0.0) continue;
       const double beyond = robot.weight[ClipRobot::SPEED] / (bound * bound);
       const double weight = robot.weight[ClipRobot::STIFFNESS] * beyond, pull = weight * over;
@@ -60,7 +60,7 @@ template <class Team> struct ClipPlan {
     for (int j = 0; j < n; ++j) {
       const double value = present * (step[j] - before[j]), bound = robot.change[j];
       const double smooth = present * (robot.joints[j] >= 0 ? w[ClipRobot::SMOOTH] : w[ClipRobot::SMOOTH_BASE]);
-      const double over = value - ClipFrames<Team>::inside(value, -bound, bound);
+      const double over = value - ClipFrames::inside(value, -bound, bound);
       const double beyond = over != 0.0 ? w[ClipRobot::SPEED] / (bound * bound) : 0.0;
       const double c = smooth + w[ClipRobot::STIFFNESS] * beyond,
                    a = smooth * value + w[ClipRobot::STIFFNESS] * beyond * over;

@@ -8,8 +8,6 @@
 using namespace osik;
 
 namespace {
-using Team = Serial<double>;
-
 // Arguments, flat, with an axis of clips, or of length 1 where all clips share them: q [F, nq], the goals in the order of
 // ClipGoals, free [F], the numbers of ClipRobot, ClipMethod; and the integers of ClipRobot, which all clips share.
 // Results: q [F, nq], cost [2], iterations.
@@ -21,7 +19,7 @@ void plan(const xla::Call& call) {
   ClipRobot robot;
   robot.read(call.in<int>(12));
   const size_t size = size_t(frames) * nq;
-  std::vector<double> space(ClipPlan<Team>::doubles(robot, frames)), other(size);
+  std::vector<double> space(ClipPlan::doubles(robot, frames)), other(size);
   for (int b = 0; b < clips; ++b) {
     robot.read(numbers(10, b));
     ClipMethod method;
@@ -30,7 +28,7 @@ void plan(const xla::Call& call) {
                           numbers(5, b), numbers(6, b), numbers(7, b), numbers(8, b)};
     double* q = call.out<double>(0) + b * size;
     for (size_t e = 0; e < size; ++e) q[e] = numbers(0, b)[e];
-    ClipPlan<Team> clip(robot, goals, method, frames, nq, space.data());
+    ClipPlan clip(robot, goals, method, frames, nq, space.data());
     call.out<double>(2)[b] = clip.descend(numbers(9, b), q, other.data(), call.out<double>(1) + 2 * b);
   }
 }

@@ -71,10 +71,7 @@ template <class Team> struct DualActiveSet {
       if (j < n && lower[j] == upper[j]) column[j] = 0;
     });
   }
-  OSIK_FN void along_normal(int i, Real side, Real* d) {  // d = J' n_i
-    t.each(0, N, [&](int k) { d[k] = side * own_along_normal(i, k); });
-  }
-  OSIK_FN Real own_along_normal(int i, int k) const {
+  OSIK_FN Real own_along_normal(int i, int k) const {  // entry k of J' n_i
     const Real* column = J + k * lN;
     if (i < n) return column[i];
     return t.own_dot(c.rows + (i - n) * c.ld, column, 0, n) + column[i] * ROOT[i];
@@ -150,7 +147,7 @@ template <class Team> struct DualActiveSet {
     Real pushed = 0;
     while (true) {
       if (++changes > c.most_changes) return false;
-      along_normal(entering, side, d);
+      t.each(0, N, [&](int k) { d[k] = side * own_along_normal(entering, k); });
       for (int k = count - 1; k >= 0; --k) {
         const Real rate = (d[k] - t.dot(R + k * lN, RATE, k + 1, count)) / R[k * lN + k];
         t.once([&] { RATE[k] = rate; });

@@ -14,7 +14,7 @@
 //   [first_free, n)             free: the level's rows are factored in these, R = A Z
 #pragma once
 #include "constants.hpp"
-#include "linear_algebra.hpp"
+#include "workspace.hpp"
 
 namespace osik {
 
@@ -68,7 +68,6 @@ OSIK_FN void advance(Answer& a, const Sizes& s, size_t by = 1) {
 template <class Team> struct Hierarchy {
   using Int = typename Team::Int;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 19, INTEGERS = 13;
   Team t;
   Sizes size;
   // n, m, h as above; strides of the basis and of the level's factors; strides of A; the current level and its rows
@@ -82,92 +81,37 @@ template <class Team> struct Hierarchy {
   double rank_tol, step_tol, multiplier_tol, feasible_tol;
   const double* A;  // the level's rows, entry i of row a at A[a row + i column]
 
-  // ---- the workspace: where each array begins, in bytes
+  // ---- the workspace
+  using Space = Workspace<Hierarchy, Team, Sizes>;
+  static constexpr int VECTORS = 19, MATRICES = 5, INTEGERS = 13;
   static constexpr OSIK_HOST int width(const Sizes& s) {
     const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h);
     return Team::stride(h > m ? h : m > n ? m : n);
   }
-  // rows of the length of the basis in front of a matrix: the basis has h, the level's rows m, the hard rows h - n
-  template <int HARD, int ROWS, int VARIABLES> struct MatrixAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) {
-      const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h);
-      return 8 * (VECTORS * width(s) + (HARD * h + ROWS * m - VARIABLES * n) * Team::stride(n));
-    }
-  };
-  using BasisAt = MatrixAt<0, 0, 0>;
-  using RowsAt = MatrixAt<1, 0, 0>;
-  using HardAt = MatrixAt<1, 1, 0>;
-  using CopiedAt = MatrixAt<2, 1, 1>;
-  struct FactorsAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) {
-      const int m = Team::level_rows(s.m);
-      return CopiedAt::of(s) + 8 * (Team::COPIES ? m * Team::stride(Team::variables(s.n)) : 0);
-    }
-  };
-  static constexpr OSIK_HOST int bytes_of_numbers(const Sizes& s) {
-    const int m = Team::level_rows(s.m);
-    return FactorsAt::of(s) + 8 * (m * Team::stride(m) + (Team::COPIES ? 8 : 0));  // the last row is read on
+  static constexpr OSIK_HOST int numbers_of(int matrix, const Sizes& s) {
+    const int n = Team::variables(s.n), m = Team::level_rows(s.m), h = Team::hard_rows(s.h), ld = Team::stride(n);
+    const int of_factors = m * Team::stride(m) + (Team::COPIES ? 8 : 0);  // their last row is read on
+    const int numbers[] = {h * ld, m * ld, (h - n) * ld, Team::COPIES ? m * ld : 0, of_factors};
+    return numbers[matrix];
   }
-  static constexpr OSIK_HOST int bytes(const Sizes& s) {
-    return (bytes_of_numbers(s) + INTEGERS * width(s) * int(sizeof(Int)) + 15) / 16 * 16;
-  }
-  template <int K> struct VectorAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) { return 8 * K * width(s); }
-  };
-  template <int K> struct LabelsAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) { return bytes_of_numbers(s) + int(sizeof(Int)) * K * width(s); }
-  };
-  template <int K> using Numbers = typename Team::template Array<double, VectorAt<K>, Sizes>;
-  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, Sizes>;
-  template <class At> using Matrix = typename Team::template Array<double, At, Sizes>;
-  Matrix<BasisAt> Z;       // [h, ld] the basis
-  Matrix<RowsAt> R;        // [m, ld] the level's rows in the basis
-  Matrix<HardAt> hard;     // [h - n, ld] hard rows beside the box
-  Matrix<CopiedAt> copied;  // [m, ld] the level's rows, padded, if the team copies them
-  Matrix<FactorsAt> V, S;  // [m, lm] one matrix: reflections above the diagonal, a Cholesky factor below it
+  static constexpr OSIK_HOST int bytes(const Sizes& s) { return Space::bytes(s, INTEGERS * width(s)); }
+  char* space;
+  OSIK_PLACED(Matrix, 0, Z);       // [h, ld] the basis
+  OSIK_PLACED(Matrix, 1, R);       // [m, ld] the level's rows in the basis
+  OSIK_PLACED(Matrix, 2, hard);    // [h - n, ld] hard rows beside the box
+  OSIK_PLACED(Matrix, 3, copied);  // [m, ld] the level's rows, padded, if the team copies them
+  OSIK_PLACED(Matrix, 4, V);       // [m, lm] reflections above the diagonal
+  OSIK_PLACED(Matrix, 4, S);       // the same one: a Cholesky factor below the diagonal
   // vectors, as long as the longest of n, m and h
-  Numbers<0> X;
-  Numbers<1> START;
-  Numbers<2> STEP;
-  Numbers<3> WORK;
-  Numbers<4> DOWNHILL;
-  Numbers<5> CURVATURE;
-  Numbers<6> HARD_LOWER;
-  Numbers<7> HARD_UPPER;
-  Numbers<8> HARD_NORM;
-  Numbers<9> MULTIPLIER;
-  Numbers<10> LOWER;
-  Numbers<11> UPPER;
-  Numbers<12> ROW_NORM;
-  Numbers<13> VALUE;
-  Numbers<14> SLACK;
-  Numbers<15> RATE;
-  Numbers<16> RIGHT;
-  Numbers<17> SCALE;
-  Numbers<18> INVERSE;
-  Numbers<4> DIAGONAL;  // in the place of DOWNHILL: a Gram matrix is factored before multipliers are computed
-  Labels<0> ACTIVE;
-  Labels<1> ACTIVE_ABOVE;
-  Labels<2> FROZEN;
-  Labels<3> PENDING;
-  Labels<4> FREEZES;
-  Labels<5> EQUALITY;
-  Labels<6> IN_COST;
-  Labels<7> OWN;
-  Labels<8> PIVOT;
-  Labels<9> NONZERO;
-  Labels<10> NONZERO_END;
-  Labels<11> ACTIVE_BOUND;
-  Labels<12> ACTIVE_ROW;
+  OSIK_PLACED(Numbers, 0, X, START, STEP, WORK, DOWNHILL, CURVATURE, HARD_LOWER, HARD_UPPER, HARD_NORM, MULTIPLIER, LOWER,
+              UPPER, ROW_NORM, VALUE, SLACK, RATE, RIGHT, SCALE, INVERSE);
+  OSIK_PLACED(Numbers, 4, DIAGONAL);  // in the place of DOWNHILL: a Gram matrix is factored before multipliers are computed
+  OSIK_PLACED(Labels, 0, ACTIVE, ACTIVE_ABOVE, FROZEN, PENDING, FREEZES, EQUALITY, IN_COST, OWN, PIVOT, NONZERO, NONZERO_END,
+              ACTIVE_BOUND, ACTIVE_ROW);
 
-  template <class... Arrays> OSIK_FN void place(char* space, Arrays&... arrays) { (arrays.place(space, size), ...); }
   OSIK_FN Hierarchy(const Sizes& s, char* space)
       : size(s), n(s.n), m(s.m), h(s.h), ld(Team::stride(Team::variables(n))), lm(Team::stride(Team::level_rows(m))),
-        row(ld), column(1) {
-    place(space, Z, R, hard, copied, V, S, X, START, STEP, WORK, DOWNHILL, CURVATURE, HARD_LOWER, HARD_UPPER, HARD_NORM,
-          MULTIPLIER, LOWER, UPPER, ROW_NORM, VALUE, SLACK, RATE, RIGHT, SCALE, INVERSE, DIAGONAL, ACTIVE, ACTIVE_ABOVE,
-          FROZEN, PENDING, FREEZES, EQUALITY, IN_COST, OWN, PIVOT, NONZERO, NONZERO_END, ACTIVE_BOUND, ACTIVE_ROW);
-  }
+        row(ld), column(1), space(space) {}
 
   // ---- single rows
   OSIK_FN double hard_value(int q, const double* d) const {
@@ -715,18 +659,15 @@ template <class Team> struct Hierarchy {
     const double terms = longest * larger(longest * x_max, root_cost);
     return residual / (terms > 0.0 ? terms : 1.0);
   }
-  struct Outcome {
-    bool done;
-    double residual;
-  };
-  // all levels, from the guesses of a warm start or without them
-  OSIK_METHOD Outcome solve_levels(const Problem& p, const Answer& to, bool warm) {
+  // all levels, from the guesses of a warm start or without them; returns whether each is optimal
+  OSIK_METHOD bool solve_levels(const Problem& p, const Answer& to, bool warm) {
     const int L = size.L;
     t.each(0, L * h, [&](int e) { to.multipliers[e] = 0.0, to.active[e] = to.frozen[e] = 0; });
     t.each(0, L * m, [&](int e) { to.in_cost[e] = to.own[e] = 0; });
     t.each(0, L, [&](int k) { to.ranks[k] = 0, to.slack_norms[k] = INFINITE, to.dampings[k] = 0.0; });
     begin(p);
-    Outcome all{true, 0.0};
+    bool done = true;
+    double worst = 0.0;
     for (level = first_row = 0; level < L && first_active < n; ++level) {
       rows = size.row_counts[level], unmet = p.damping[3 * level + 1], demand = p.damping[3 * level + 2];
       has_inequalities = t.count(n, h, [&](int q) { return size.level_of_hard[q] == level; }) > 0;
@@ -735,34 +676,32 @@ template <class Team> struct Hierarchy {
       bool optimal = warm && try_guess(p.guess_hard + level * h, p.guess_own + level * m, factored);
       if (!optimal) optimal = primal_active_set(factored);
       const int in_cost_rank = freeze(to);
-      all.done = all.done && optimal, all.residual = larger(all.residual, relative_residual());
+      done = done && optimal, worst = larger(worst, relative_residual());
       t.once([&] { to.ranks[level] = in_cost_rank, to.slack_norms[level] = slack_norm, to.dampings[level] = damping; });
       narrow_box(p.bends + level * n);
       freeze_columns();
       first_row += rows;
     }
-    return all;
+    t.once([&] { to.residual[0] = worst; });
+    return done;
   }
   OSIK_METHOD void solve(const Problem& p, const Answer& to) {
     rank_tol = p.tolerances[0], step_tol = p.tolerances[1], multiplier_tol = p.tolerances[2];
     feasible_tol = p.tolerances[3];
     const bool warm = t.count(0, size.L * m, [&](int e) { return p.guess_own[e] != 0; }) > 0;
     changes = factorizations = 0;
-    Outcome all;
+    bool done = false;
     for (bool guessed = warm;; guessed = false) {
-      all = solve_levels(p, to, guessed);
+      done = solve_levels(p, to, guessed);
       // a guess far beyond the answer has left its roundoff there: all levels are solved again without guesses
-      if (!guessed || (all.done && largest <= MAX_DETOUR * x_max)) break;
+      if (!guessed || (done && largest <= MAX_DETOUR * x_max)) break;
     }
     t.each(0, n, [&](int i) {  // a bound that levels narrowed for those below them is none of the box
       const int at = ACTIVE_BOUND[i];
       const bool narrowed = at < 0 ? HARD_LOWER[i] > p.hard_lower[i] : HARD_UPPER[i] < p.hard_upper[i];
       to.x[i] = X[i], to.active_bounds[i] = narrowed ? 0 : at;
     });
-    t.once([&] {
-      to.residual[0] = all.residual;
-      to.report[0] = all.done, to.report[1] = changes, to.report[2] = factorizations;
-    });
+    t.once([&] { to.report[0] = done, to.report[1] = changes, to.report[2] = factorizations; });
   }
 };
 }  // namespace osik

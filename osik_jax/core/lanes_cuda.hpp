@@ -12,22 +12,17 @@
 
 namespace osik {
 
-// The numbers of one lane, `step` apart. Constant ones are arguments, which no thread writes: they may be read before
-// results that stand earlier in the text are written.
+// An entry of an array. A constant one is an argument, which no thread writes: it may be read before results that stand
+// earlier in the text are written.
+template <class T> __device__ T& entry_of(T& at) { return at; }
+template <class T> __device__ T entry_of(const T& at) { return __ldg(&at); }
+
+// The numbers of one lane, `step` apart.
 template <class T> struct Strided {
-  using Number = T;
+  using Number = NumberAt<T*>;
   T* at = nullptr;
   int step = 1;
-  T& operator[](int i) const { return at[size_t(i) * step]; }
-  Strided operator+(int i) const { return {at + size_t(i) * step, step}; }
-  Strided& operator+=(int i) { return at += size_t(i) * step, *this; }
-  explicit operator bool() const { return at; }
-};
-template <class T> struct Strided<const T> {
-  using Number = T;
-  const T* at = nullptr;
-  int step = 1;
-  T operator[](int i) const { return __ldg(at + size_t(i) * step); }
+  decltype(auto) operator[](int i) const { return entry_of(at[size_t(i) * step]); }
   Strided operator+(int i) const { return {at + size_t(i) * step, step}; }
   Strided& operator+=(int i) { return at += size_t(i) * step, *this; }
   explicit operator bool() const { return at; }

@@ -259,12 +259,14 @@ template <class Team> struct LinearAlgebra {
     t.backward(M, ld, inverse, M + rows * ld, rows);
   }
 
-  // out[b, j] = factor_b sum_i r_b[i column] Z[i, j] over from <= i < to, for start <= j < n and the first `rows` of
+  // out[b, j] = factor_b sum_i A[b row + i column] Z[i, j] over from <= i < to, for start <= j < n and the first `rows` of
   // four rows, so that each entry of Z is read once for four. `add`: added to what out has; `lower`: Z is lower
   // triangular, and the sums begin at the first column of a pack.
-  OSIK_FN static void four_rows(const Team& t, const Real* const (&r)[4], const Real (&factor)[4], int column, const Real* Z,
+  OSIK_FN static void four_rows(const Team& t, const Real* A, int row, int column, const Real (&factor)[4], const Real* Z,
                                 Real* out, int ld, int ld_out, int rows, int from, int to, int start, int n,
                                 bool add = false, bool lower = false) {
+    const Real* r[4];
+    for (int b = 0; b < 4; ++b) r[b] = A + (b < rows ? b : 0) * row;
     t.narrow_columns(start, n, [&](auto c) {
       using P = typename decltype(c)::P;
       P total[4] = {P(0), P(0), P(0), P(0)};
@@ -288,11 +290,9 @@ template <class Team> struct LinearAlgebra {
   OSIK_CALL static void product(Team t, const Real* A, int row, int column, const Real* M, int ld, Real* out, int ld_out,
                                 int rows, int inner, int n, bool upper = false) {
     const Real factor[4] = {1, 1, 1, 1};
-    for (int first = 0; first < rows; first += 4) {
-      const Real* r[4];
-      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first) * row;
-      four_rows(t, r, factor, column, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner, upper ? first : 0, n);
-    }
+    for (int first = 0; first < rows; first += 4)
+      four_rows(t, A + first * row, row, column, factor, M, out + first * ld_out, ld, ld_out, rows - first, 0, inner,
+                upper ? first : 0, n);
   }
 
   // S <- S - A'M in `rows` rows and the columns [from, to) of S, over `inner` rows of A and M; all strides are ld.
@@ -300,12 +300,9 @@ template <class Team> struct LinearAlgebra {
   OSIK_CALL static void subtract_product(Team t, const Real* A, const Real* M, Real* S, int ld, int rows, int inner,
                                          int from, int to, bool lower = false, bool upper = false) {
     const Real factor[4] = {-1, -1, -1, -1};
-    for (int first = 0; first < rows; first += 4) {
-      const Real* r[4];
-      for (int b = 0; b < 4; ++b) r[b] = A + (first + b < rows ? first + b : first);
-      four_rows(t, r, factor, ld, M, S + first * ld, ld, ld, rows - first, 0, inner, upper ? first / 8 * 8 : from, to, true,
-                lower);
-    }
+    for (int first = 0; first < rows; first += 4)
+      four_rows(t, A + first, 1, ld, factor, M, S + first * ld, ld, ld, rows - first, 0, inner, upper ? first / 8 * 8 : from,
+                to, true, lower);
   }
 
   // The product of a level's rows with the basis Z: R[a, j] = sum_i A[a, i] Z[i, j] for start <= j < n, or 0 where
@@ -315,16 +312,15 @@ template <class Team> struct LinearAlgebra {
                                          int n) {
     t.are_shared(Z, R, in_cost, nonzero, nonzero_end);
     for (int first = 0; first < rows; first += 4) {
-      const Real* r[4];
       Real factor[4];
       int from = n, to = 0;
       for (int b = 0; b < 4; ++b) {
-        const int a = first + b < rows ? first + b : first;
-        const bool in = first + b < rows && in_cost[a];
-        factor[b] = in ? 1 : 0, r[b] = A + a * row;
+        const int a = first + b;
+        const bool in = a < rows && in_cost[a];
+        factor[b] = in ? 1 : 0;
         if (in) from = nonzero[a] < from ? nonzero[a] : from, to = nonzero_end[a] > to ? nonzero_end[a] : to;
       }
-      four_rows(t, r, factor, column, Z, R + first * ld, ld, ld, rows - first, from, to, start, n);
+      four_rows(t, A + first * row, row, column, factor, Z, R + first * ld, ld, ld, rows - first, from, to, start, n);
     }
   }
 };

@@ -9,10 +9,11 @@ struct Manifold {
   const int* scalar;      // [2, scalars] where numbers that simply add are in q, then in v
   const int* quaternion;  // [2, quaternions] where quaternions are in q, then their rotations in v
 
-  static Quaternion<double> unit(const double* q) {
-    const double by = 1.0 / std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    return {by * q[0], by * q[1], by * q[2], by * q[3]};
+  static Quaternion<double> unit(const Quaternion<double>& q) {
+    const double by = 1.0 / std::sqrt(q.w * q.w + q.x * q.x + q.y * q.y + q.z * q.z);
+    return {by * q.w, by * q.x, by * q.y, by * q.z};
   }
+  static Quaternion<double> unit(const double* q) { return unit(Quaternion<double>::of(q)); }
   // out = the configuration that is reached from q at velocity v in unit time
   void integrate(const double* q, const double* v, double* out) const {
     for (int k = 0; k < scalars; ++k) out[scalar[k]] = q[scalar[k]] + v[scalar[scalars + k]];
@@ -23,10 +24,7 @@ struct Manifold {
       const bool small = square < SMALL_TURN_SQUARED;
       const double cosine = small ? 1.0 - square / 8.0 + square * square / 384.0 : std::cos(0.5 * angle);
       const double factor = small ? 0.5 - square / 48.0 + square * square / 3840.0 : std::sin(0.5 * angle) / angle;
-      const Quaternion<double> turned = unit(q + at) *
-                                        Quaternion<double>{cosine, factor * w[0], factor * w[1], factor * w[2]};
-      const double numbers[4] = {turned.w, turned.x, turned.y, turned.z};
-      const Quaternion<double> end = unit(numbers);
+      const Quaternion<double> turn{cosine, factor * w[0], factor * w[1], factor * w[2]}, end = unit(unit(q + at) * turn);
       out[at] = end.w, out[at + 1] = end.x, out[at + 2] = end.y, out[at + 3] = end.z;
     }
   }

@@ -9,6 +9,17 @@
 
 namespace osik {
 
+// The rows of task k, given what is at each of their places.
+template <class Out, class F> Rows<Out> rows_at(const RowPlaces& of, const StepLayout::Task& task, int k, int nv, F at) {
+  const size_t i = task.first;
+  Rows<Out> rows{};
+  rows.error = at(of.error + i), rows.jacobian = at(of.J + i * nv), rows.lower = at(of.low + i);
+  rows.curvature = at(of.curvature + k), rows.pull = at(of.pull + i), rows.levers = at(of.levers + size_t(k) * nv);
+  if (task.bounded) rows.upper = at(of.high + i);
+  rows.squares = at(of.square + i);
+  return rows;
+}
+
 // The bodies, and the rows of tasks on frames and on the centre of mass. Real: double, or Lanes<double> for a pack.
 template <class Real> struct MovingRows {
   static constexpr bool ALONE = std::is_same_v<Real, double>;
@@ -78,17 +89,10 @@ template <class Real> struct MovingRows {
       interval.lower = leaves[LOWER] < 0 ? numbers<In>(unbounded.data(), 0) : leaf(leaves[LOWER]).at;
       interval.upper = leaf(leaves[UPPER]).at;
     }
-    auto out = [&](size_t first, size_t i) { return numbers<Out>(rows + first + i, at.end); };
-    const Rows<Out> to{out(at.error, task.first),
-                       out(at.J, task.first * s.nv),
-                       out(at.low, task.first),
-                       out(at.curvature, k),
-                       out(at.pull, task.first),
-                       out(at.levers, k * s.nv),
-                       task.bounded ? out(at.high, task.first) : Out{},
-                       out(at.square, task.first)};
+    auto out = [&](size_t first) { return numbers<Out>(rows + first, at.end); };
+    const Rows<Out> to = rows_at<Out>(at, task, k, s.nv, out);
     card.add(*this, task, interval, &gain, to);
-    for (int i = 0; i < task.m; ++i) out(at.weight, task.first)[i] = weights[i];
+    for (int i = 0; i < task.m; ++i) out(at.weight + task.first)[i] = weights[i];
   }
 };
 }  // namespace osik

@@ -9,7 +9,7 @@
 // front, and so has Q'Z.
 #pragma once
 #include "constants.hpp"
-#include "linear_algebra.hpp"
+#include "workspace.hpp"
 
 namespace osik {
 
@@ -30,7 +30,6 @@ template <class Team> struct NullSpace {
   using Int = typename Team::Int;
   using Sizes = NullSpaceSizes;
   using Algebra = LinearAlgebra<Team>;
-  static constexpr int VECTORS = 17, INTEGERS = 3;
   Team t;
   NullSpaceLevel level;
   int first, rows, rank;     // rows of Z that are not free; rows of the level; rank of the level
@@ -40,101 +39,61 @@ template <class Team> struct NullSpace {
   double longest_square, frobenius, damping;  // of the level's longest row, of its matrix, of the level
   double rank_tol;
 
-  // ---- the workspace: where each array begins, in bytes
+  // ---- the workspace
+  using Space = Workspace<NullSpace, Team, Sizes>;
+  static constexpr int VECTORS = 17, MATRICES = 7, INTEGERS = 3;
   static constexpr OSIK_HOST int smaller(int a, int b) { return a < b ? a : b; }
   static constexpr OSIK_HOST int greater(int a, int b) { return a < b ? b : a; }
-  template <int K> struct SizeAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) {
-      const int n = Team::variables(s.n), m = Team::level_rows(s.m), least = smaller(n, m), most = greater(n, m);
-      const int of_b = Team::stride(greater(n, m + least)), of_s = Team::stride(least);
-      const int size[] = {
-          n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s, Team::stride(most)};
-      return size[K];
-    }
-  };
-  template <int K> using Size = typename Team::template Fixed<SizeAt<K>, Sizes>;
-  Size<0> n;
-  Size<1> m;
-  Size<2> ld;  // strides of Z and V, of AT, of B, of S, of F
-  Size<3> lm;
-  Size<4> lb;
-  Size<5> ls;
-  Size<6> lf;
-  // the numbers before matrix `which`, in the order of the matrices below; the last is the end
-  static constexpr OSIK_HOST int numbers_before(int which, const Sizes& s) {
-    const int n = Team::variables(s.n), of_b = SizeAt<4>::of(s), apart = Team::SPARES_SPACE ? 0 : 1;
-    const int of_f = apart * smaller(n, Team::level_rows(s.m)) * SizeAt<5>::of(s);
-    const int size[] = {of_b, n * SizeAt<2>::of(s),      (n + 1) * of_b, apart * n * SizeAt<3>::of(s), of_f,
-                        of_f, apart * numbers_outside(s)};
-    int count = VECTORS * SizeAt<7>::of(s);
-    for (int i = 0; i < which; ++i) count += size[i];
-    return count;
+  static constexpr OSIK_HOST int size_of(int k, const Sizes& s) {
+    const int n = Team::variables(s.n), m = Team::level_rows(s.m), least = smaller(n, m), most = greater(n, m);
+    const int of_b = Team::stride(greater(n, m + least)), of_s = Team::stride(least);
+    const int size[] = {
+        n, m, Team::stride(n), Team::stride(m), of_b, of_s, Team::SPARES_SPACE ? of_b : of_s, Team::stride(most)};
+    return size[k];
+  }
+  static constexpr OSIK_HOST int width(const Sizes& s) { return size_of(7, s); }
+  static constexpr OSIK_HOST int numbers_of(int matrix, const Sizes& s) {
+    const int n = Team::variables(s.n), of_b = size_of(4, s), apart = Team::SPARES_SPACE ? 0 : 1;
+    const int of_f = apart * smaller(n, Team::level_rows(s.m)) * size_of(5, s);
+    const int numbers[] = {of_b, n * size_of(2, s),         (n + 1) * of_b, apart * n * size_of(3, s), of_f,
+                           of_f, apart * numbers_outside(s)};
+    return numbers[matrix];
   }
   // the numbers of V and S, which are in global memory if the team spares space
   static constexpr OSIK_HOST int numbers_outside(const Sizes& s) {
     const int n = Team::variables(s.n), m = Team::level_rows(s.m);
-    return greater(m, n) * SizeAt<2>::of(s) + smaller(n, m) * SizeAt<5>::of(s);
+    return greater(m, n) * size_of(2, s) + smaller(n, m) * size_of(5, s);
   }
   static constexpr OSIK_HOST int bytes(const Sizes& s, int integers = INTEGERS) {
-    return (int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * integers * SizeAt<7>::of(s) + 15) / 16 * 16;
+    return Space::bytes(s, integers * width(s));
   }
-  template <int K, int COLUMN = 0> struct MatrixAt {
+  template <int K> struct InPlaceAt {
     static constexpr OSIK_HOST int of(const Sizes& s) {
-      return int(sizeof(double)) * (numbers_before(K, s) + COLUMN * Team::level_rows(s.m));
+      return int(sizeof(double)) *
+             (Space::numbers_before(Team::SPARES_SPACE ? 2 : K, s) + (Team::SPARES_SPACE ? Team::level_rows(s.m) : 0));
     }
   };
-  template <int K> struct VectorAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) { return int(sizeof(double)) * K * SizeAt<7>::of(s); }
-  };
-  template <int K> struct LabelsAt {
-    static constexpr OSIK_HOST int of(const Sizes& s) {
-      return int(sizeof(double)) * numbers_before(7, s) + int(sizeof(Int)) * K * SizeAt<7>::of(s);
-    }
-  };
-  template <class At> using Matrix = typename Team::template Array<double, At, Sizes>;
-  template <int K> using Numbers = typename Team::template Array<double, VectorAt<K>, Sizes>;
-  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, Sizes>;
-  template <int K> using InPlaceAt = MatrixAt<Team::SPARES_SPACE ? 2 : K, Team::SPARES_SPACE>;
-  Matrix<MatrixAt<0>> WORK;  // as long as a row of B
-  Matrix<MatrixAt<1>> Z;     // [n, ld] the basis
-  Matrix<MatrixAt<2>> B;  // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
-  Matrix<MatrixAt<3>> AT;  // [n, lm] the level's matrix, transposed; not for a team that spares space
+  char* space;
+  Sizes size;
+  OSIK_PLACED(Size, 0, n, m, ld, lm, lb, ls, lf);  // strides of Z and V, of AT, of B, of S, of F
+  OSIK_PLACED(Matrix, 0, WORK);                    // as long as a row of B
+  OSIK_PLACED(Matrix, 1, Z);                       // [n, ld] the basis
+  OSIK_PLACED(Matrix, 2, B);  // [n + 1, lb] the level's rows in the basis, B[j, a] = Z_j . A_a; below them a right-hand side
+  OSIK_PLACED(Matrix, 3, AT);  // [n, lm] the level's matrix, transposed; not for a team that spares space
   // [min(m, n), lf] space to factor a Gram matrix, and the inverse of the factor: if the team spares space, both are in the
   // columns of B from m on, until the level is solved in its row space
-  Matrix<InPlaceAt<4>> F;
-  Matrix<InPlaceAt<5>> M;
+  typename Space::template ArrayAt<InPlaceAt<4>> F{space, size};
+  typename Space::template ArrayAt<InPlaceAt<5>> M{space, size};
   double* V;  // [max(m, n), ld] reflections; before these, on a CPU, rows in the cost in the free coordinates
   double* S;  // [min(m, n), ls] a Gram matrix
   // vectors, as long as the longer of m and n
-  Numbers<0> X;
-  Numbers<1> LOW;
-  Numbers<2> HIGH;
-  Numbers<3> CURVATURE;
-  Numbers<4> MOTION;
-  Numbers<5> COORDINATES;
-  Numbers<6> WANTED;
-  Numbers<7> MISSING;
-  Numbers<8> VALUE;
-  Numbers<9> BASE_VALUE;
-  Numbers<10> BASE_WANTED;
-  Numbers<11> SQUARE;
-  Numbers<12> RIGHT;
-  Numbers<13> DIAGONAL;
-  Numbers<14> INVERSE;
-  Numbers<15> SCALE;
-  Numbers<16> SQUARES;
-  Labels<0> IN_COST;
-  Labels<1> IN_COST_AT_BASE;
-  Labels<2> PIVOT;
+  OSIK_PLACED(Numbers, 0, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE, BASE_VALUE, BASE_WANTED,
+              SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES);
+  OSIK_PLACED(Labels, 0, IN_COST, IN_COST_AT_BASE, PIVOT);
 
-  template <class... Arrays> OSIK_FN void place(char* space, const Sizes& s, Arrays&... arrays) {
-    (arrays.place(space, s), ...);
-  }
   // outside: space of V and S, if the team spares space
-  OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr) : n(s), m(s), ld(s), lm(s), lb(s), ls(s), lf(s) {
-    place(space, s, WORK, Z, B, AT, F, M, X, LOW, HIGH, CURVATURE, MOTION, COORDINATES, WANTED, MISSING, VALUE, BASE_VALUE,
-          BASE_WANTED, SQUARE, RIGHT, DIAGONAL, INVERSE, SCALE, SQUARES, IN_COST, IN_COST_AT_BASE, PIVOT);
-    V = Team::SPARES_SPACE ? outside : reinterpret_cast<double*>(space) + numbers_before(6, s);
+  OSIK_FN NullSpace(const Sizes& s, char* space, double* outside = nullptr) : space(space), size(s) {
+    V = Team::SPARES_SPACE ? outside : reinterpret_cast<double*>(space) + Space::numbers_before(6, s);
     S = V + greater(m, n) * ld;
   }
 

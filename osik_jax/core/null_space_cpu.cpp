@@ -59,23 +59,11 @@ void saturate(const xla::Call& call) {
   Method method(sizes, reinterpret_cast<char*>(space.data()));
   for (size_t b = 0; b < size_t(batch); ++b) {
     const size_t l = b * L;
-    const SaturationProblem p{numbers(0) + l * m * n,
-                              numbers(1) + l * m,
-                              numbers(2) + l * m,
-                              numbers(4) + l,
-                              numbers(5) + l,
-                              numbers(6) + l,
-                              numbers(7) + l * n,
-                              numbers(8) + l * n,
-                              numbers(9) + b * n,
-                              numbers(10) + b * n,
-                              call.in<int>(3) + l * m,
-                              numbers(11)[b],
-                              call.in<int>(12)[0],
-                              L,
-                              m,
-                              n,
-                              1};
+    SaturationProblem p{};
+    p.matrix = numbers(0) + l * m * n, p.lower = numbers(1) + l * m, p.upper = numbers(2) + l * m;
+    p.equality = call.in<int>(3) + l * m, p.constant = numbers(4) + l, p.unmet = numbers(5) + l, p.demand = numbers(6) + l;
+    p.bends = numbers(7) + l * n, p.targets = numbers(8) + l * n, p.low = numbers(9) + b * n, p.high = numbers(10) + b * n;
+    p.rank_tol = numbers(11)[b], p.max_changes = call.in<int>(12)[0], p.L = L, p.m = m, p.row = n, p.column = 1;
     const SaturationAnswer a{call.out<double>(0) + b * n, call.out<double>(1) + b * n * n, call.out<double>(2) + l,
                              call.out<int>(3) + l,        call.out<int>(4) + l * n,        call.out<int>(5) + l * n,
                              call.out<int>(6) + l,        call.out<int>(7) + b * n,        call.out<int>(8) + b * 2};

@@ -19,30 +19,20 @@ template <class Team> class QPCertificate {
   using Int = typename Team::Int;
   using Method = WeightedQP<Team>;
   using Gathered = GatheredBy<Team>;
-  template <int K> using Numbers = typename Method::template Numbers<K>;
+  using Space = typename Method::Space;
   static constexpr Real EPS = Method::EPS, REDUNDANT_TOL = DualActiveSet<Team>::REDUNDANT_BELOW;
   Team t;
-  typename Method::template Size<0> m;
-  typename Method::template Size<1> n;
-  typename Method::template Size<2> p;
-  typename Method::template Size<Team::SPARES_SPACE ? 5 : 1> ld;  // of rows that a GPU has copied, or as given
+  char* space;
+  QPSizes size;
+  OSIK_PLACED(Size, 0, m, n, p);
+  OSIK_PLACED(Size, Team::SPARES_SPACE ? 5 : 1, ld);  // of rows that a GPU has copied, or as given
   Real scaled, plain, tolerance;  // sizes of x: per root of a curvature, and per unit
-  // in the workspace of a search that is over
-  Numbers<8> SIZE;                // [n]
-  Numbers<9> GRADIENT;            // [n], and the sizes of its terms:
-  Numbers<10> SCALE;              // [n] of the cost
-  Numbers<11> ROW_TERMS;          // [n] of the rows
-  Numbers<12> ROOT;               // [n] of the curvature of the cost
-  Numbers<13> INVERSE_ROOT;       // [n]
-  Numbers<14> ONES;               // [n]
-  Numbers<15> FORCE;              // [m] pulls of the rows
-  Numbers<16> TERMS;              // [m] the sizes of their terms
+  // in the workspace of a search that is over: sizes of x, the gradient, the sizes of its terms of the cost and of the rows,
+  // roots of the curvature of the cost [n]; pulls of the rows, and the sizes of their terms [m]
+  OSIK_PLACED(Numbers, 8, SIZE, GRADIENT, SCALE, ROW_TERMS, ROOT, INVERSE_ROOT, ONES, FORCE, TERMS);
 
  public:
-  OSIK_FN QPCertificate(const QPSizes& s, char* space) : m(s), n(s), p(s), ld(s) {
-    auto place = [&](auto&... arrays) { (arrays.place(space, s), ...); };
-    place(SIZE, GRADIENT, SCALE, ROW_TERMS, ROOT, INVERSE_ROOT, ONES, FORCE, TERMS);
-  }
+  OSIK_FN QPCertificate(const QPSizes& s, char* space) : space(space), size(s) {}
 
   // x: [n], y: [p] multipliers of the rows, active: [n + p] labels; residuals up to kkt_tol are certified
   template <class Data>

@@ -76,9 +76,7 @@ template <class Team> struct RowFactors {
   OSIK_CALL void solve(const double* matrix, double cutoff, double damping, double* basis, double* orthonormal,
                        double* triangle) {
     const double root = sqrt(damping);
-    t.each(0, n * lm, [&](int e) { REST[e] = 0.0; });
-    t.each(0, m * ln, [&](int e) { BASIS[e] = 0.0; });
-    t.each(0, m * lc, [&](int e) { COLUMNS[e] = 0.0; });
+    t.each(0, n * lm + m * ln + m * lc, [&](int e) { REST[e] = 0.0; });  // the next two as well
     t.each(0, m * m, [&](int e) { triangle[e] = e % (m + 1) == 0; });
     t.each(0, m, [&](int a) {
       SQUARES[a] = 0.0;

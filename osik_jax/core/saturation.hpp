@@ -53,38 +53,24 @@ template <class Team> struct Saturation : NullSpace<Team> {
       Base::MISSING;
   using typename Base::Algebra, typename Base::Int;
   enum Step { CHOOSE, REPLACE, STOP };  // a joint leaves or enters; one enters in place of another; one stops the motion
-  template <int K> using Numbers = typename Base::template Numbers<K>;
-  template <int K> using Labels = typename Base::template Labels<K>;
+  using typename Base::Space;
 
   // The search's numbers are in the place of those from which the level's damping and motion were computed. WANTED,
   // MISSING, COORDINATES and IN_COST stay, which the search reads.
 
   // coordinates of the saturated joints, each with 1 along its own joint's column and 0 along the others'. [n, lb]
-  typename Base::template Matrix<typename Base::template MatrixAt<2>> DUALS;
+  OSIK_PLACED(Matrix, 2, DUALS);
   double* BEFORE;        // [n, ld] the free rows of the basis before the search
   const double* target;  // [n]
   // joints: the point of the search; the target's part in it; a direction; the combination that stops the motion; the
   // point at scale 0; the last point that was accepted
-  Numbers<8> POINT;
-  Numbers<9> TARGET_PART;
-  Numbers<10> DIRECTION;
-  Numbers<11> NORMAL;
-  Numbers<12> START;
-  Numbers<13> KEPT;
-  typename Base::template Matrix<typename Base::template MatrixAt<0>> COLUMN;  // coordinates of a joint
+  OSIK_PLACED(Numbers, 8, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT);
+  OSIK_PLACED(Matrix, 0, COLUMN);  // coordinates of a joint
   // saturated joints, in the order of their coordinates: multipliers, their part of a column, way to their bounds
-  Numbers<14> MULTIPLIER;
-  Numbers<15> RATE;
-  Numbers<16> GAP;
-  // joints; PASSED: free ones that saturated ones put on their bounds
-  Labels<3> SIDE;
-  Labels<4> PASSED;
-  Labels<5> BLOCKING;
-  Labels<6> FIXED;
-  Labels<7> KEPT_SIDE;
-  // saturated joints: which they are, and whether they stop the motion
-  Labels<8> JOINT;
-  Labels<9> STOPS;
+  OSIK_PLACED(Numbers, 14, MULTIPLIER, RATE, GAP);
+  // joints; PASSED: free ones that saturated ones put on their bounds. The last two: saturated joints, whether they stop
+  // the motion
+  OSIK_PLACED(Labels, 3, SIDE, PASSED, BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
   int count, stop;  // number of saturated joints; the joint that stops the motion, -1 for none
   double scale;
   // the search: changes of the active set, and their limit
@@ -98,10 +84,7 @@ template <class Team> struct Saturation : NullSpace<Team> {
 
   static constexpr OSIK_HOST int bytes(const NullSpaceSizes& s) { return Base::bytes(s, 10); }
   OSIK_FN Saturation(const NullSpaceSizes& s, char* space, double* outside = nullptr)
-      : Base(s, space, outside), BEFORE(this->V) {
-    this->place(space, s, DUALS, COLUMN, POINT, TARGET_PART, DIRECTION, NORMAL, START, KEPT, MULTIPLIER, RATE, GAP, SIDE,
-                PASSED, BLOCKING, FIXED, KEPT_SIDE, JOINT, STOPS);
-  }
+      : Base(s, space, outside), BEFORE(this->V) {}
 
   OSIK_FN double bound(int i) const { return SIDE[i] > 0 ? HIGH[i] : LOW[i]; }
   OSIK_FN double bound_passed(int i) const { return PASSED[i] < 0 ? LOW[i] : HIGH[i]; }
@@ -443,12 +426,8 @@ template <class Team> struct Saturation : NullSpace<Team> {
   OSIK_METHOD bool attempt(double its_scale, double least, double compliance, bool goes_on) {
     const bool soft = compliance > 0.0;
     const int start = first - soft;
-    if (!goes_on)
-      t.each(start, n, [&](int j) {
-        for (int i = 0; i < n; ++i) BEFORE[j * ld + i] = Z[j * ld + i];
-      });
     if (goes_on) go_on(its_scale);
-    else begin_search(its_scale);
+    else copy_rows(Z, BEFORE, start), begin_search(its_scale);
     if (soft) {
       const double square = t.dot(MOTION, MOTION, 0, n), root = square > 0.0 ? sqrt(compliance / square) : 0.0;
       t.each(0, n, [&](int i) { Z[start * ld + i] = root * MOTION[i]; });
@@ -460,16 +439,16 @@ template <class Team> struct Saturation : NullSpace<Team> {
     if (soft) {
       done = done && stop < 0;
       find_stop();
-      put_back(start);
+      copy_rows(BEFORE, Z, start);
     }
     done = done && holds(size);
     if (soft) t.each(0, n, [&](int i) { NORMAL[i] = fabs(NORMAL[i]) > NEGLIGIBLE_ENTRY ? NORMAL[i] : 0.0; });
-    else if (!done) put_back(start);
+    else if (!done) copy_rows(BEFORE, Z, start);
     return done;
   }
-  OSIK_FN void put_back(int start) {
+  OSIK_FN void copy_rows(const double* from, double* to, int start) {  // from row `start` on
     t.each(start, n, [&](int j) {
-      for (int i = 0; i < n; ++i) Z[j * ld + i] = BEFORE[j * ld + i];
+      for (int i = 0; i < n; ++i) to[j * ld + i] = from[j * ld + i];
     });
   }
 

@@ -16,57 +16,21 @@ constexpr int VECTOR_BYTES = 32;
 constexpr int VECTOR_BYTES = 16;
 #endif
 
-template <class Real> struct Vector {
+template <class R> struct Vector {
+  using Real = R;
   static constexpr int LANES = VECTOR_BYTES / int(sizeof(Real));
   typedef Real Loaded __attribute__((vector_size(VECTOR_BYTES), aligned(sizeof(Real)), may_alias));
   typedef Real Value __attribute__((vector_size(VECTOR_BYTES)));
   typedef std::conditional_t<sizeof(Real) == 8, long long, int> Bits;
   typedef Bits Mask __attribute__((vector_size(VECTOR_BYTES)));
-};
-
-// B vectors of neighbouring columns.
-template <class Real, int B> struct Pack {
-  typename Vector<Real>::Value v[B];
-  OSIK_FN Pack() {}
-  OSIK_FN Pack(Real a) {
-    for (int b = 0; b < B; ++b) v[b] = typename Vector<Real>::Value{} + a;
-  }
-  OSIK_FN Pack& operator+=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& operator-=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] -= o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& operator*=(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] *= o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack inverse() const {
-    Pack p;
-    for (int b = 0; b < B; ++b) p.v[b] = Real(1) / v[b];
-    return p;
-  }
-  OSIK_FN Pack& fma(Real a, const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += a * o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack& square(const Pack& o) {
-    for (int b = 0; b < B; ++b) v[b] += o.v[b] * o.v[b];
-    return *this;
-  }
-  OSIK_FN Pack size() const {
-    Pack p;
-    for (int b = 0; b < B; ++b) p.v[b] = v[b] < 0 ? -v[b] : v[b];
-    return p;
-  }
+  OSIK_FN static Value all(Real a) { return Value{} + a; }
+  OSIK_FN static Value size(Value a) { return a < 0 ? -a : a; }
 };
 
 template <class Real, int B> struct Columns {
   int at;
-  using P = Pack<Real, B>;
   using V = Vector<Real>;
+  using P = Pack<V, B>;
   OSIK_FN P load(const Real* row) const {
     P p;
     for (int b = 0; b < B; ++b) p.v[b] = *(const typename V::Loaded*)(row + at + b * V::LANES);
@@ -80,18 +44,18 @@ template <class Real, int B> struct Columns {
 // An array of a workspace, at the place that At::of says [bytes].
 template <class T, class At, class Sizes> struct PointerArray {
   T* data;
-  OSIK_FN void place(char* space, const Sizes& s) { data = reinterpret_cast<T*>(space + At::of(s)); }
+  OSIK_FN PointerArray(char* space, const Sizes& s) : data(reinterpret_cast<T*>(space + At::of(s))) {}
   OSIK_FN operator T*() const { return data; }
 };
 
 // A number that depends on a problem's sizes, as At::of says.
 template <class At, class Sizes> struct SizeValue {
   int value;
-  OSIK_FN SizeValue(const Sizes& s) : value(At::of(s)) {}
+  OSIK_FN SizeValue(char*, const Sizes& s) : value(At::of(s)) {}
   OSIK_FN operator int() const { return value; }
 };
 
-template <class R> struct Serial {
+template <class R> struct Serial : CommonTeam<R> {
   using Real = R;
   template <class At, class Sizes> using Fixed = SizeValue<At, Sizes>;
   template <class T, class At, class Sizes> using Array = PointerArray<T, At, Sizes>;
@@ -105,16 +69,10 @@ template <class R> struct Serial {
   static constexpr bool SPARES_SPACE = false, HOLDS_COLUMNS = false;
   static constexpr int BLOCK = 2 * 64 / int(sizeof(R));  // columns of a large pack
   static constexpr int WIDE = 64 / int(sizeof(R));  // the widest vector of any instruction set
-  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
-  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   // a pack that begins at the last column ends within the row
   static constexpr int stride(int n) { return (n + 2 * WIDE - 2) / WIDE * WIDE; }
   // the end of the pack that holds the n-th number
   static constexpr int padded(int n) { return (n + LANES - 1) / LANES * LANES; }
-  // the numbers of variables, rows and hard rows that space is laid out for
-  static constexpr int variables(int n) { return n; }
-  static constexpr int level_rows(int m) { return m; }
-  static constexpr int hard_rows(int h) { return h; }
 
   template <class F> OSIK_FN void each(int a, int b, F f) const {
     for (int i = a; i < b; ++i) f(i);
@@ -364,18 +322,12 @@ template <class R> struct Serial {
     Real* M = rows + at;
     v += at;
     switch ((n - at + LANES - 1) / LANES) {  // with all of v in registers
-      case 1:
-        return reflect_packs<1>(M, ld, count, v, scale);
-      case 2:
-        return reflect_packs<2>(M, ld, count, v, scale);
-      case 3:
-        return reflect_packs<3>(M, ld, count, v, scale);
-      case 4:
-        return reflect_packs<4>(M, ld, count, v, scale);
-      case 5:
-        return reflect_packs<5>(M, ld, count, v, scale);
-      case 6:
-        return reflect_packs<6>(M, ld, count, v, scale);
+      case 1: return reflect_packs<1>(M, ld, count, v, scale);
+      case 2: return reflect_packs<2>(M, ld, count, v, scale);
+      case 3: return reflect_packs<3>(M, ld, count, v, scale);
+      case 4: return reflect_packs<4>(M, ld, count, v, scale);
+      case 5: return reflect_packs<5>(M, ld, count, v, scale);
+      case 6: return reflect_packs<6>(M, ld, count, v, scale);
       default:
         for (int q = 0; q < count; ++q, M += ld) {
           const Real by = -scale * own_dot_on(M, v, 0, n - at);

@@ -154,17 +154,11 @@ class Step : StepRows {
       qp_bounds[N + n + i] = own > 0 ? order(low[s.m + i], high[s.m + i], 1) : INFINITE;
     }
     if (limit_rows) add_hard(soft);
-    const QPData<double> data{J,
-                              low,
-                              weight,
-                              diagonal.data(),
-                              center.data(),
-                              limit_rows ? hard_and_soft.data() : J + s.m * n,
-                              compliance.data(),
-                              qp_bounds.data(),
-                              qp_bounds.data() + N,
-                              d.guess ? d.guess : no_labels.data(),
-                              tolerances[0]};
+    QPData<double> data{};
+    data.matrix = J, data.target = low, data.weight = weight, data.damping = diagonal.data(), data.center = center.data();
+    data.rows = limit_rows ? hard_and_soft.data() : J + s.m * n, data.compliance = compliance.data();
+    data.lower = qp_bounds.data(), data.upper = qp_bounds.data() + N, data.tolerance = tolerances[0];
+    data.guess = d.guess ? d.guess : no_labels.data();
     int* active = to.integers + 3;
     to.integers[0] = to.integers[1] = to.integers[2] = 0;
     Certificate found = solve_qp(data, to);
@@ -305,22 +299,11 @@ class Step : StepRows {
     for (const Numbers* v : {&dampings, &bends})
       for (double a : *v) valid &= a >= 0 && a <= LARGEST_DOUBLE;
     if (!valid) return {false, INFINITE};
-    const Problem p{level_rows.data(),
-                    level_lower.data(),
-                    level_upper.data(),
-                    hard.data(),
-                    hard_lower.data(),
-                    hard_upper.data(),
-                    dampings.data(),
-                    bends.data(),
-                    tolerances,
-                    equality.data(),
-                    pinned.data(),
-                    d.guess ? d.guess : no_labels.data(),
-                    d.guess ? d.guess_own : no_labels.data(),
-                    n,
-                    1,
-                    false};
+    Problem p{};
+    p.matrix = level_rows.data(), p.lower = level_lower.data(), p.upper = level_upper.data(), p.equality = equality.data();
+    p.hard = hard.data(), p.hard_lower = hard_lower.data(), p.hard_upper = hard_upper.data(), p.pinned = pinned.data();
+    p.damping = dampings.data(), p.bends = bends.data(), p.tolerances = tolerances, p.row = n, p.column = 1;
+    p.guess_hard = d.guess ? d.guess : no_labels.data(), p.guess_own = d.guess ? d.guess_own : no_labels.data();
     double* f = found_numbers.data();
     int *i = found_labels.data(), *active = to.integers + 3, report[3];
     const Answer a{to.numbers, f,     f + L * h,     f + L * h + L,  f + L * h + 2 * L,     i,
@@ -384,25 +367,13 @@ class Step : StepRows {
     }
     for (int k = 0; k < 3 * L; ++k) separate[k % 3 * L + k / 3] = dampings[k];
     remove_roundoff();
-    const double* each = separate.data();
     int *sides = found_labels.data(), report[2];
-    const SaturationProblem p{level_rows.data(),
-                              level_lower.data(),
-                              level_upper.data(),
-                              each,
-                              each + L,
-                              each + 2 * L,
-                              bends.data(),
-                              targets.data(),
-                              low_speed.data(),
-                              high_speed.data(),
-                              equality.data(),
-                              *of_step(StepLayout::RANK_TOLERANCE),
-                              s.max_iterations,
-                              L,
-                              m,
-                              n,
-                              1};
+    SaturationProblem p{};
+    p.matrix = level_rows.data(), p.lower = level_lower.data(), p.upper = level_upper.data(), p.equality = equality.data();
+    p.constant = separate.data(), p.unmet = p.constant + L, p.demand = p.unmet + L, p.bends = bends.data();
+    p.targets = targets.data(), p.low = low_speed.data(), p.high = high_speed.data();
+    p.rank_tol = *of_step(StepLayout::RANK_TOLERANCE), p.max_changes = s.max_iterations;
+    p.L = L, p.m = m, p.row = n, p.column = 1;
     saturation[0].solve(p, {x, nullptr, scales.data(), sides, sides + L, sides + L + L * n, sides + L + 2 * L * n,
                             sides + 2 * L + 2 * L * n, report});
     to.integers[1] = report[1], to.integers[2] += report[1];

@@ -31,19 +31,8 @@ struct StepLayout {
   };
   // the leaves of the step and those of the robot, in the order of the layout; the last three are NullSpace's
   enum { Q, DT, DAMPING, CURVATURE_DAMPING, BOX, BOX_END, POTENTIAL_GAIN, MARGIN, RANK_TOLERANCE, STEP_LEAVES };
-  enum {
-    OFFSET,
-    REFERENCE,
-    POSITION,
-    QUATERNION,
-    ANCHOR,
-    AXIS,
-    MASS,
-    CENTER_OF_MASS,
-    FRAME_POSITION,
-    FRAME_ROTATION,
-    ROBOT_LEAVES
-  };
+  enum { OFFSET, REFERENCE, POSITION, QUATERNION, ANCHOR, AXIS, MASS, CENTER_OF_MASS, FRAME_POSITION };
+  enum { FRAME_ROTATION = FRAME_POSITION + 1, ROBOT_LEAVES };
   StepSizes s;
   std::vector<int> numbers;
   std::vector<Task> tasks;

@@ -154,16 +154,8 @@ struct StepRows {
     curvature = at + place.curvature;
     for (int k = 0; k < s.tasks; ++k) {
       Task& task = tasks[k];
-      const size_t i = task.first;
-      task.rows = {at + place.error + i,
-                   J + i * s.nv,
-                   low + i,
-                   curvature + k,
-                   at + place.pull + i,
-                   levers + k * s.nv,
-                   task.bounded ? high + i : nullptr,
-                   at + place.square + i};
-      task.weight = weight + i;
+      task.rows = rows_at<double*>(place, task, k, s.nv, [&](size_t first) { return at + first; });
+      task.weight = weight + task.first;
     }
   }
   // A bound of the solver's: where they are the wrong way round, both are in the middle (solvers/_box.py).

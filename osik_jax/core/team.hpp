@@ -52,6 +52,43 @@ template <class T> struct NumberOf<const T*> {
 };
 template <class At> using NumberAt = typename NumberOf<At>::Type;
 
+// Numbers of a thread from B columns, or from B vectors of them (Of::Value).
+template <class Of, int B> struct Pack {
+  using Real = typename Of::Real;
+  typename Of::Value v[B];
+  template <class F> OSIK_FN static void each(F f) {
+    OSIK_UNROLL
+    for (int b = 0; b < B; ++b) f(b);
+  }
+  OSIK_FN Pack() {}
+  OSIK_FN Pack(Real a) {
+    each([&](int b) { v[b] = Of::all(a); });
+  }
+  OSIK_FN Pack& operator+=(const Pack& o) {
+    return each([&](int b) { v[b] += o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& operator-=(const Pack& o) {
+    return each([&](int b) { v[b] -= o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& operator*=(const Pack& o) {
+    return each([&](int b) { v[b] *= o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& fma(Real a, const Pack& o) {
+    return each([&](int b) { v[b] += a * o.v[b]; }), *this;
+  }
+  OSIK_FN Pack& square(const Pack& o) {
+    return each([&](int b) { v[b] += o.v[b] * o.v[b]; }), *this;
+  }
+  OSIK_FN Pack inverse() const {
+    Pack p;
+    return each([&](int b) { p.v[b] = Real(1) / v[b]; }), p;
+  }
+  OSIK_FN Pack size() const {
+    Pack p;
+    return each([&](int b) { p.v[b] = Of::size(v[b]); }), p;
+  }
+};
+
 template <class Real> struct Best {
   Real value;
   int which;  // -1 where no value is larger than the start
@@ -66,9 +103,19 @@ template <class Real> struct RowSums {
 template <class T, class At, class Sizes> struct NoArray {};
 template <class At, class Sizes> struct NoSize {};
 
-template <class R = double> struct WarpSizes {
-  using Int = short;
+// What teams share.
+template <class R> struct CommonTeam {
   using Real = R;
+  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
+  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
+  // the numbers of variables, rows and hard rows that space is laid out for
+  static constexpr OSIK_HOST int variables(int n) { return n; }
+  static constexpr OSIK_HOST int level_rows(int m) { return m; }
+  static constexpr OSIK_HOST int hard_rows(int h) { return h; }
+};
+
+template <class R = double> struct WarpSizes : CommonTeam<R> {
+  using Int = short;
   template <class T, class At, class Sizes> using Array = NoArray<T, At, Sizes>;
   template <class At, class Sizes> using Fixed = NoSize<At, Sizes>;
   static constexpr bool COPIES = false;        // rows are read from global memory
@@ -77,9 +124,6 @@ template <class R = double> struct WarpSizes {
   static constexpr OSIK_HOST int padded(int n) { return (n + WIDE - 1) / WIDE * WIDE; }
   // an odd number of wide ones, so that threads read different banks of memory
   static constexpr OSIK_HOST int stride(int n) { return WIDE * ((n + WIDE - 1) / WIDE | 1); }
-  static constexpr OSIK_HOST int variables(int n) { return n; }
-  static constexpr OSIK_HOST int level_rows(int m) { return m; }
-  static constexpr OSIK_HOST int hard_rows(int h) { return h; }
 };
 
 constexpr double LARGEST_DOUBLE = 1.7976931348623157e308, INFINITE = __builtin_bit_cast(double, 0x7ff0000000000000ull);

@@ -4,43 +4,17 @@
 
 namespace osik {
 
+template <class R> struct Number {
+  using Real = R;
+  using Value = R;
+  OSIK_FN static R all(R a) { return a; }
+  OSIK_FN static R size(R a) { return fabs(a); }
+};
+
 // One column of a thread, or two that are 32 apart: of the second one only numbers before `end` count.
 template <class Real, int SLOTS> struct ColumnsOf {
   int at, end;
-  struct P {
-    Real v[SLOTS];
-    OSIK_FN P() {}
-    OSIK_FN P(Real a) {
-      each([&](int s) { v[s] = a; });
-    }
-    template <class F> OSIK_FN static void each(F f) {
-      OSIK_UNROLL
-      for (int s = 0; s < SLOTS; ++s) f(s);
-    }
-    OSIK_FN P& operator+=(const P& o) {
-      return each([&](int s) { v[s] += o.v[s]; }), *this;
-    }
-    OSIK_FN P& operator-=(const P& o) {
-      return each([&](int s) { v[s] -= o.v[s]; }), *this;
-    }
-    OSIK_FN P& operator*=(const P& o) {
-      return each([&](int s) { v[s] *= o.v[s]; }), *this;
-    }
-    OSIK_FN P& fma(Real a, const P& o) {
-      return each([&](int s) { v[s] += a * o.v[s]; }), *this;
-    }
-    OSIK_FN P& square(const P& o) {
-      return each([&](int s) { v[s] += o.v[s] * o.v[s]; }), *this;
-    }
-    OSIK_FN P inverse() const {
-      P p;
-      return each([&](int s) { p.v[s] = Real(1) / v[s]; }), p;
-    }
-    OSIK_FN P size() const {
-      P p;
-      return each([&](int s) { p.v[s] = fabs(v[s]); }), p;
-    }
-  };
+  using P = Pack<Number<Real>, SLOTS>;
   OSIK_FN P load(const Real* row) const {
     P p;
     return P::each([&](int s) { p.v[s] = row[s && at + 32 * s >= end ? at : at + 32 * s]; }), p;
@@ -60,7 +34,7 @@ extern __shared__ __align__(16) double shared_space[];  // of one problem: a blo
 
 // An array of a workspace in shared memory. Its address is a constant, so that no register and no member holds it.
 template <class T, class At, class Sizes> struct SharedArray {
-  OSIK_FN void place(char*, const Sizes&) {}
+  OSIK_FN SharedArray(char*, const Sizes&) {}
   OSIK_FN operator T*() const {
     constexpr int at = At::of(Sizes{});
     return reinterpret_cast<T*>(reinterpret_cast<char*>(shared_space) + at);
@@ -69,7 +43,7 @@ template <class T, class At, class Sizes> struct SharedArray {
 
 // A number that depends on a problem's sizes: a constant too, so that loops have constant ends.
 template <class At, class Sizes> struct SizeConstant {
-  OSIK_FN SizeConstant(const Sizes&) {}
+  OSIK_FN SizeConstant(char*, const Sizes&) {}
   OSIK_FN operator int() const {
     constexpr int value = At::of(Sizes{});
     return value;
@@ -82,8 +56,6 @@ template <class R, int N, int M, int H> struct Warp : WarpSizes<R> {
   using typename WarpSizes<R>::Int;
   template <class T, class At, class Sizes> using Array = SharedArray<T, At, Sizes>;
   template <class At, class Sizes> using Fixed = SizeConstant<At, Sizes>;
-  static constexpr Real SMALLEST_PIVOT = sizeof(R) == 8 ? 1e-300 : 1e-37;
-  static constexpr Real SMALLEST_ROOT = sizeof(R) == 8 ? 1e-150 : 1e-18;
   static constexpr unsigned ALL = 0xffffffffu;
   static constexpr int SLOTS = sizeof(R) == 4 && N > 32 ? 2 : 1;  // columns of a thread at once
   static constexpr OSIK_HOST int variables(int) { return N; }

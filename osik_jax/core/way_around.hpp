@@ -28,6 +28,7 @@ class WayAround {
     List nodes;                // [count, n]
     std::vector<int> parents;  // -1: a root
     int count() const { return int(parents.size()); }
+    void add(const List& x, int parent) { nodes.insert(nodes.end(), x.begin(), x.end()), parents.push_back(parent); }
   };
   static constexpr double MARGIN = 1e-4;  // states in the middle of parts keep so much more than the clearance [m]
   static constexpr double FINEST = 1e-6;  // the same, where curves are given
@@ -266,7 +267,7 @@ class WayAround {
     const auto nearest = collision.nearest();
     if (!(nearest.gap.distance > clearance)) return touching = nearest, false;
     margin = std::min(margin, 0.5 * (nearest.gap.distance - clearance));
-    return tree.nodes.insert(tree.nodes.end(), x.begin(), x.end()), tree.parents.push_back(-1), true;
+    return tree.add(x, -1), true;
   }
   double distance(const double* a, const double* b) const {
     double sum = 0;
@@ -287,7 +288,7 @@ class WayAround {
     List to(x, x + n);
     for (int k = 0; k < n && share < 1; ++k) to[k] = node(tree, from)[k] + share * (x[k] - node(tree, from)[k]);
     if (!is_free_state(to.data()) || !is_free_line(node(tree, from), to.data())) return -1;
-    trees[tree].nodes.insert(trees[tree].nodes.end(), to.begin(), to.end()), trees[tree].parents.push_back(from);
+    trees[tree].add(to, from);
     return trees[tree].count() - 1;
   }
   Status meet(int grown, int added, int other) {

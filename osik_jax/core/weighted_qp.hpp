@@ -18,7 +18,7 @@
 #pragma once
 #include "constants.hpp"
 #include "dual_active_set.hpp"
-#include "linear_algebra.hpp"
+#include "workspace.hpp"
 
 namespace osik {
 
@@ -51,13 +51,14 @@ template <class Team> struct WeightedQP {
   static constexpr bool IS_SINGLE = sizeof(Real) == 4;
   static constexpr Real VIOLATION = IS_SINGLE ? VIOLATION_TOL : 1;
   static constexpr Real RELEASE = IS_SINGLE ? SINGLE_BOUND_MULTIPLIER : BOUND_MULTIPLIER;
-  static constexpr int VECTORS = Team::SPARES_SPACE ? 19 : 21, INTEGERS = 4;
   Team t;
   int max_changes, used, changes, factorizations;  // used: rows in the system of the active set
   Real tolerance;
   const Real *lower, *upper;
 
-  // ---- the workspace: where each array begins, in bytes. The numbers begin as zeros.
+  // ---- the workspace, whose numbers begin as zeros
+  using Space = Workspace<WeightedQP, Team, QPSizes>;
+  static constexpr int VECTORS = Team::SPARES_SPACE ? 19 : 21, MATRICES = 8, INTEGERS = 4;
   static constexpr OSIK_HOST int width(const QPSizes& s) {
     const int k = Team::level_rows(s.m) + Team::hard_rows(s.p), N = Team::variables(s.n) + Team::hard_rows(s.p);
     return Team::stride(k > N ? k : N);
@@ -65,103 +66,45 @@ template <class Team> struct WeightedQP {
   // the order of the system of the active set. In single precision it is the Hessian's: the rows' needs a damping that is
   // far above roundoff.
   static constexpr OSIK_HOST int order(int k, int n) { return k < n && !IS_SINGLE ? k : n; }
-  template <int K> struct SizeAt {
-    static constexpr OSIK_HOST int of(const QPSizes& s) {
-      const int m = Team::level_rows(s.m), n = Team::variables(s.n), p = Team::hard_rows(s.p), k = m + p;
-      const int size[] = {m, n, p, k, n + p, Team::stride(n), Team::stride(p), Team::stride(order(k, n))};
-      return size[K];
-    }
-  };
-  template <int K> using Size = typename Team::template Fixed<SizeAt<K>, QPSizes>;
-  Size<0> m;
-  Size<1> n;
-  Size<2> p;
-  Size<3> k;   // all rows
-  Size<4> N;   // all constraints
-  Size<5> ld;  // strides of rows of n, of p and of order(k, n) numbers
-  Size<6> lp;
-  Size<7> lq;
-  // the numbers before matrix `which`, in the order of the matrices below; the last two are the dual method and an end
-  static constexpr OSIK_HOST int numbers_before(int which, const QPSizes& s) {
+  static constexpr OSIK_HOST int size_of(int which, const QPSizes& s) {
+    const int m = Team::level_rows(s.m), n = Team::variables(s.n), p = Team::hard_rows(s.p), k = m + p;
+    const int size[] = {m, n, p, k, n + p, Team::stride(n), Team::stride(p), Team::stride(order(k, n))};
+    return size[which];
+  }
+  // the last two matrices are the dual method and an end
+  static constexpr OSIK_HOST int numbers_of(int matrix, const QPSizes& s) {
     const int n = Team::variables(s.n), p = Team::hard_rows(s.p), k = Team::level_rows(s.m) + p, q = order(k, n);
     const int kept = q < k || IS_SINGLE ? p : 0;  // rows that are kept where the system is the Hessian's
-    const int dual = Team::SPARES_SPACE ? 0 : DualActiveSet<Team>::doubles(n, p);
-    const int size[] = {k * Team::stride(n),
-                        kept * Team::stride(n),
-                        q * Team::stride(q),
-                        Team::SPARES_SPACE ? 0 : q * Team::stride(q),
-                        kept * Team::stride(p),
-                        Team::SPARES_SPACE ? 0 : kept * Team::stride(p),
-                        dual,
-                        Team::stride(0)};
-    int count = VECTORS * width(s);
-    for (int i = 0; i < which; ++i) count += size[i];
-    return count;
+    const int of_b = k * Team::stride(n), of_v = kept * Team::stride(n);
+    const int of_s = q * Team::stride(q), of_t = kept * Team::stride(p), apart = Team::SPARES_SPACE ? 0 : 1;
+    const int dual = apart * DualActiveSet<Team>::doubles(n, p);
+    const int numbers[] = {of_b, of_v, of_s, apart * of_s, of_t, apart * of_t, dual, Team::stride(0)};
+    return numbers[matrix];
   }
-  static constexpr OSIK_HOST int bytes_of_numbers(const QPSizes& s) { return int(sizeof(Real)) * numbers_before(8, s); }
   static constexpr OSIK_HOST int bytes(const QPSizes& s) {
-    const int integers = INTEGERS * width(s) + Team::variables(s.n) + Team::hard_rows(s.p);
-    return (bytes_of_numbers(s) + integers * int(sizeof(Int)) + 15) / 16 * 16;
+    return Space::bytes(s, INTEGERS * width(s) + Team::variables(s.n) + Team::hard_rows(s.p));
   }
-  template <int K> struct MatrixAt {
-    static constexpr OSIK_HOST int of(const QPSizes& s) { return int(sizeof(Real)) * numbers_before(K, s); }
-  };
-  template <int K> struct VectorAt {
-    static constexpr OSIK_HOST int of(const QPSizes& s) { return int(sizeof(Real)) * K * width(s); }
-  };
-  template <int K> struct LabelsAt {
-    static constexpr OSIK_HOST int of(const QPSizes& s) { return bytes_of_numbers(s) + int(sizeof(Int)) * K * width(s); }
-  };
-  template <int K> using Matrix = typename Team::template Array<Real, MatrixAt<K>, QPSizes>;
-  template <int K> using Numbers = typename Team::template Array<Real, VectorAt<K>, QPSizes>;
-  template <int K> using Labels = typename Team::template Array<Int, LabelsAt<K>, QPSizes>;
-  Matrix<0> B;   // [k, ld] the rows
-  Matrix<1> V;   // [p, ld] where the system is the Hessian's: M times the active rows of C
-  Matrix<2> S;   // [q, lq] the system of the active set, q = order(k, n)
-  Matrix<(Team::SPARES_SPACE ? 2 : 3)> M;  // [q, lq] the inverse of its factor, perhaps in the place of S
-  Matrix<4> T;   // [p, lp] with V: the Schur complement of the active rows of C
-  Matrix<(Team::SPARES_SPACE ? 4 : 5)> TM;  // [p, lp] the inverse of its factor
-  Matrix<6> DUAL;
+  char* space;
+  QPSizes size;
+  OSIK_PLACED(Size, 0, m, n, p, k, N, ld, lp, lq);  // k: all rows; N: all constraints; strides of n, p and order(k, n)
+  OSIK_PLACED(Matrix, 0, B);                                // [k, ld] the rows
+  OSIK_PLACED(Matrix, 1, V);  // [p, ld] if the system is the Hessian's: M times active rows of C
+  OSIK_PLACED(Matrix, 2, S);  // [q, lq] the system of the active set, q = order(k, n)
+  OSIK_PLACED(Matrix, Team::SPARES_SPACE ? 2 : 3, M);  // [q, lq] the inverse of its factor, perhaps in the place of S
+  OSIK_PLACED(Matrix, 4, T);  // [p, lp] with V: the Schur complement of the active rows of C
+  OSIK_PLACED(Matrix, Team::SPARES_SPACE ? 4 : 5, TM);  // [p, lp] the inverse of its factor
+  OSIK_PLACED(Matrix, 6, DUAL);
   // vectors, as long as the longest of k and N
-  Numbers<0> TARGET;
-  Numbers<1> COMPLIANCE;
-  Numbers<2> DAMPING;
-  Numbers<3> CENTER;
-  Numbers<4> ROOT;
-  Numbers<5> INVERSE_ROOT;
-  Numbers<6> X;
-  Numbers<7> Z;
-  Numbers<8> STEP;
-  Numbers<9> GRADIENT;
-  Numbers<10> GAP;
-  Numbers<11> RIGHT;
-  Numbers<12> SOLVED;
-  Numbers<13> PIVOT;
-  Numbers<14> TERMS;
-  Numbers<15> VALUE;
-  Numbers<16> VALUE_ROUNDOFF;
-  Numbers<17> MULTIPLIER_ROUNDOFF;
-  Numbers<18> SMALL_PIVOT;
-  Numbers<15> INVERSE;  // these three while a point is solved for, whose roundoff is found afterwards
-  Numbers<16> DIAGONAL;
-  Numbers<17> SMALL;
-  Numbers<19> SCALED;  // of a CPU, with the next one [2, ld]
-  Labels<0> LABEL;
-  Labels<1> NEXT;
-  Labels<2> USED;
-  Labels<3> END;  // a row of B is 0 from this column on
-  Labels<4> ORDER;
+  OSIK_PLACED(Numbers, 0, TARGET, COMPLIANCE, DAMPING, CENTER, ROOT, INVERSE_ROOT, X, Z, STEP, GRADIENT, GAP, RIGHT, SOLVED,
+              PIVOT, TERMS, VALUE, VALUE_ROUNDOFF, MULTIPLIER_ROUNDOFF, SMALL_PIVOT);
+  OSIK_PLACED(Numbers, 15, INVERSE, DIAGONAL, SMALL);  // while a point is solved for, whose roundoff is found afterwards
+  OSIK_PLACED(Numbers, 19, SCALED);  // of a CPU, with the next one [2, ld]
+  OSIK_PLACED(Labels, 0, LABEL, NEXT, USED, END, ORDER);  // END: a row of B is 0 from this column on
   DualActiveSet<Team> dual;
 
-  template <class... Arrays> OSIK_FN void place(char* space, const QPSizes& s, Arrays&... arrays) {
-    (arrays.place(space, s), ...);
-  }
   // outside: space of the dual method, if the team spares space
   OSIK_FN WeightedQP(const QPSizes& s, char* space, Real* outside = nullptr)
-      : max_changes(s.max_changes), m(s), n(s), p(s), k(s), N(s), ld(s), lp(s), lq(s) {
-    place(space, s, B, V, S, M, T, TM, DUAL, TARGET, COMPLIANCE, DAMPING, CENTER, ROOT, INVERSE_ROOT, INVERSE, X, Z, STEP,
-          GRADIENT, GAP, RIGHT, SOLVED, PIVOT, TERMS, VALUE, VALUE_ROUNDOFF, MULTIPLIER_ROUNDOFF, DIAGONAL, SMALL,
-          SMALL_PIVOT, SCALED, LABEL, NEXT, USED, END, ORDER);
+      : max_changes(s.max_changes), space(space), size(s) {
     dual.begin(n, p, Team::SPARES_SPACE ? outside : DUAL, ORDER);
     t.each(n, width(s), [&](int j) { DAMPING[j] = 1; });  // which has an inverse
   }
@@ -450,11 +393,11 @@ template <class Team> struct WeightedQP {
   }
   // the problem as begin() copied it, whose rows have their weights multiplied in and the stride ld
   struct Copied {
-    Matrix<0> matrix;
-    Numbers<0> target;
-    Numbers<1> weight;  // the first compliances, which are ones
-    Numbers<2> damping;
-    Numbers<3> center;
+    typename Space::template Matrix<0> matrix;
+    typename Space::template Numbers<0> target;
+    typename Space::template Numbers<1> weight;  // the first compliances, which are ones
+    typename Space::template Numbers<2> damping;
+    typename Space::template Numbers<3> center;
     const Real *rows, *compliance, *lower, *upper;
     Real tolerance;
   };

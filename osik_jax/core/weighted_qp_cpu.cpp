@@ -1,5 +1,4 @@
 // XLA's calls of the weighted QP and of its certificate on a CPU: one problem of a batch after another, in double precision.
-#include <utility>
 #include <vector>
 
 #include "qp_certificate.hpp"
@@ -11,15 +10,9 @@ namespace {
 // The numbers of a problem but its matrix, one array after another; returns where they end.
 const double* read(QPData<double>& d, const double* at, const QPSizes& s) {
   const int m = s.m, n = s.n, p = s.p, N = n + p;
-  for (auto [field, count] : {std::pair{&d.target, m},
-                              {&d.weight, m},
-                              {&d.damping, n},
-                              {&d.center, n},
-                              {&d.rows, p * n},
-                              {&d.compliance, p},
-                              {&d.lower, N},
-                              {&d.upper, N}})
-    *field = at, at += count;
+  auto take = [&](int count) { return at += count, at - count; };
+  d.target = take(m), d.weight = take(m), d.damping = take(n), d.center = take(n), d.rows = take(p * n);
+  d.compliance = take(p), d.lower = take(N), d.upper = take(N);
   return at;
 }
 

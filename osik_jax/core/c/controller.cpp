@@ -28,6 +28,8 @@ struct Input {  // q or a target: where it is among the numbers of a step
   bool is_rotation;
 };
 
+constexpr auto require = LayoutCheck::require;
+constexpr auto require_within = LayoutCheck::require_within;
 [[noreturn]] void refuse(const std::string& reason) { throw std::runtime_error(reason); }
 
 uint32_t checksum(const char* text, size_t count) {  // CRC-32, as zlib has it

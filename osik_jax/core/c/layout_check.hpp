@@ -12,13 +12,6 @@
 
 namespace osik {
 
-inline void require(bool holds, const char* part) {
-  if (!holds) throw std::runtime_error(std::string("its section \"core\" is wrong (") + part + "): save it again");
-}
-inline void require_within(const int* from, int count, int low, int end, const char* part) {
-  for (int i = 0; i < count; ++i) require(from[i] >= low && from[i] < end, part);
-}
-
 class LayoutCheck {
   using Task = StepLayout::Task;
   const StepLayout& layout;
@@ -51,10 +44,11 @@ class LayoutCheck {
     else check_levels(of_level);
   }
 
-  // what cards of tasks ask
-  static void require(bool holds, const char* part) { osik::require(holds, part); }
+  static void require(bool holds, const char* part) {
+    if (!holds) throw std::runtime_error(std::string("its section \"core\" is wrong (") + part + "): save it again");
+  }
   static void require_within(const int* from, int count, int low, int end, const char* part) {
-    osik::require_within(from, count, low, end, part);
+    for (int i = 0; i < count; ++i) require(from[i] >= low && from[i] < end, part);
   }
   void check_leaf(int k, int size, int other = -1) const {
     require(k >= 0 && k < s.leaves && (layout.places[k].size == size || layout.places[k].size == other), "leaves");

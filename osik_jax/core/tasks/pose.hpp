@@ -162,15 +162,10 @@ struct PoseTask : CommonCard {
     const auto& s = own.s;
     const int *options = task.options, *leaves = task.leaves, nv = s.nv, count = options[FRAMES];
     auto leaf = [&](int i) { return own.leaf(leaves[i]); };
-    const PoseGoal<In, const Real*> goal{leaf(POSITION).at,
-                                         leaf(ROTATION).at,
-                                         own.velocity(task),
-                                         own.weights.data(),
-                                         gain,
-                                         options + KEPT,
-                                         options[IN_FRAME] != 0,
-                                         options[GEOMETRIC] != 0,
-                                         interval};
+    PoseGoal<In, const Real*> goal{};
+    goal.position = leaf(POSITION).at, goal.rotation = leaf(ROTATION).at, goal.velocity = own.velocity(task);
+    goal.weight = own.weights.data(), goal.gain = gain, goal.kept = options + KEPT, goal.bounds = interval;
+    goal.in_frame = options[IN_FRAME] != 0, goal.geometric = options[GEOMETRIC] != 0;
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) own.weights[row] = leaf(WEIGHT)[row] * leaf(POSITION_WEIGHT + i / 3)[i % 3], ++row;
     Real *position = own.frames.data(), *turn = position + 6, *jacobian = position + 24;
