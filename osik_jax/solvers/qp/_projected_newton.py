@@ -222,17 +222,18 @@ def _line_search(
 ) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""]]:
     """Return the step along Newton's direction with the lowest cost, by a projected line search.
 
-    The direction is clipped into the box at many lengths, or followed to the first bound. Return that step, whether it
-    lowers the cost or meets a bound, and whether the full Newton step stays in the box.
+    The direction is clipped into the box at many lengths, or followed to the first bound, or to its minimum before.
+    Return that step, whether it lowers the cost or meets a bound, and whether the full Newton step stays in the box.
     """
     lower, upper = _box(qp)
     # the step length at which the first bound is met
     ahead = jnp.where(newton > 0.0, upper - s.x, lower - s.x)
     to_bound = jnp.min(jnp.where(newton != 0.0, ahead / jnp.where(newton != 0.0, newton, 1.0), jnp.inf))
-    # geometrically decreasing step lengths, and the one to the first bound
+    # geometrically decreasing step lengths, the minimum along the straight line, and the way to the first bound
     lengths = SHORTEST_STEP ** jnp.linspace(0.0, 1.0, STEP_LENGTHS)
     reach = jnp.clip(to_bound, 0.0, 1.0)
-    lengths = jnp.append(jnp.where(s.single_release, reach, 1.0) * lengths, reach)
+    lengths = jnp.where(s.single_release, reach, 1.0) * lengths
+    lengths = jnp.append(lengths, jnp.stack([_minimum_along(qp, s, at, newton, reach), reach]))
     steps = jnp.clip(s.x + lengths[:, None] * newton, lower, upper) - s.x
     changes = jax.vmap(partial(_cost_change, qp, s, at))(steps)
     eps = float(jnp.finfo(s.x.dtype).eps)
@@ -246,6 +247,34 @@ def _line_search(
     meets_bound = s.single_release & ~descends & ~is_inside & (to_bound > 0.0) & (changes[-1] <= roundoff[-1])
     best = jnp.where(meets_bound, len(lengths) - 1, best)
     return steps[best], descends | meets_bound, is_inside
+
+
+def _minimum_along(
+    qp: QP, s: NewtonState, at: Linearisation, newton: Float[Array, " n"], reach: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Return the step length in [0, reach] with the lowest cost along Newton's direction.
+
+    The slope of the cost is piecewise linear and rises, with a kink where a row meets a bound. A softened hard row
+    raises it so fast that the minimum lies just behind the kink, where halved lengths may never come.
+    """
+    bounds = jnp.stack([qp.lower[len(newton) :], qp.upper[len(newton) :]])
+    along, old = apply(qp.rows, newton), violation(at.values, *bounds)
+    downhill, curvature = jnp.dot(at.gradient, newton), jnp.dot(newton, qp.cost.hessian_product(newton))
+
+    def slope(length: Float[Array, ""]) -> Float[Array, ""]:
+        change = violation(at.values + length * along, *bounds) - old
+        return downhill + length * curvature + jnp.sum(along * change / s.compliance)
+
+    moves = along != 0.0
+    kinks = jnp.where(moves, (bounds - at.values) / jnp.where(moves, along, 1.0), 0.0)
+    ends = jnp.stack([jnp.zeros_like(reach), reach])
+    lengths = jnp.append(jnp.clip(kinks, 0.0, reach), ends)
+    falls = jax.vmap(slope)(lengths) < 0.0
+    # between the last kink where the cost falls and the first where it rises the slope is linear
+    first, last = jnp.max(jnp.where(falls, lengths, 0.0)), jnp.min(jnp.where(falls, reach, lengths))
+    drop, rise = slope(first), slope(last)
+    part = jnp.where(rise > drop, -drop / jnp.where(rise > drop, rise - drop, 1.0), 1.0)
+    return first + jnp.clip(part, 0.0, 1.0) * (last - first)
 
 
 def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, " n"]) -> Float[Array, ""]:
