@@ -99,12 +99,14 @@ def projected_newton(
     start: Float[Array, "B n"],
     iterations: Int[Array, " B"],
     feasibility_tol: Float[Array, ""],
+    zero_multiplier: Float[Array, ""],
     max_iterations: int,
 ) -> NewtonResult:
     """Return the minimisers of a batch: every argument has a leading axis of problems.
 
     The start is clipped into the box. ``feasibility_tol`` is the violation of a hard row that counts as none, relative
-    to its scale; ``iterations`` are changes of the active set so far.
+    to its scale; ``zero_multiplier`` is that of a multiplier, relative to the gradient's terms; ``iterations`` are
+    changes of the active set so far.
     """
     first = jax.vmap(_initial_state)(qp, start, iterations)
 
@@ -115,7 +117,7 @@ def projected_newton(
         improved = jax.vmap(partial(_iterate, feasibility_tol))
         return choose(s.searching & (s.iterations < max_iterations), improved(qp, s), s)
 
-    return jax.vmap(_result)(qp, jax.lax.while_loop(is_running, body, first))
+    return jax.vmap(partial(_result, zero_multiplier))(qp, jax.lax.while_loop(is_running, body, first))
 
 
 def _initial_state(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""]) -> NewtonState:
@@ -344,13 +346,13 @@ def _is_least_violation(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) 
     return jnp.all(inward <= ZERO_GRADIENT * jnp.linalg.norm(qp.rows, axis=0) * jnp.linalg.norm(gap))
 
 
-def _result(qp: QP, s: NewtonState) -> NewtonResult:
+def _result(zero_multiplier: Float[Array, ""], qp: QP, s: NewtonState) -> NewtonResult:
     at = _linearise(qp, s)
     lower, _ = _box(qp)
     in_box = jnp.where(at.free, INACTIVE, jnp.where(s.x <= lower, AT_LOWER, AT_UPPER))
     labels = jnp.concatenate([in_box, jnp.sign(-at.multipliers).astype(jnp.int32)])
     in_gradient = jnp.concatenate([at.gradient, at.multipliers * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
-    counts = jnp.abs(in_gradient) > ZERO_GRADIENT * jnp.max(gradient_scale(qp, s.x, at.multipliers))
+    counts = jnp.abs(in_gradient) > zero_multiplier * jnp.max(gradient_scale(qp, s.x, at.multipliers))
     hard = jnp.concatenate([jnp.ones(len(s.x), bool), qp.compliance == 0.0])
     active, determined = (
         jnp.where(qp.equality & (hard | (own != INACTIVE)), EQUALITY, own).astype(jnp.int32)
