@@ -49,7 +49,7 @@ from ...numerics._constants import (
     ZERO_GRADIENT,
 )
 from ...numerics._dense import apply
-from .._box import violation
+from .._box import minimum_along, violation
 from ._problem import QP, constraint_scales, gradient_scale, softened_compliance
 
 
@@ -235,7 +235,13 @@ def _line_search(
     lengths = SHORTEST_STEP ** jnp.linspace(0.0, 1.0, STEP_LENGTHS)
     reach = jnp.clip(to_bound, 0.0, 1.0)
     lengths = jnp.where(s.single_release, reach, 1.0) * lengths
-    lengths = jnp.append(lengths, jnp.stack([_minimum_along(qp, s, at, newton, reach), reach]))
+    # a softened hard row raises the slope so fast that the minimum lies just behind the point where the row meets its
+    # bound, where halved lengths may never come
+    n, along = len(newton), apply(qp.rows, newton)
+    of_cost = jnp.dot(at.gradient, newton) + jnp.dot(at.multipliers, along)
+    curvature = jnp.dot(newton, qp.cost.hessian_product(newton))
+    ideal = minimum_along(at.values, along, qp.lower[n:], qp.upper[n:], 1.0 / s.compliance, of_cost, curvature)
+    lengths = jnp.append(lengths, jnp.stack([jnp.minimum(ideal, reach), reach]))
     steps = jnp.clip(s.x + lengths[:, None] * newton, lower, upper) - s.x
     changes = jax.vmap(partial(_cost_change, qp, s, at))(steps)
     eps = float(jnp.finfo(s.x.dtype).eps)
@@ -249,34 +255,6 @@ def _line_search(
     meets_bound = s.single_release & ~descends & ~is_inside & (to_bound > 0.0) & (changes[-1] <= roundoff[-1])
     best = jnp.where(meets_bound, len(lengths) - 1, best)
     return steps[best], descends | meets_bound, is_inside
-
-
-def _minimum_along(
-    qp: QP, s: NewtonState, at: Linearisation, newton: Float[Array, " n"], reach: Float[Array, ""]
-) -> Float[Array, ""]:
-    """Return the step length in [0, reach] with the lowest cost along Newton's direction.
-
-    The slope of the cost is piecewise linear and rises, with a kink where a row meets a bound. A softened hard row
-    raises it so fast that the minimum lies just behind the kink, where halved lengths may never come.
-    """
-    bounds = jnp.stack([qp.lower[len(newton) :], qp.upper[len(newton) :]])
-    along, old = apply(qp.rows, newton), violation(at.values, *bounds)
-    downhill, curvature = jnp.dot(at.gradient, newton), jnp.dot(newton, qp.cost.hessian_product(newton))
-
-    def slope(length: Float[Array, ""]) -> Float[Array, ""]:
-        change = violation(at.values + length * along, *bounds) - old
-        return downhill + length * curvature + jnp.sum(along * change / s.compliance)
-
-    moves = along != 0.0
-    kinks = jnp.where(moves, (bounds - at.values) / jnp.where(moves, along, 1.0), 0.0)
-    ends = jnp.stack([jnp.zeros_like(reach), reach])
-    lengths = jnp.append(jnp.clip(kinks, 0.0, reach), ends)
-    falls = jax.vmap(slope)(lengths) < 0.0
-    # between the last kink where the cost falls and the first where it rises the slope is linear
-    first, last = jnp.max(jnp.where(falls, lengths, 0.0)), jnp.min(jnp.where(falls, reach, lengths))
-    drop, rise = slope(first), slope(last)
-    part = jnp.where(rise > drop, -drop / jnp.where(rise > drop, rise - drop, 1.0), 1.0)
-    return first + jnp.clip(part, 0.0, 1.0) * (last - first)
 
 
 def _cost_change(qp: QP, s: NewtonState, at: Linearisation, step: Float[Array, " n"]) -> Float[Array, ""]:
