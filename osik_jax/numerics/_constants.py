@@ -104,6 +104,10 @@ SEARCH_TOLERANCES = 0.01, 0.1, 0.1
 """Violation of hard rows at the end of each projected Newton search for a problem, in units of ``KKT_TOLERANCE``. Where
 a search ends without an answer, the next one begins at its end.
 """
+ZERO_MULTIPLIERS = 1e-9, 1e-8, 1e-7
+"""Multiplier relative to the gradient's terms, below which its constraint is not active in the exact solve after each
+of these searches: what a large penalty makes of roundoff.
+"""
 RELAXED = {jnp.dtype("float64"): 1e3, jnp.dtype("float32"): 1e2}
 """Violations in units of roundoff up to which an exact solve after projected Newton is accepted."""
 ROW_MULTIPLIER = 1e-3
@@ -164,7 +168,7 @@ MAX_UPDATES = 40
 COMPLIANCE_DECREASE = 0.1
 """Factor on the compliance of infeasible hard rows, applied while a bound keeps x from the least violation."""
 ZERO_GRADIENT = 1e-9
-"""Cosine between violation and column of C, and multiplier relative to the gradient's terms, that count as 0."""
+"""Cosine of the angle between the violation and a column of C, below which it counts as 0."""
 UNCHANGED = 1e-9
 """Change of x by an update relative to x, below which the least violation has been found."""
 

@@ -1,7 +1,8 @@
-"""Box constraints of a solver: contradictory bounds at its start, and clipping of its answer."""
+"""Intervals of variables and rows: contradictory bounds, clipping, violations and an exact line search."""
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -43,3 +44,39 @@ def clip_to_box(x: Float[Array, " n"], lower: Float[Array, " n"], upper: Float[A
 def violation(values: Float[Array, " m"], lower: Float[Array, " m"], upper: Float[Array, " m"]) -> Float[Array, " m"]:
     """Return values minus the nearest points of their intervals: negative below, positive above, exactly 0 inside."""
     return jnp.where(values < lower, values - lower, jnp.where(values > upper, values - upper, 0.0))
+
+
+def minimum_along(
+    value: Float[Array, " m"],
+    rate: Float[Array, " m"],
+    lower: Float[Array, " m"],
+    upper: Float[Array, " m"],
+    weight: Float[Array, " m"] | float,
+    slope: Float[Array, ""],
+    curvature: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Return the step length t >= 0 at which a convex, piecewise quadratic cost is least (exact line search).
+
+    The cost is ``1/2 sum weight dist(value + t rate, [lower, upper])^2 + slope t + 1/2 curvature t^2``. It has a knot
+    where a row meets a bound.
+    """
+    moving = rate != 0.0
+    safe_rate = jnp.where(moving, rate, 1.0)
+    crossings = [
+        jnp.where(moving & jnp.isfinite(b), (jnp.where(jnp.isfinite(b), b, 0.0) - value) / safe_rate, 1.0)
+        for b in (lower, upper)
+    ]
+    knots = jnp.maximum(jnp.concatenate([*crossings, jnp.ones(1, value.dtype), jnp.zeros(1, value.dtype)]), 0.0)
+
+    def derivative(t: Array) -> Array:
+        return jnp.sum(weight * rate * violation(value + t * rate, lower, upper)) + slope + t * curvature
+
+    derivatives = jax.vmap(derivative)(knots)
+    before = jnp.max(jnp.where(derivatives < 0.0, knots, 0.0), initial=0.0)
+    after = jnp.min(jnp.where(knots > before, knots, jnp.inf))  # the next knot, where the derivative is >= 0
+    probe = jnp.where(jnp.isinf(after), before + 1.0, 0.5 * (before + after))
+    # between two knots the derivative is a straight line, so the secant through two of its points has the root
+    first, second = derivative(before), derivative(probe)
+    rising = second > first
+    root = before - first * (probe - before) / jnp.where(rising, second - first, 1.0)
+    return jnp.where(rising, jnp.maximum(root, 0.0), before)

@@ -76,7 +76,7 @@ def by_both(solve, p):
     return tuple(jax.tree.map(np.asarray, run(p, backend)) for backend in ("core", "jax"))
 
 
-@pytest.mark.variants(ordinary=[], slow=SHAPES[:1])
+@pytest.mark.variants(ordinary=[], slow=["6-5", "24-30"])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_weighted(shape):
     n, m = map(int, shape.split("-"))

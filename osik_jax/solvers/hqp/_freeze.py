@@ -85,8 +85,7 @@ def freeze(
 def _determined(problem: LevelProblem, end: PrimalState, tolerances: Tolerances) -> _Determined:
     """Return the rows with the same value at all minimisers: rows with a slack and rows with a multiplier."""
     level = problem.level
-    value = apply(level.matrix, end.x)
-    slack = value - jnp.clip(value, level.lower, level.upper)
+    slack = level.distance(end.x)
     root_cost = problem.root_cost(end.x, slack)
     # a short row has the roundoff of the longest one
     short = tolerances.multiplier * (level.length * jnp.max(jnp.abs(end.x)) + root_cost)

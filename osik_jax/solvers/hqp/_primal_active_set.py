@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...execution._double import first_smallest
 from ...numerics._constants import EXTRA_DAMPING, MAX_STALLED, STATIONARITY_TOL
 from ...numerics._dense import apply
+from .._box import minimum_along
 from ._active_rows import ActiveRows, factor_active_rows, multipliers
 from ._problem import LevelProblem, Tolerances
 from ._working_set_solve import factor_least_squares, slack_roundoff, wrong_signs
@@ -51,8 +52,7 @@ def primal_active_set(
     level = problem.level
 
     def iterate(s: PrimalState) -> PrimalState:
-        value = apply(level.matrix, s.x)
-        slack = value - jnp.clip(value, level.lower, level.upper)
+        slack = level.distance(s.x)
         in_cost = (slack != 0.0) | problem.level.equal
         rows = jax.lax.optimization_barrier(factor_active_rows(problem, s.active, tolerances.rank))
         least_squares_step, rank = factor_least_squares(problem, in_cost, rows, tolerances)
@@ -115,8 +115,9 @@ def _advance(
     ratios = jnp.where(approached, jnp.maximum(jnp.where(approached, bound - value, jnp.inf) / safe_rate, 0.0), jnp.inf)
     longest = jnp.min(ratios, initial=jnp.inf)
     # 1/2 damping |x + t d|^2 has the derivative damping (x'd + t d'd)
-    damping_terms = problem.damping * jnp.stack([jnp.sum(s.x * step), jnp.sum(step**2)])
-    ideal = _line_search(apply(level.matrix, s.x), apply(level.matrix, step), level.lower, level.upper, damping_terms)
+    damping_terms = problem.damping * jnp.sum(s.x * step), problem.damping * jnp.sum(step**2)
+    values = apply(level.matrix, s.x), apply(level.matrix, step)
+    ideal = minimum_along(*values, level.lower, level.upper, 1.0, *damping_terms)
     ideal = jnp.where(weak, 1.0, ideal)
     blocked = longest <= ideal
     length = jnp.minimum(longest, ideal)
@@ -125,37 +126,3 @@ def _advance(
     stalled = jnp.where(length * jnp.max(jnp.abs(step)) > 0.0, 0, s.stalled + 1)
     active = s.active.at[first].set(jnp.where(blocked, jnp.where(rate[first] > 0.0, 1, -1), s.active[first]))
     return s._replace(x=x, active=active, stalled=stalled, tried_weak=(s.tried_weak | weak) & ~blocked)
-
-
-def _line_search(
-    value: Float[Array, " m"],
-    rate: Float[Array, " m"],
-    lower: Float[Array, " m"],
-    upper: Float[Array, " m"],
-    damping_terms: Float[Array, "2"],
-) -> Float[Array, ""]:
-    """Return the exact minimiser t >= 0 of 1/2 |dist(value + t rate, [lower, upper])|^2 + c_0 t + 1/2 c_1 t^2.
-
-    The function is convex and piecewise quadratic; c are ``damping_terms``, the damping along the step.
-    """
-    moving = rate != 0.0
-    safe_rate = jnp.where(moving, rate, 1.0)
-    crossings = [
-        jnp.where(moving & jnp.isfinite(b), (jnp.where(jnp.isfinite(b), b, 0.0) - value) / safe_rate, 1.0)
-        for b in (lower, upper)
-    ]
-    knots = jnp.maximum(jnp.concatenate([*crossings, jnp.ones(1, value.dtype), jnp.zeros(1, value.dtype)]), 0.0)
-
-    def derivative(t: Array) -> Array:
-        at = value + t * rate
-        return jnp.sum(rate * (at - jnp.clip(at, lower, upper))) + damping_terms[0] + t * damping_terms[1]
-
-    derivatives = jax.vmap(derivative)(knots)
-    before = jnp.max(jnp.where(derivatives < 0.0, knots, 0.0), initial=0.0)
-    after = jnp.min(jnp.where(knots > before, knots, jnp.inf))  # the next knot, where the derivative is >= 0
-    probe = jnp.where(jnp.isinf(after), before + 1.0, 0.5 * (before + after))
-    # between two knots the derivative is a straight line, so the secant through two of its points has the root
-    first, second = derivative(before), derivative(probe)
-    rising = second > first
-    root = before - first * (probe - before) / jnp.where(rising, second - first, 1.0)
-    return jnp.where(rising, jnp.maximum(root, 0.0), before)

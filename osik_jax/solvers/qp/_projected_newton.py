@@ -49,7 +49,7 @@ from ...numerics._constants import (
     ZERO_GRADIENT,
 )
 from ...numerics._dense import apply
-from .._box import violation
+from .._box import minimum_along, violation
 from ._problem import QP, constraint_scales, gradient_scale, softened_compliance
 
 
@@ -99,12 +99,14 @@ def projected_newton(
     start: Float[Array, "B n"],
     iterations: Int[Array, " B"],
     feasibility_tol: Float[Array, ""],
+    zero_multiplier: Float[Array, ""],
     max_iterations: int,
 ) -> NewtonResult:
     """Return the minimisers of a batch: every argument has a leading axis of problems.
 
     The start is clipped into the box. ``feasibility_tol`` is the violation of a hard row that counts as none, relative
-    to its scale; ``iterations`` are changes of the active set so far.
+    to its scale; ``zero_multiplier`` is that of a multiplier, relative to the gradient's terms; ``iterations`` are
+    changes of the active set so far.
     """
     first = jax.vmap(_initial_state)(qp, start, iterations)
 
@@ -115,7 +117,7 @@ def projected_newton(
         improved = jax.vmap(partial(_iterate, feasibility_tol))
         return choose(s.searching & (s.iterations < max_iterations), improved(qp, s), s)
 
-    return jax.vmap(_result)(qp, jax.lax.while_loop(is_running, body, first))
+    return jax.vmap(partial(_result, zero_multiplier))(qp, jax.lax.while_loop(is_running, body, first))
 
 
 def _initial_state(qp: QP, start: Float[Array, " n"], iterations: Int[Array, ""]) -> NewtonState:
@@ -222,17 +224,24 @@ def _line_search(
 ) -> tuple[Float[Array, " n"], Bool[Array, ""], Bool[Array, ""]]:
     """Return the step along Newton's direction with the lowest cost, by a projected line search.
 
-    The direction is clipped into the box at many lengths, or followed to the first bound. Return that step, whether it
-    lowers the cost or meets a bound, and whether the full Newton step stays in the box.
+    The direction is clipped into the box at many lengths, or followed to the first bound, or to its minimum before.
+    Return that step, whether it lowers the cost or meets a bound, and whether the full Newton step stays in the box.
     """
     lower, upper = _box(qp)
     # the step length at which the first bound is met
     ahead = jnp.where(newton > 0.0, upper - s.x, lower - s.x)
     to_bound = jnp.min(jnp.where(newton != 0.0, ahead / jnp.where(newton != 0.0, newton, 1.0), jnp.inf))
-    # geometrically decreasing step lengths, and the one to the first bound
+    # geometrically decreasing step lengths, the minimum along the straight line, and the way to the first bound
     lengths = SHORTEST_STEP ** jnp.linspace(0.0, 1.0, STEP_LENGTHS)
     reach = jnp.clip(to_bound, 0.0, 1.0)
-    lengths = jnp.append(jnp.where(s.single_release, reach, 1.0) * lengths, reach)
+    lengths = jnp.where(s.single_release, reach, 1.0) * lengths
+    # a softened hard row raises the slope so fast that the minimum lies just behind the point where the row meets its
+    # bound, where halved lengths may never come
+    n, along = len(newton), apply(qp.rows, newton)
+    of_cost = jnp.dot(at.gradient, newton) + jnp.dot(at.multipliers, along)
+    curvature = jnp.dot(newton, qp.cost.hessian_product(newton))
+    ideal = minimum_along(at.values, along, qp.lower[n:], qp.upper[n:], 1.0 / s.compliance, of_cost, curvature)
+    lengths = jnp.append(lengths, jnp.stack([jnp.minimum(ideal, reach), reach]))
     steps = jnp.clip(s.x + lengths[:, None] * newton, lower, upper) - s.x
     changes = jax.vmap(partial(_cost_change, qp, s, at))(steps)
     eps = float(jnp.finfo(s.x.dtype).eps)
@@ -315,13 +324,13 @@ def _is_least_violation(qp: QP, x: Float[Array, " n"], gap: Float[Array, " p"]) 
     return jnp.all(inward <= ZERO_GRADIENT * jnp.linalg.norm(qp.rows, axis=0) * jnp.linalg.norm(gap))
 
 
-def _result(qp: QP, s: NewtonState) -> NewtonResult:
+def _result(zero_multiplier: Float[Array, ""], qp: QP, s: NewtonState) -> NewtonResult:
     at = _linearise(qp, s)
     lower, _ = _box(qp)
     in_box = jnp.where(at.free, INACTIVE, jnp.where(s.x <= lower, AT_LOWER, AT_UPPER))
     labels = jnp.concatenate([in_box, jnp.sign(-at.multipliers).astype(jnp.int32)])
     in_gradient = jnp.concatenate([at.gradient, at.multipliers * jnp.max(jnp.abs(qp.rows), 1, initial=0.0)])
-    counts = jnp.abs(in_gradient) > ZERO_GRADIENT * jnp.max(gradient_scale(qp, s.x, at.multipliers))
+    counts = jnp.abs(in_gradient) > zero_multiplier * jnp.max(gradient_scale(qp, s.x, at.multipliers))
     hard = jnp.concatenate([jnp.ones(len(s.x), bool), qp.compliance == 0.0])
     active, determined = (
         jnp.where(qp.equality & (hard | (own != INACTIVE)), EQUALITY, own).astype(jnp.int32)

@@ -24,6 +24,7 @@ from ...numerics._constants import (
     KKT_TOLERANCE,
     RELAXED,
     SEARCH_TOLERANCES,
+    ZERO_MULTIPLIERS,
 )
 from ...numerics._dense import apply
 from ._kkt_solve import factorize, solve_on_active_set
@@ -96,8 +97,8 @@ def _solve_batch(
 
     def go_on(state: tuple[SearchResult, Array]) -> tuple[SearchResult, Array]:
         result, count = state
-        tol = jnp.array(SEARCH_TOLERANCES)[count] * kkt_tol
-        newton = partial(_by_newton, feasibility_tol=tol, kkt_tol=kkt_tol, max_iterations=max_iterations)
+        tol, zero = jnp.array(SEARCH_TOLERANCES)[count] * kkt_tol, jnp.array(ZERO_MULTIPLIERS)[count]
+        newton = partial(_by_newton, feasibility_tol=tol, zero=zero, kkt_tol=kkt_tol, max_iterations=max_iterations)
         return with_a_few((qp, tolerance), result, result.done, newton), count + 1
 
     result = jax.lax.while_loop(is_running, go_on, (first, jnp.asarray(0)))[0]
@@ -116,6 +117,7 @@ def _by_newton(
     result: SearchResult,
     *,
     feasibility_tol: Float[Array, ""],
+    zero: Float[Array, ""],
     kkt_tol: float,
     max_iterations: int,
 ) -> SearchResult:
@@ -125,8 +127,7 @@ def _by_newton(
     unit = 1.0 / jnp.sqrt(jax.vmap(lambda one: one.cost.diagonal())(qp))
     start = jnp.where(jnp.isfinite(result.x), result.x, 0.0) / unit
     scaled = jax.vmap(in_units)(qp, unit)
-    limits = feasibility_tol, max_iterations
-    end = projected_newton(scaled, start, result.iterations, *limits)
+    end = projected_newton(scaled, start, result.iterations, feasibility_tol, zero, max_iterations)
     infeasible, optimal = end.converged & end.infeasible, end.converged & ~end.infeasible
     largest = jnp.max(jnp.sum(scaled.rows**2, 2), 1, initial=0.0)[:, None]
     softened = jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest, qp.compliance)
