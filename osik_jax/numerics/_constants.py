@@ -151,8 +151,11 @@ SHORTEST_STEP, STEP_LENGTHS = 1e-9, 31
 """Shortest step of the line search, and number of lengths tried from 1 down to it."""
 NEWTON_ROUNDOFF = 4e-15
 """Gradient of a variable relative to its terms, below which the variable is stationary."""
-SMALL_STEP = 1e-13
-"""Newton step relative to x, below which it is the last on its face."""
+SMALL_STEP, SMALLER_STEP, SMALLER_STEPS = 1e-13, 1e-14, 8
+"""Newton step relative to x, below which it is the last on its face. After an update of the multipliers the second
+number counts for as many steps as the third says: beside a large penalty the first leaves a gradient. Then the first
+counts, for a search may cycle above the second.
+"""
 FULL_STEP_ROUNDOFF = 4.0
 """Improvement of a shorter step in units of the roundoff of the cost, below which the full step is taken."""
 FEASIBLE_AT_ONCE, FEASIBLE_DECREASE = 1e-3, 0.7

@@ -44,6 +44,8 @@ from ...numerics._constants import (
     SHORTEST_STEP,
     SLOW_DECREASE,
     SMALL_STEP,
+    SMALLER_STEP,
+    SMALLER_STEPS,
     STEP_LENGTHS,
     UNCHANGED,
     ZERO_GRADIENT,
@@ -168,7 +170,8 @@ def _iterate(feasibility_tol: Float[Array, ""], qp: QP, s: NewtonState) -> Newto
 
 def _newton_iteration(qp: QP, s: NewtonState, at: Linearisation) -> NewtonState:
     newton = _newton_step(qp, s, at)
-    is_small = jnp.max(jnp.abs(newton)) <= SMALL_STEP * jnp.max(jnp.abs(s.x))
+    small = jnp.where(s.steps < SMALLER_STEPS, SMALLER_STEP, SMALL_STEP)
+    is_small = jnp.max(jnp.abs(newton)) <= small * jnp.max(jnp.abs(s.x))
     roundoff = NEWTON_ROUNDOFF * gradient_scale(qp, s.x, at.multipliers)
     is_stationary = jnp.all(~at.free | (jnp.abs(at.gradient) <= roundoff))
     # three ways to stop: a Newton step of roundoff, a gradient of roundoff, a line search without descent
