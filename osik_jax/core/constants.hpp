@@ -20,7 +20,9 @@ constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT
 
 // weighted QP; SINGLE_... in single precision
 constexpr double SINGLE_CORRECTION = 1e-6, SINGLE_RIDGE = 1.0, ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0,
-                 SINGLE_BOUND_MULTIPLIER = 0.03, INFEASIBLE_COMPLIANCE = 1e-11;
+                 SINGLE_BOUND_MULTIPLIER = 0.03, INFEASIBLE_COMPLIANCE = 1e-11, SINGLE_INFEASIBLE_COMPLIANCE = 1e-6,
+                 SEARCHED_COMPLIANCE = 1e-7, FARKAS_RADIUS = 1e3, FARKAS_ROUNDOFF = 1e-14, SINGLE_FARKAS_ROUNDOFF = 2e-6,
+                 FARKAS_MARGIN = 1e-3;
 
 // certificates, and the point without one
 constexpr int GRADIENT_STEPS = 100;

@@ -14,6 +14,10 @@ struct Certificate {
   bool is_exact = true;  // whether the gradient is roundoff where it has to be 0, which no search needs to reach
 };
 
+// What an answer is, the best one last: a candidate whose certificate fails, or that of a problem whose hard rows contradict
+// each other or the box.
+enum Outcome { NOTHING, CANDIDATE, SOLUTION, LEAST_VIOLATION };
+
 template <class Team> class QPCertificate {
   using Real = typename Team::Real;
   using Int = typename Team::Int;
@@ -33,6 +37,38 @@ template <class Team> class QPCertificate {
 
  public:
   OSIK_FN QPCertificate(const QPSizes& s, char* space) : space(space), size(s) {}
+
+  // Solve a problem by the method whose workspace this is, and judge the answer. is_final: no search follows, so no gradient
+  // has to be roundoff, and the least violation needs no proof that there is no point without one
+  OSIK_CALL Certificate solve(Method& method, const QPData<Real>& d, const QPAnswer<Real>& to, Real kkt_tol,
+                              bool is_final = false) {
+    auto judged = [&](const Real* compliance) {
+      if constexpr (Team::SPARES_SPACE) {
+        auto own = method.copied();
+        own.compliance = compliance;
+        return judge(own, method.X, method.Z + m, method.LABEL, kkt_tol);
+      } else {
+        auto own = d;
+        own.compliance = compliance;
+        return judge(own, to.x, to.multipliers, to.active, kkt_tol);
+      }
+    };
+    auto accepts = [&](const Certificate& c) { return c.holds && (c.is_exact || is_final || Method::IS_SINGLE); };
+    int outcome = method.solve(d, to) ? CANDIDATE : NOTHING;
+    Certificate found{false, 0};
+    if (outcome) found = judged(d.compliance), outcome += accepts(found);
+    if (outcome < SOLUTION && method.search_softened(d, to)) {
+      bool is_least = false;
+      for (Real part = Method::LEAST_COMPLIANCE; !is_least && part < 2 * Method::LARGEST_COMPLIANCE; part *= 10)
+        is_least = method.solve_softened(d, to, part) && accepts(judged(method.COMPLIANCE + m));
+      if (is_least) found = judged(d.compliance);
+      if (is_least && accepts(found)) outcome = SOLUTION;
+      else if (is_least && (is_final || contradicts(d, to.x))) outcome = LEAST_VIOLATION;
+      else outcome = method.solve(d, to) ? CANDIDATE : NOTHING;  // from which a search goes on
+    }
+    t.once([&] { to.report[0] = outcome; });
+    return found;
+  }
 
   // x: [n], y: [p] multipliers of the rows, active: [n + p] labels; residuals up to kkt_tol are certified
   template <class Data>
@@ -83,6 +119,35 @@ template <class Team> class QPCertificate {
   }
 
  private:
+  // Whether what a point misses of hard rows proves that no point of the box satisfies them: is_farkas_certificate in
+  // solvers/qp/_projected_newton.py.
+  OSIK_CALL bool contradicts(const QPData<Real>& d, const Real* x) {
+    constexpr Real ROUNDOFF = Method::IS_SINGLE ? SINGLE_FARKAS_ROUNDOFF : FARKAS_ROUNDOFF;
+    Real* gap = FORCE;
+    t.each(0, p, [&](int q) {
+      Real value = 0;
+      for (int j = 0; j < n; ++j) value += d.rows[q * n + j] * x[j];
+      const Real low = d.lower[n + q], high = d.upper[n + q];
+      gap[q] = d.compliance[q] > 0 ? Real(0) : value < low ? value - low : value > high ? value - high : Real(0);
+    });
+    const Real far = Real(FARKAS_RADIUS) * t.most(Real(0), 0, n, [&](int j, Real) {
+      Real size = fabs(x[j]);
+      for (const Real bound : {d.lower[j], d.upper[j]})
+        size = fabs(bound) < Real(INFINITE) ? larger(size, Real(fabs(bound))) : size;
+      return size;
+    });
+    // the most that the rows can still gain in the box
+    const Real gain = t.sum(0, n, [&](int j) {
+      Real slope = 0, terms = 0;
+      for (int q = 0; q < p; ++q) {
+        const Real term = d.rows[q * n + j] * gap[q];
+        slope += term, terms += fabs(term);
+      }
+      const Real way = slope > 0 ? x[j] - d.lower[j] : d.upper[j] - x[j];
+      return fabs(slope) <= ROUNDOFF * terms ? Real(0) : Real(fabs(slope)) * (way < Real(INFINITE) ? way : far);
+    });
+    return t.sum(0, p, [&](int q) { return square(gap[q]); }) > (1 + Real(FARKAS_MARGIN)) * gain;
+  }
   OSIK_FN RowSums<Real> sums(const Real* row, const Real* x, int n) const { return row_sums(t, row, x, n); }
   // the cost's gradient at x, the sizes of its terms, and roots of its curvatures
   template <class Data> OSIK_CALL void add_terms(const Data& d, const Real* x) {

@@ -160,10 +160,11 @@ class Step : StepRows {
     data.lower = qp_bounds.data(), data.upper = qp_bounds.data() + N, data.tolerance = tolerances[0];
     data.guess = d.guess ? d.guess : no_labels.data();
     int* active = to.integers + 3;
-    to.integers[0] = to.integers[1] = to.integers[2] = 0;
-    Certificate found = solve_qp(data, to);
-    if (!found.holds && limit_rows) found = solve_softened(data, to);
+    Certificate found = certificate[0].solve(qp[0], data, {to.numbers, multipliers.data(), active, to.integers},
+                                             tolerances[1], true);
+    contradicts = to.integers[0] == LEAST_VIOLATION;
     if (!found.holds && !contradicts) {
+      for (int i = soft; i < s.p; ++i) compliance[i] = qp[0].longest_row();
       move_downhill(data, to.numbers);
       for (int i = 0; i < N; ++i) active[i] = i < n && data.lower[i] == data.upper[i] ? EQUALITY : INACTIVE;
       found.residual = certificate[0].judge(data, to.numbers, zeros.data(), active, tolerances[1]).residual;
@@ -184,35 +185,6 @@ class Step : StepRows {
                       qp_bounds[N + n + i] = order(rows.lower[k], rows.upper[k], 1);
       }
     });
-  }
-  Certificate solve_qp(const QPData<double>& data, const StepResult& to) {
-    int report[3], *active = to.integers + 3;
-    qp[0].solve(data, {to.numbers, multipliers.data(), active, report});
-    to.integers[1] += report[1], to.integers[2] += report[2];
-    if (!report[0] || report[1] > s.max_iterations) return {false, 0};
-    return certificate[0].judge(data, to.numbers, multipliers.data(), active, tolerances[1]);
-  }
-  // The least violation of rows that contradict each other or the box: solvers/qp/_search.py, _by_newton. It minimises the
-  // cost too where the rows have this little compliance, as in the derivative.
-  Certificate solve_softened(QPData<double> data, const StepResult& to) {
-    const int n = s.nv;
-    double largest = 0;
-    for (int j = 0; j < n; ++j) center[n + j] = data.damping[j];
-    for (int i = 0; i < s.m; ++i)
-      for (int j = 0; j < n; ++j) center[n + j] += weight[i] * square(J[i * n + j]);
-    for (int i = 0; i < s.p; ++i) {
-      double length = 0;
-      for (int j = 0; j < n; ++j) length += square(data.rows[i * n + j]) / center[n + j];
-      largest = larger(largest, length);
-    }
-    for (int i = s.p - limit_rows; i < s.p; ++i) compliance[i] = INFEASIBLE_COMPLIANCE * largest;
-    const Certificate softened = solve_qp(data, to);
-    const double after = softened.holds ? 0 : largest;  // for move_downhill
-    for (int i = s.p - limit_rows; i < s.p; ++i) compliance[i] = after;
-    if (!softened.holds) return softened;
-    const Certificate given = certificate[0].judge(data, to.numbers, multipliers.data(), to.integers + 3, tolerances[1]);
-    contradicts = given.residual > tolerances[1];
-    return given;
   }
   // A point of the box that is no worse than zero: solvers/qp/_projected_gradient.py. The rows are soft.
   void move_downhill(const QPData<double>& d, double* x) {

@@ -38,7 +38,7 @@ template <class Real> struct QPData {
 // The results of one problem.
 template <class Real> struct QPAnswer {
   Real *x, *multipliers;  // [n], [p] multipliers of the rows of C
-  int *active, *report;   // [N] labels; [3] whether there is a candidate, changes, factorizations
+  int *active, *report;   // [N] labels; [3] Outcome (qp_certificate.hpp), changes, factorizations
 };
 
 template <class Team> struct WeightedQP {
@@ -404,17 +404,58 @@ template <class Team> struct WeightedQP {
   OSIK_FN Copied copied() const {
     return {B, TARGET, COMPLIANCE, DAMPING, CENTER, B + m * ld, COMPLIANCE + m, lower, upper, tolerance};
   }
-  OSIK_CALL void solve(const Data& d, const Answer& to) {
+  // Solve a problem; whether there is a candidate.
+  OSIK_CALL bool solve(const Data& d, const Answer& to) {
     begin(d);
-    first_labels(d.guess, LABEL);
+    return search_from(d.guess, to);
+  }
+  // After `solve`: the same with a little compliance for hard rows, a part of longest_row(). Where these contradict each other
+  // or the box, they are then missed as little as possible, and the cost is minimal too. False without hard rows.
+  OSIK_CALL bool search_softened(const Data& d, const Answer& to) {
+    if (!t.count(0, p, [&](int i) { return !(d.compliance[i] > 0); })) return false;
+    soften(d, LARGEST_COMPLIANCE);
+    return search_from(d.guess, to);
+  }
+  // After that, on its active set, with another part, down to where the factors are regular.
+  OSIK_CALL bool solve_softened(const Data& d, const Answer& to, Real part) {
+    soften(d, part);
+    const bool found = solve_on_active_set();
+    put(to, found);
+    return found;
+  }
+  static constexpr Real LARGEST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : SEARCHED_COMPLIANCE;
+  static constexpr Real LEAST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : INFEASIBLE_COMPLIANCE;
+  // the largest square of a row of C, over the curvatures of the cost
+  OSIK_FN Real longest_row() const {
+    return t.most(Real(0), m, k, [&](int i, Real) {
+      Real square_length = 0;
+      for (int j = 0; j < n; ++j) square_length += square(B[i * ld + j] * INVERSE_ROOT[j]);
+      return square_length;
+    });
+  }
+
+ private:
+  OSIK_CALL bool search_from(const int* guess, const Answer& to) {
+    const int before = changes;
+    changes = 0;
+    first_labels(guess, LABEL);
     const bool found = search() && changes <= max_changes;
-    if (!found) first_labels(d.guess, LABEL);
+    if (!found) first_labels(guess, LABEL);
+    changes += before;
+    put(to, found);
+    return found;
+  }
+  OSIK_CALL void put(const Answer& to, bool found) const {
     t.each(0, N, [&](int i) {
       to.active[i] = LABEL[i];
       if (i < n) to.x[i] = X[i];
       else to.multipliers[i - n] = LABEL[i] == INACTIVE ? Real(0) : Z[m + i - n];
     });
     t.once([&] { to.report[0] = found, to.report[1] = changes, to.report[2] = factorizations; });
+  }
+  OSIK_FN void soften(const Data& d, Real part) {
+    const Real least = part * longest_row();
+    t.each(0, p, [&](int i) { COMPLIANCE[m + i] = larger(d.compliance[i], least); });
   }
 };
 }  // namespace osik

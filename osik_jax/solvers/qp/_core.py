@@ -14,8 +14,9 @@ from ...execution._computed import side_by_side
 from ...numerics._constants import INACTIVE, KKT_TOLERANCE, REDUNDANT, SINGLE_TOL
 from ._problem import QP, LeastSquares
 
-CERTIFIED = 2
-"""``Candidate.converged`` of a candidate that solves its problem; 1: there is one."""
+CERTIFIED, LEAST_VIOLATION = 2, 3
+"""``Candidate.converged`` of a candidate that solves its problem, or misses hard rows that contradict each other or the
+box as little as possible; 1: there is a candidate."""
 
 
 class Candidate(NamedTuple):
@@ -82,9 +83,8 @@ extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
     const QPData<Real> d{matrix + k * M * N, target + k * M, weight + k * M, damping + k * N, center + k * N,
                          rows + k * P * N, compliance + k * P, lower + k * (N + P), upper + k * (N + P),
                          guess + k * (N + P), tolerance[k]};
-    method.solve(d, {x + k * N, multipliers + k * P, active + k * (N + P), report + k * 3});
-    const Certificate found = certificate.judge(method.copied(), method.X, method.Z + M, method.LABEL, KKT_TOLERANCE);
-    if (threadIdx.x == 0) report[k * 3] += report[k * 3] && found.holds && (sizeof(Real) == 4 || found.is_exact);
+    const QPAnswer<Real> to{x + k * N, multipliers + k * P, active + k * (N + P), report + k * 3};
+    const Certificate found = certificate.solve(method, d, to, KKT_TOLERANCE);
     if (threadIdx.x == 0) residual[k] = found.residual;
   }
 }

@@ -19,9 +19,9 @@ from ...execution._candidates import Candidates, certified_or_searched
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import EQUALITY, INACTIVE, SINGLE_TOL
 from . import _core
-from ._core import CERTIFIED, Candidate
+from ._core import CERTIFIED, LEAST_VIOLATION, Candidate
 from ._kkt_solve import kkt_inverse
-from ._problem import QP, LeastSquares
+from ._problem import QP, LeastSquares, compliance_of
 from ._search import SearchResult, search
 
 _BLOCKS, _MIN_BLOCK = 16, 1024
@@ -67,6 +67,7 @@ def kernel_candidates(max_iterations: int, solve: Callable[..., Candidate], bloc
         candidate = solve(qp, guess, tolerance, max_iterations)
         within_limit = candidate.iterations <= max_iterations
         certified = (candidate.converged == CERTIFIED) & within_limit & is_valid
+        infeasible = (candidate.converged == LEAST_VIOLATION) & is_valid
         # nothing to search where numbers are not valid, and finite numbers for derivatives
         numbers = candidate.x, candidate.row_multipliers, candidate.residual[:, None]
         x, y, residual = (jnp.where(is_valid[:, None], a, 0.0) for a in numbers)
@@ -74,13 +75,13 @@ def kernel_candidates(max_iterations: int, solve: Callable[..., Candidate], bloc
             x=x,
             row_multipliers=y,
             # the search has the limit too: it may not begin where more changes than that have led
-            active=jnp.where(within_limit[:, None], candidate.active, guess),
+            active=jnp.where((within_limit | infeasible)[:, None], candidate.active, guess),
             iterations=candidate.iterations,
             factorizations=candidate.factorizations,
-            done=certified | ~is_valid,
+            done=certified | infeasible | ~is_valid,
             optimal=certified,
-            infeasible=jnp.zeros_like(certified),
-            compliance=qp.compliance,
+            infeasible=infeasible,
+            compliance=jnp.where(infeasible[:, None], _compliance_of(qp, x, y), qp.compliance),
             residual=residual[:, 0],
         )
 
@@ -95,6 +96,10 @@ def kernel_candidates(max_iterations: int, solve: Callable[..., Candidate], bloc
         return with_a_few((as_given[0], tolerance), result, result.done, search_block, size)
 
     return Candidates(certified, search_rest)
+
+
+def _compliance_of(qp: QP, x: Float[Array, "B n"], y: Float[Array, "B p"]) -> Float[Array, "B p"]:
+    return jax.vmap(compliance_of)(qp, x, y) if y.shape[1] else qp.compliance
 
 
 def _block(batch: int) -> int:

@@ -16,6 +16,7 @@ from ...numerics._constants import (
     AT_UPPER,
     BOUND_MULTIPLIER,
     INACTIVE,
+    INFEASIBLE_COMPLIANCE,
     QUADRATIC_RIDGE,
     ROW_MULTIPLIER,
     ZERO_TOL,
@@ -215,6 +216,21 @@ def softened_compliance(qp: QP, penalty_ratio: float) -> Float[Array, " p"]:
     # a row of length l and compliance c has the curvature l^2 / c along itself
     scaled = penalty_ratio * jnp.where(largest_curvature > 0.0, largest_curvature, 1.0)
     return jnp.where(is_soft, qp.compliance, jnp.where(square > 0.0, square, 1.0) / scaled)
+
+
+def infeasible_compliance(qp: QP) -> Float[Array, " p"]:
+    """Return the compliances with which the least violation of infeasible hard rows minimises the cost too."""
+    largest = jnp.max(jnp.sum(qp.rows**2 / qp.cost.diagonal(), 1), initial=0.0)
+    return jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest, qp.compliance)
+
+
+def compliance_of(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " p"]:
+    """Return the compliances of rows that miss their bounds by their multipliers: that of the hard ones is the same."""
+    n = len(x)
+    gap = jnp.where(qp.compliance > 0.0, 0.0, jnp.abs(violation(apply(qp.rows, x), qp.lower[n:], qp.upper[n:])))
+    worst = jnp.argmax(gap)
+    size = jnp.abs(y[worst])
+    return jnp.maximum(jnp.where(size > 0.0, gap[worst] / jnp.where(size > 0.0, size, 1.0), 0.0), qp.compliance)
 
 
 def gradient_scale(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:

@@ -6,6 +6,7 @@ comes from a fresh factorisation at the final active set, if there are digits en
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +21,6 @@ from ...numerics._constants import (
     AT_UPPER,
     EQUALITY,
     INACTIVE,
-    INFEASIBLE_COMPLIANCE,
     KKT_TOLERANCE,
     RELAXED,
     SEARCH_TOLERANCES,
@@ -28,7 +28,7 @@ from ...numerics._constants import (
 )
 from ...numerics._dense import apply
 from ._kkt_solve import factorize, solve_on_active_set
-from ._problem import QP, constraint_scales, in_units, kkt_residual, multiplier_roundoff
+from ._problem import QP, constraint_scales, in_units, infeasible_compliance, kkt_residual, multiplier_roundoff
 from ._projected_gradient import projected_gradient
 from ._projected_newton import projected_newton
 
@@ -129,8 +129,6 @@ def _by_newton(
     scaled = jax.vmap(in_units)(qp, unit)
     end = projected_newton(scaled, start, result.iterations, feasibility_tol, zero, max_iterations)
     infeasible, optimal = end.converged & end.infeasible, end.converged & ~end.infeasible
-    largest = jnp.max(jnp.sum(scaled.rows**2, 2), 1, initial=0.0)[:, None]
-    softened = jnp.maximum(INFEASIBLE_COMPLIANCE[largest.dtype] * largest, qp.compliance)
     found = result._replace(
         x=end.x * unit,
         row_multipliers=end.row_multipliers,
@@ -139,9 +137,16 @@ def _by_newton(
         factorizations=result.factorizations + end.iterations - result.iterations,
         optimal=optimal,
         infeasible=infeasible,
-        compliance=jnp.where(infeasible[:, None], softened, qp.compliance),
+        compliance=jnp.where(infeasible[:, None], jax.vmap(infeasible_compliance)(qp), qp.compliance),
     )
-    found = _judged(qp, found, 10.0 * feasibility_tol)
+    # the multipliers of the least violation are those of its compliance, for derivatives
+    softened = replace(qp, compliance=found.compliance)
+    factors = jax.vmap(factorize)(softened, jax.vmap(lambda one: one.cost.hessian())(qp), found.active)
+    y = solve_on_active_set(softened, factors, found.active)[1]
+    of_least = infeasible[:, None] & jnp.isfinite(y)
+    found = _judged(
+        qp, found._replace(row_multipliers=jnp.where(of_least, y, found.row_multipliers)), 10.0 * feasibility_tol
+    )
     exact = _on_active_set(qp, tolerance, found._replace(active=end.determined), kkt_tol, relaxed=RELAXED[unit.dtype])
     exact = choose(optimal & exact.optimal, exact, found)
     return exact._replace(done=exact.done | (end.iterations >= max_iterations))
