@@ -13,12 +13,12 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
-from ..numerics._arguments import check_bounds, concrete, entries
+from ..numerics._arguments import check_bounds, check_positive, concrete
 from ..numerics._guarded import rate_of_way
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values, scalar_layout
 from ._box import Box, Kind, Limit, Time, limit_box
-from ._configuration import ConfigurationLimit, check_return_speed
+from ._configuration import ConfigurationLimit
 
 _ROUNDOFF = 32.0  # machine epsilons of the way to a bound that braking leaves over
 _MOST_STEPS = 1e6  # of braking
@@ -103,10 +103,8 @@ class AccelerationLimit(Limit):
 
     def _check(self, names: Sequence[str] | None = None) -> None:
         check_bounds(self.lower, self.upper)
-        check_return_speed(self.return_speed, names)
-        seen = concrete(self.acceleration)
-        if seen is not None and not (seen > 0.0).all():
-            raise OsikValueError(f"accelerations have to be positive: {entries(seen, ~(seen > 0.0), names)}")
+        check_positive("return speeds", self.return_speed, names)
+        check_positive("accelerations", self.acceleration, names)
 
     def after(self, velocity: Float[Array, " nv"]) -> Self:
         """Return the limit for the next step, given this step's ``velocity``."""

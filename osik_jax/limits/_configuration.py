@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..kinematics import Kinematics
-from ..numerics._arguments import check_bounds, concrete, entries
+from ..numerics._arguments import check_bounds, check_positive, concrete
 from ..numerics._constants import RANGE_ROUNDOFF
 from ..numerics._guarded import rate_of_way
 from ..numerics._host import Numbers, module_of, on_host, to_jax
@@ -84,7 +84,7 @@ class ConfigurationLimit(Limit):
             _check(robot, low, high)
         self.gain = _as_gain(robot, gain)
         self.return_speed = dof_values(robot, return_speed, _own_return_speed(robot), "return_speed")
-        check_return_speed(self.return_speed, dof_names(robot))
+        check_positive("return speeds", self.return_speed, dof_names(robot))
 
     def box(self, robot: Robot, q: Float[Array, " nq"], dt: Time) -> Box:
         """Return the velocities that lead to the ends of each range in one step of dt [s], or back at return speed."""
@@ -146,7 +146,7 @@ class ConfigurationLimit(Limit):
     def _check(self) -> None:
         check_bounds(self.lower, self.upper)
         _check_gain(self.gain)
-        check_return_speed(self.return_speed)
+        check_positive("return speeds", self.return_speed)
 
 
 def _own_return_speed(robot: Robot) -> Float[Numbers, " nv"]:
@@ -154,13 +154,6 @@ def _own_return_speed(robot: Robot) -> Float[Numbers, " nv"]:
     default = np.where(robot.tree.turning, _RETURN_SPEED_HINGE, _RETURN_SPEED_SLIDE)
     speed = on_host(robot.velocity_limit)
     return module_of(speed).where(abs(speed) < np.inf, speed, default)
-
-
-def check_return_speed(speed: Array, names: Sequence[str] | None = None) -> None:
-    """Raise ValueError if a concrete return speed is not positive."""
-    seen = concrete(speed)
-    if seen is not None and not (seen > 0.0).all():
-        raise OsikValueError(f"return speeds have to be positive: {entries(seen, ~(seen > 0.0), names)}")
 
 
 def _as_gain(robot: Robot, value: ArrayLike | Array | Mapping[str, float]) -> Float[Array, ""] | Float[Array, " nv"]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError, unknown_name
 from ..kinematics import Kinematics
-from ..numerics._arguments import as_vector, concrete, entries
+from ..numerics._arguments import as_vector, check_positive, concrete
 from ..robot import Robot
 from ..robot._joint_selection import dof_names, dof_values
 from ..robot._ranges import warn_of_fast_joints
@@ -58,9 +58,7 @@ class VelocityLimit(Limit):
         return [0, *[self.velocity] * 4]
 
     def _check(self, names: Sequence[str] | None = None) -> None:
-        seen = concrete(self.velocity)
-        if seen is not None and not (seen >= 0.0).all():
-            raise OsikValueError(f"velocity limits have to be 0 or more: {entries(seen, ~(seen >= 0.0), names)}")
+        check_positive("velocity limits", self.velocity, names, or_zero=True)
 
 
 class FloatingBaseVelocityLimit(Limit):

@@ -92,6 +92,18 @@ def entries(values: np.ndarray, which: np.ndarray, names: Sequence[str] | None =
     return ", ".join(f"{names[i] if names else f'entry {i}'} ({values[i]})" for i in found)
 
 
+def check_positive(what: str, values: Any, names: Sequence[str] | None = None, *, or_zero: bool = False) -> None:
+    """Raise ValueError unless each entry is positive, or 0 if that is allowed; traced values are not checked."""
+    seen = concrete(values)
+    if seen is None:
+        return
+    wrong = ~((seen >= 0.0) if or_zero else (seen > 0.0))
+    if wrong.any():
+        raise OsikValueError(
+            f"{what} have to be {'0 or more' if or_zero else 'positive'}: {entries(seen, wrong, names)}"
+        )
+
+
 def check_count(what: str, value: Any, *, least: int = 1) -> None:
     """Raise ValueError unless the value is an integer of at least ``least``."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:

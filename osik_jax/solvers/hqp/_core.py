@@ -24,12 +24,8 @@ def solve(
 ) -> CascadeResult:
     """Return candidates for a batch of hierarchies, for all levels including the last.
 
-    Args:
-        layout: sizes and row indices (static).
-        hierarchy: the numbers, with a leading axis of problems.
-        tolerances: what counts as zero, one of each a problem.
-        warm_start: working sets to try first; all zeros in a problem for none.
-        max_iterations: limit on the active-set iterations of one level (static).
+    Arrays have a leading axis of problems. ``warm_start`` has the working sets to try first, all zeros for none;
+    ``max_iterations`` limits the active-set iterations of one level.
     """
 
     def call(shapes: _library.Shapes, numbers: list[Array], integers: list[Array]) -> list[Array]:

@@ -129,7 +129,8 @@ def _fit_rows(
     new x, and the projector without the row space of C.
     """
     is_active = active != 0
-    target = jnp.where(active < 0, _masked(lower, active < 0), _masked(upper, active > 0))
+    # a bound that is not active may be infinite: it is masked, and the terms are added
+    target = jnp.where(active < 0, lower, 0.0) + jnp.where(active > 0, upper, 0.0)
     chosen = jnp.where(is_active[:, None], matrix, 0.0)
     # a cutoff decides on the rank alone: no derivative goes through it
     longest = jnp.max(jnp.abs(jax.lax.stop_gradient(chosen)))
@@ -144,8 +145,3 @@ def _fit_rows(
         motion = jnp.where(is_damped, whole - x, motion)
     # rounding over small singular values has components outside the projector's range, so both are projected (eq. 7)
     return x + apply(projector, motion), projector - product(projector, product(space, projector))
-
-
-def _masked(bound: Array, used: Array) -> Array:
-    """Return the active bounds, and 0 for unused bounds, which may be infinite."""
-    return jnp.where(used, bound, 0.0)

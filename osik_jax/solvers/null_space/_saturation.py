@@ -119,14 +119,11 @@ def _kernel_candidates(
 ) -> Candidates:
     """Return the function that uses a kernel, which checks its own answers, and the search in blocks for the rest."""
 
-    def certified(problem: Problem) -> SaturatedResult:
-        return solve(problem, max_iterations)
-
     def search_rest(result: SaturatedResult, problem: Problem) -> SaturatedResult:
         is_final = result.done | (result.iterations >= max_iterations)
         return with_a_few(problem, result, is_final, lambda problem, _: search(problem), block)
 
-    return Candidates(certified, search_rest)
+    return Candidates(lambda problem: solve(problem, max_iterations), search_rest)
 
 
 def _solve_levels(max_iterations: int, backend: Backend, problem: Problem) -> SaturatedResult:

@@ -68,20 +68,24 @@ def solve_nullspace(
     n = levels[0].matrix.shape[1]
     dtype = jnp.result_type(*(level.matrix for level in levels))
     box = _bounds(lower, upper, n, dtype)
-    # bounds with lower > upper become equalities halfway; the status says so
     # without a secondary motion x is the smallest: the motion towards 0
     motion = jnp.zeros(n, dtype) if secondary is None else jnp.asarray(secondary, dtype)
+    # bounds with lower > upper become equalities halfway; the status says so
     levels, unordered = zip(*(level.ordered() for level in levels), strict=True)
     bounds_are_ordered = ~jnp.stack(unordered).any()
     dampings = per_level(damping, len(levels), n, dtype)
     # where the data are not finite, a placeholder of zeros is solved, in a box of ones
     numbers = [jnp.isfinite(a).all() for a in (motion, *dampings)]
     is_valid = jnp.stack([*are_finite(levels), *numbers, *([] if box is None else [bounds_exist(*box)])]).all()
-    valid, motion, dampings = _or_zeros(is_valid, (list(levels), motion, dampings))
+    valid, motion, dampings = jax.tree.map(
+        lambda leaf: jnp.where(is_valid, leaf, 0.0), (list(levels), motion, dampings)
+    )
     scaled = [level.scaled() for level in valid]
     rank_tol = NULL_SPACE_RANK[dtype] if rank_tolerance is None else rank_tolerance
     if box is None:
-        answer = _unbounded(*project(scaled, motion, dampings, rank_tol, backend), count=len(levels))
+        x, projector = project(scaled, motion, dampings, rank_tol, backend)
+        scales, inactive = jnp.ones(len(levels), dtype), jnp.zeros(n, jnp.int32)
+        answer = BoundedAnswer(x, projector, scales, inactive, jnp.asarray(0), jnp.asarray(True))
         return _solution(valid, answer, is_valid, bounds_are_ordered, jnp.zeros(n, dtype))
     limit = 10 * (n + 2) if max_iterations is None else max_iterations
     low, high, empty = ordered_bounds(*box)
@@ -89,11 +93,6 @@ def solve_nullspace(
     target = None if secondary is None else motion
     answer = solve_saturated(scaled, *safe, target, dampings, rank_tol, limit, backend)
     return _solution(valid, answer, is_valid, bounds_are_ordered & ~empty, clip_to_box(jnp.zeros(n, dtype), *box))
-
-
-def _or_zeros(is_valid: Array, tree: Any) -> Any:
-    """Return the given numbers, or zeros for None."""
-    return jax.tree.map(lambda leaf: jnp.where(is_valid, leaf, 0.0), tree)
 
 
 def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] | None:
@@ -107,12 +106,6 @@ def _bounds(lower: Any, upper: Any, n: int, dtype: Any) -> tuple[Array, Array] |
         if bound.shape != (n,):
             raise OsikValueError(f"{name} has shape {bound.shape}; the levels ask for {(n,)}")
     return low, high
-
-
-def _unbounded(x: Float[Array, " n"], projector: Float[Array, "n n"], *, count: int) -> BoundedAnswer:
-    """Return an answer without bounds in the same form: every scale is 1, no joint is active."""
-    inactive = jnp.zeros(len(x), jnp.int32)
-    return BoundedAnswer(x, projector, jnp.ones(count, x.dtype), inactive, jnp.asarray(0), jnp.asarray(True))
 
 
 def _solution(

@@ -32,13 +32,10 @@ class Candidate(NamedTuple):
 
 
 def solve(qp: QP, guess: Int[Array, "B m"], tolerance: Float[Array, " B"], max_iterations: int) -> Candidate:
-    """Return candidates for a batch of QPs.
+    """Return candidates for a batch of QPs, from a guess of their active sets.
 
-    Args:
-        qp: the problems, with a leading axis.
-        guess: labels of the active sets to try first.
-        tolerance: violation that counts as none, relative to the scale of the constraint.
-        max_iterations: limit on the changes of the active set (static).
+    ``tolerance`` is the violation that counts as none, relative to the scale of the constraint; ``max_iterations``
+    limits the changes of the active set.
     """
     cost = qp.cost
     assert isinstance(cost, LeastSquares)

@@ -115,10 +115,12 @@ def kkt_solver(qp: QP, active: Int[Array, " m"], backend: Backend) -> Callable[[
 
 @cache
 def _solve_kkt_on_platform() -> Callable[[QP, Array, Array], Array]:
-    def plain(qp: QP, active: Array, right: Array) -> Array:
-        return kkt_inverse(qp, active)(right)
+    return in_lanes(partial(on_platforms, {"core-cuda": _solve_kkt}, _solve_kkt_in_jax))
 
-    return in_lanes(partial(on_platforms, {"core-cuda": _solve_kkt}, jax.vmap(plain)))
+
+@jax.vmap
+def _solve_kkt_in_jax(qp: QP, active: Int[Array, " m"], right: Float[Array, " m"]) -> Float[Array, " m"]:
+    return kkt_inverse(qp, active)(right)
 
 
 def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) -> Float[Array, "B m"]:
@@ -143,7 +145,6 @@ def _solve_kkt(qp: QP, active: Int[Array, "B m"], right: Float[Array, "B m"]) ->
     done = (candidate.converged != 0) & jnp.isfinite(point).all(1)
 
     def solve_block(at: Array, point: Array) -> Array:
-        block = jax.tree.map(lambda a: a[at], (qp, active, right))
-        return jax.vmap(lambda qp, active, right: kkt_inverse(qp, active)(right))(*block)
+        return _solve_kkt_in_jax(*jax.tree.map(lambda a: a[at], (qp, active, right)))
 
     return with_the_rest(point, done, solve_block, _block(len(active)))
