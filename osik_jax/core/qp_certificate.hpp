@@ -58,10 +58,11 @@ template <class Team> class QPCertificate {
     Certificate found{false, 0};
     if (outcome) found = judged(d.compliance), outcome += accepts(found);
     if (outcome < SOLUTION && method.search_softened(d, to)) {
-      bool is_least = false;
-      for (Real part = Method::LEAST_COMPLIANCE; !is_least && part < 2 * Method::LARGEST_COMPLIANCE; part *= 10)
-        is_least = method.solve_softened(d, to, part) && accepts(judged(method.COMPLIANCE + m));
-      if (is_least) found = judged(d.compliance);
+      Real part = Method::LEAST_COMPLIANCE;
+      auto is_solved = [&] { return method.solve_softened(d, to, part) && accepts(judged(method.COMPLIANCE + m)); };
+      bool is_least = is_solved();
+      while (!is_least && part < Method::LARGEST_COMPLIANCE) part *= 10, is_least = is_solved();
+      if (is_least) method.extrapolate(d, to, part), found = judged(d.compliance);
       if (is_least && accepts(found)) outcome = SOLUTION;
       else if (is_least && (is_final || contradicts(d, to.x))) outcome = LEAST_VIOLATION;
       else outcome = method.solve(d, to) ? CANDIDATE : NOTHING;  // from which a search goes on

@@ -423,6 +423,12 @@ template <class Team> struct WeightedQP {
     put(to, found);
     return found;
   }
+  // After that: bring x to where no compliance would have it. x is linear in the compliance, but for its square.
+  OSIK_CALL void extrapolate(const Data& d, const Answer& to, Real part) {
+    soften(d, 2 * part);
+    if (!solve_on_active_set()) return;
+    t.each(0, n, [&](int j) { to.x[j] = X[j] = 2 * to.x[j] - X[j]; });
+  }
   static constexpr Real LARGEST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : SEARCHED_COMPLIANCE;
   static constexpr Real LEAST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : INFEASIBLE_COMPLIANCE;
   // the largest square of a row of C, over the curvatures of the cost
