@@ -53,21 +53,13 @@ class FixedFrame(eqx.Module):
 
 
 class Setup(eqx.Module):
-    """A robot and fixed frames, the base first, as arrays that unknowns change.
-
-    Attributes:
-        robot: the robot.
-        names: of the fixed frames; the first is ``BASE`` (static).
-        parents: the robot's frame that carries each, None for the world (static).
-        position: of each in its parent [m]. (m, 3)
-        rotation: from the axes of each to its parent's. (m, 3, 3)
-    """
+    """A robot and fixed frames, the base first, as arrays that unknowns change."""
 
     robot: Robot
-    names: tuple[str, ...] = eqx.field(static=True)
-    parents: tuple[str | None, ...] = eqx.field(static=True)
-    position: Float[Array, "m 3"]
-    rotation: Float[Array, "m 3 3"]
+    names: tuple[str, ...] = eqx.field(static=True)  # of the fixed frames; the first is ``BASE``
+    parents: tuple[str | None, ...] = eqx.field(static=True)  # the robot's frame that carries each, None for the world
+    position: Float[Array, "m 3"]  # of each in its parent [m]
+    rotation: Float[Array, "m 3 3"]  # from the axes of each to its parent's
 
     def check(self, name: str) -> None:
         """Raise KeyError unless a frame of the robot or a fixed frame has this name."""

@@ -18,21 +18,13 @@ _ISOLATED_SEPARATION = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
-    """Entries of q that a search moves.
+    """Entries of q that a search moves."""
 
-    Attributes:
-        entries: their numbers.
-        turns: whether a whole turn of each changes no pose.
-        lower: limits, -inf where free [rad or m].
-        upper: likewise.
-        first: the configuration that solutions are near to.
-    """
-
-    entries: np.ndarray
-    turns: Bool[np.ndarray, " n"]
-    lower: Float[np.ndarray, " n"]
-    upper: Float[np.ndarray, " n"]
-    first: Float[np.ndarray, " n"]
+    entries: np.ndarray  # their numbers
+    turns: Bool[np.ndarray, " n"]  # whether a whole turn of each changes no pose
+    lower: Float[np.ndarray, " n"]  # limits, -inf where free [rad or m]
+    upper: Float[np.ndarray, " n"]  # likewise
+    first: Float[np.ndarray, " n"]  # the configuration that solutions are near to
 
 
 def all_solutions(explored: Explored, alone: Bool[np.ndarray, " targets"], own: Coordinates) -> dict[str, np.ndarray]:

@@ -31,39 +31,23 @@ STOPPED = 1e-3
 
 
 class Settings(NamedTuple):
-    """Numbers of a search, all traced.
+    """Numbers of a search, all traced."""
 
-    Attributes:
-        home: what entries of q have that move no frame, and where search 0 of a warm start begins. (nq,)
-        lower: limits of each entry of v. (nv,)
-        upper: (nv,)
-        key: of the starts.
-        tolerance: of position [m] and orientation [rad]. (2,)
-        seeds: number of searches that ``nearest`` spreads out. ()
-        parts: what else a search is made of.
-    """
-
-    home: Float[Array, " nq"]
-    lower: Float[Array, " nv"]
+    home: Float[Array, " nq"]  # what entries of q have that move no frame, and where search 0 of a warm start begins
+    lower: Float[Array, " nv"]  # limits of each entry of v
     upper: Float[Array, " nv"]
-    key: Any
-    tolerance: Float[Array, "2"]
-    seeds: Int[Array, ""] | int
-    parts: Any = None
+    key: Any  # of the starts
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad]
+    seeds: Int[Array, ""] | int  # number of searches that ``nearest`` spreads out
+    parts: Any = None  # what else a search is made of
 
 
 class ChainRoute(NamedTuple):
-    """Problem of poses of frames whose chains have hinges and slides only; hashable.
+    """Problem of poses of frames whose chains have hinges and slides only; hashable."""
 
-    Attributes:
-        frames: names.
-        rows: of each frame, those that count: x, y, z, rotation about x, y, z.
-        by_core: whether the compiled core takes the steps where it is installed: not in a user's program, which may be
-            exported.
-    """
-
-    frames: tuple[str, ...]
-    rows: tuple[tuple[bool, ...], ...]
+    frames: tuple[str, ...]  # names
+    rows: tuple[tuple[bool, ...], ...]  # of each frame, those that count: x, y, z, rotation about x, y, z
+    # whether the compiled core takes the steps where it is installed: not in a user's program, which may be exported
     by_core: bool = True
 
     @property
@@ -105,20 +89,13 @@ class ChainRoute(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What a search needs of a robot and its limits alone.
+    """What a search needs of a robot and its limits alone."""
 
-    Attributes:
-        chain: geometry.
-        lower: limits of the chain's coordinates, -inf where free. (n,)
-        upper: (n,)
-        reaches: bounds on where each frame gets.
-        length: the greatest distance that a frame gets from its root and its slides' travel [m]; may be infinite. ()
-    """
-
-    chain: Chain
-    lower: Float[Array, " n"]
+    chain: Chain  # geometry
+    lower: Float[Array, " n"]  # limits of the chain's coordinates, -inf where free
     upper: Float[Array, " n"]
-    reaches: list[Reach]
+    reaches: list[Reach]  # bounds on where each frame gets
+    # the greatest distance that a frame gets from its root and its slides' travel [m]; may be infinite
     length: Float[Array, ""]
 
 

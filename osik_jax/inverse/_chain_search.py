@@ -35,14 +35,9 @@ _GAIN = 1e-4
 
 
 class Goal(NamedTuple):
-    """Wanted poses of the frames.
+    """Wanted poses of the frames."""
 
-    Attributes:
-        position: [m]. (..., frames, 3)
-        rotation: (..., frames, 3, 3)
-    """
-
-    position: Float[Array, "*lanes frames 3"]
+    position: Float[Array, "*lanes frames 3"]  # [m]
     rotation: Float[Array, "*lanes frames 3 3"]
 
 
@@ -57,47 +52,29 @@ class ChainSearch(eqx.Module):
     Such a damping needs no line search, and vanishes fast enough for quadratic convergence (T. Sugihara, "Solvability-
     unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on Robotics 27(5), 2011). A
     joint at a limit beyond which the negative gradient points is left out of the step.
-
-    Attributes:
-        rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
-        by_core: whether the compiled core takes the steps where it is installed (static).
-        turns: of each coordinate, whether a whole turn of it changes no pose (static).
-        chain: geometry.
-        lower: of the chain's coordinates, -inf where free. (n,)
-        upper: (n,)
-        reaches: bounds on where each frame gets.
-        low: of where searches start, finite. (n,)
-        high: (n,)
-        first: where search 0 starts, used where ``warm``. (n,)
-        home: the whole configuration that the coordinates are part of. (nq,)
-        warm: whether search 0 starts at ``first`` (static).
-        near: whether the nearest solution to ``first`` is wanted: searches start around it, and what the frames leave
-            free goes towards it (static).
-        seeds: number of searches that ``near`` spreads out. ()
-        shift: of the sequence of starts. (n,)
-        length: what a radian counts as [m]. ()
-        tolerance: of position [m] and orientation [rad], less what rounding may hide. (2,)
-        enough: score at which a search stays where it is. ()
     """
 
+    # of each frame, the rows that count: x, y, z, rotation about x, y, z
     rows: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
-    by_core: bool = eqx.field(static=True)
-    turns: tuple[bool, ...] = eqx.field(static=True)
-    chain: Chain
-    lower: Float[Array, " n"]
+    by_core: bool = eqx.field(static=True)  # whether the compiled core takes the steps where it is installed
+    turns: tuple[bool, ...] = eqx.field(static=True)  # of each coordinate, whether a whole turn of it changes no pose
+    chain: Chain  # geometry
+    lower: Float[Array, " n"]  # of the chain's coordinates, -inf where free
     upper: Float[Array, " n"]
-    reaches: list[Reach]
-    low: Float[Array, " n"]
+    reaches: list[Reach]  # bounds on where each frame gets
+    low: Float[Array, " n"]  # of where searches start, finite
     high: Float[Array, " n"]
-    first: Float[Array, " n"]
-    home: Float[Array, " nq"]
-    warm: bool = eqx.field(static=True)
+    first: Float[Array, " n"]  # where search 0 starts, used where ``warm``
+    home: Float[Array, " nq"]  # the whole configuration that the coordinates are part of
+    warm: bool = eqx.field(static=True)  # whether search 0 starts at ``first``
+    # whether the nearest solution to ``first`` is wanted: searches start around it, and what the frames leave free goes
+    # towards it
     near: bool = eqx.field(static=True)
-    seeds: Float[Array, ""]
-    shift: UInt[Array, " n"]
-    length: Float[Array, ""]
-    tolerance: Float[Array, "2"]
-    enough: Float[Array, ""]
+    seeds: Float[Array, ""]  # number of searches that ``near`` spreads out
+    shift: UInt[Array, " n"]  # of the sequence of starts
+    length: Float[Array, ""]  # what a radian counts as [m]
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad], less what rounding may hide
+    enough: Float[Array, ""]  # score at which a search stays where it is
 
     def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return the starts of the searches with these indices."""

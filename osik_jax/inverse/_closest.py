@@ -15,19 +15,12 @@ _EQUAL = 0.01
 
 
 class Closest(NamedTuple):
-    """Best local optimum of each target.
+    """Best local optimum of each target."""
 
-    Attributes:
-        x: coordinates. (targets, n)
-        error: length of all errors [m], where a radian counts as the tolerances' ratio. (targets,)
-        seed: number of the search that it began with. (targets,)
-        steps: that were taken to all of the target's optima. (targets,)
-    """
-
-    x: Float[Array, "targets n"]
-    error: Float[Array, " targets"]
-    seed: Int[Array, " targets"]
-    steps: Int[Array, " targets"]
+    x: Float[Array, "targets n"]  # coordinates
+    error: Float[Array, " targets"]  # length of all errors [m], where a radian counts as the tolerances' ratio
+    seed: Int[Array, " targets"]  # number of the search that it began with
+    steps: Int[Array, " targets"]  # that were taken to all of the target's optima
 
 
 def closest(

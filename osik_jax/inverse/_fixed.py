@@ -21,45 +21,27 @@ SETTLED = 0.1
 
 
 class Outcomes(NamedTuple):
-    """End points of all searches of each target.
+    """End points of all searches of each target."""
 
-    Attributes:
-        x: coordinates. (targets, seeds, n)
-        errors: there. (targets, seeds) each
-    """
-
-    x: Float[Array, "targets seeds n"]
-    errors: Errors
+    x: Float[Array, "targets seeds n"]  # coordinates
+    errors: Errors  # there; (targets, seeds) each
 
 
 class Searches(NamedTuple):
-    """Static settings of the searches for a target; hashable.
+    """Static settings of the searches for a target; hashable."""
 
-    Attributes:
-        seeds: their number, where all of them run.
-        warm: whether search 0 starts at the first configuration.
-        near: whether they start around it and go towards it.
-        every: whether the results of all of them are wanted.
-    """
-
-    seeds: int
-    warm: bool
-    near: bool
-    every: bool
+    seeds: int  # their number, where all of them run
+    warm: bool  # whether search 0 starts at the first configuration
+    near: bool  # whether they start around it and go towards it
+    every: bool  # whether the results of all of them are wanted
 
 
 class Explored(NamedTuple):
-    """Results of all searches of each target.
+    """Results of all searches of each target."""
 
-    Attributes:
-        found: the best.
-        outcomes: their ends; None where the core computed the best alone.
-        isolated: with ``every``, whether these are isolated solutions, else None. (targets, seeds)
-    """
-
-    found: InverseKinematicsSolution
-    outcomes: Any
-    isolated: Any
+    found: InverseKinematicsSolution  # the best
+    outcomes: Any  # their ends; None where the core computed the best alone
+    isolated: Any  # with ``every``, whether these are isolated solutions, else None; (targets, seeds)
 
 
 def search_all(

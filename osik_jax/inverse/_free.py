@@ -50,19 +50,12 @@ SEEDS = 256
 
 
 class Obstacles(NamedTuple):
-    """The robot's shapes and the obstacles that a search keeps apart.
+    """The robot's shapes and the obstacles that a search keeps apart."""
 
-    Attributes:
-        route: the frames.
-        shapes: of the robot.
-        scene: the user's.
-        around: both for the core.
-    """
-
-    route: ChainRoute
-    shapes: RobotShapes
-    scene: Scene
-    around: Around
+    route: ChainRoute  # the frames
+    shapes: RobotShapes  # of the robot
+    scene: Scene  # the user's
+    around: Around  # both for the core
 
     @property
     def many(self) -> bool:

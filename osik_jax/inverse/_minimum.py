@@ -38,17 +38,11 @@ Model = Callable[
 
 
 class Minimum(NamedTuple):
-    """Local minima.
+    """Local minima."""
 
-    Attributes:
-        x: coordinates. (n, lanes)
-        cost: half the sum of the squared errors. (lanes,)
-        steps: that were taken. (lanes,)
-    """
-
-    x: Float[Array, "n lanes"]
-    cost: Float[Array, " lanes"]
-    steps: Int[Array, " lanes"]
+    x: Float[Array, "n lanes"]  # coordinates
+    cost: Float[Array, " lanes"]  # half the sum of the squared errors
+    steps: Int[Array, " lanes"]  # that were taken
 
 
 class _State(NamedTuple):

@@ -19,17 +19,11 @@ _WORD = np.dtype(np.int32)
 @partial(jax.tree_util.register_dataclass, data_fields=["words", "apart"], meta_fields=["form"])
 @dataclass(frozen=True)
 class Packed:
-    """A pytree.
+    """A pytree."""
 
-    Attributes:
-        words: numbers of its packed leaves one after another, as integers of 32 bits. (k,)
-        apart: its leaves that are not packed.
-        form: shape and type of each leaf, the type None for a leaf that is apart; and the structure (static).
-    """
-
-    words: Int[Array | np.ndarray, " k"]
-    apart: tuple[Array, ...]
-    form: Any
+    words: Int[Array | np.ndarray, " k"]  # numbers of its packed leaves one after another, as integers of 32 bits
+    apart: tuple[Array, ...]  # its leaves that are not packed
+    form: Any  # shape and type of each leaf, the type None for a leaf that is apart; and the structure (static)
 
 
 def packed(tree: Any) -> Packed:

@@ -19,19 +19,12 @@ CHECK = 4
 
 
 class Errors(NamedTuple):
-    """Errors of configurations.
+    """Errors of configurations."""
 
-    Attributes:
-        position: largest of the distances [m].
-        orientation: largest of the angles [rad].
-        score: largest error relative to its tolerance: 1 and less is converged.
-        cost: what the steps reduce.
-    """
-
-    position: Float[Array, "..."]
-    orientation: Float[Array, "..."]
-    score: Float[Array, "..."]
-    cost: Float[Array, "..."]
+    position: Float[Array, "..."]  # largest of the distances [m]
+    orientation: Float[Array, "..."]  # largest of the angles [rad]
+    score: Float[Array, "..."]  # largest error relative to its tolerance: 1 and less is converged
+    cost: Float[Array, "..."]  # what the steps reduce
 
 
 @runtime_checkable
@@ -48,19 +41,12 @@ class Search(Protocol):
 
 
 class Found(NamedTuple):
-    """Best result of each target's searches.
+    """Best result of each target's searches."""
 
-    Attributes:
-        x: coordinates.
-        errors: there.
-        seed: number of the search.
-        steps: that the target's searches took, all together.
-    """
-
-    x: Float[Array, "targets n"]
-    errors: Errors
-    seed: Int[Array, " targets"]
-    steps: Int[Array, " targets"]
+    x: Float[Array, "targets n"]  # coordinates
+    errors: Errors  # there
+    seed: Int[Array, " targets"]  # number of the search
+    steps: Int[Array, " targets"]  # that the target's searches took, all together
 
 
 class _Lanes(NamedTuple):

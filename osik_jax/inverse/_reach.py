@@ -19,17 +19,11 @@ _SWEEPS = 4
 
 
 class Reach(NamedTuple):
-    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move.
+    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move."""
 
-    Attributes:
-        root: the first hinge's position with the slides before it in the middle of their ranges [m]. (3,)
-        slides: half the travel of each of these slides, along its direction in the world [m]. (k, 3)
-        length: of the links from there to the frame, with the slides among them drawn out [m]. ()
-    """
-
-    root: Float[Array, "3"]
-    slides: Float[Array, "k 3"]
-    length: Float[Array, ""]
+    root: Float[Array, "3"]  # the first hinge's position with the slides before it in the middle of their ranges [m]
+    slides: Float[Array, "k 3"]  # half the travel of each of these slides, along its direction in the world [m]
+    length: Float[Array, ""]  # of the links from there to the frame, with the slides among them drawn out [m]
 
 
 def reaches(chain: Chain, lower: Array, upper: Array) -> list[Reach]:

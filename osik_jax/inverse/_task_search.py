@@ -48,15 +48,10 @@ _SPREADS = 8
 
 
 class Aims(NamedTuple):
-    """Targets of the tasks of one search, where a batch has many.
+    """Targets of the tasks of one search, where a batch has many."""
 
-    Attributes:
-        number: number of the target in the batch.
-        targets: targets by name of the task; other tasks keep their own.
-    """
-
-    number: Int[Array, "*n"]
-    targets: dict[str, Any]
+    number: Int[Array, "*n"]  # number of the target in the batch
+    targets: dict[str, Any]  # targets by name of the task; other tasks keep their own
 
 
 class TaskSearch(eqx.Module):
@@ -64,40 +59,23 @@ class TaskSearch(eqx.Module):
 
     The tasks' own curvature, as damping, keeps long steps in check. Tasks that are no goals fade out as the goals are
     met, so that a posture decides between solutions and never keeps the goals from being met.
-
-    Attributes:
-        robot: the robot.
-        turns: of each entry of q, whether a whole turn of it changes no task (static).
-        tasks: all of them, gains 1.
-        scheme: whose steps are taken.
-        limits: on configurations.
-        first: where search 0 starts. (nq,)
-        low: of where searches start, of each entry of q. (nq,)
-        high: (nq,)
-        lower: limits of each entry of q, -inf where free. (nq,)
-        upper: (nq,)
-        angles: greatest angles of ball joints, in their three entries of v, inf where free. (nv,)
-        shift: of the sequence of starts. (nq,)
-        tolerance: of position [m] and orientation [rad]. (2,)
-        enough: score at which a search stays where it is. ()
-        preferred: largest gain of the preferences. ()
     """
 
     robot: Robot
-    turns: tuple[bool, ...] = eqx.field(static=True)
-    tasks: dict[str, Task]
-    scheme: Scheme
-    limits: tuple[Limit, ...]
-    first: Float[Array, " nq"]
-    low: Float[Array, " nq"]
+    turns: tuple[bool, ...] = eqx.field(static=True)  # of each entry of q, whether a whole turn of it changes no task
+    tasks: dict[str, Task]  # all of them, gains 1
+    scheme: Scheme  # whose steps are taken
+    limits: tuple[Limit, ...]  # on configurations
+    first: Float[Array, " nq"]  # where search 0 starts
+    low: Float[Array, " nq"]  # of where searches start, of each entry of q
     high: Float[Array, " nq"]
-    lower: Float[Array, " nq"]
+    lower: Float[Array, " nq"]  # limits of each entry of q, -inf where free
     upper: Float[Array, " nq"]
-    angles: Float[Array, " nv"]
-    shift: UInt[Array, " nq"]
-    tolerance: Float[Array, "2"]
-    enough: Float[Array, ""]
-    preferred: Float[Array, ""]
+    angles: Float[Array, " nv"]  # greatest angles of ball joints, in their three entries of v, inf where free
+    shift: UInt[Array, " nq"]  # of the sequence of starts
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad]
+    enough: Float[Array, ""]  # score at which a search stays where it is
+    preferred: Float[Array, ""]  # largest gain of the preferences
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
         """Return the starts of the searches: the first configuration, then points at growing distances from it."""

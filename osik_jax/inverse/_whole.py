@@ -42,34 +42,23 @@ _STILL = 1e-9
 
 
 class Whole(NamedTuple):
-    """Results of whole searches.
+    """Results of whole searches."""
 
-    Attributes:
-        answer: the answers, as of ``ChainRoute.answer``.
-        score: of the answers, where all searches run. (targets,)
-        ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
-        pair: with a scene, numbers of the two shapes of the nearest pair, and why there is no free solution, as in
-            ``core/freedom.hpp``. (targets, 3)
-    """
-
-    answer: InverseKinematicsSolution
-    score: Float[Array, "*targets"] | None
+    answer: InverseKinematicsSolution  # the answers, as of ``ChainRoute.answer``
+    score: Float[Array, "*targets"] | None  # of the answers, where all searches run
+    # with ``every``, of each search its end point, the score there, and whether it is an isolated solution
     ends: Float[Array, "*targets seeds n_and_2"] | None
+    # with a scene, numbers of the two shapes of the nearest pair, and why there is no free solution, as in
+    # ``core/freedom.hpp``
     pair: Int[Array, "*targets 3"] | None = None
 
 
 class Around(NamedTuple):
-    """Arrays of the robot's shapes and of the obstacles for the core.
+    """Arrays of the robot's shapes and of the obstacles for the core."""
 
-    Attributes:
-        robot: its shapes.
-        scene: the obstacles.
-        clearance: distance that all pairs keep [m]. (1,)
-    """
-
-    robot: CoreRobot
-    scene: CoreScene
-    clearance: Float[Array, "1"] | np.ndarray
+    robot: CoreRobot  # its shapes
+    scene: CoreScene  # the obstacles
+    clearance: Float[Array, "1"] | np.ndarray  # distance that all pairs keep [m]
 
 
 class _Known(NamedTuple):

@@ -28,25 +28,15 @@ _NUMBERS = 8_000_000
 
 
 class Task(NamedTuple):
-    """Poses, obstacles and settings by which bases are compared.
-
-    Attributes:
-        robot: the robot.
-        frames: those that the poses are of, with their kinematics.
-        rows: of each frame, which rows of its pose count.
-        goal: the poses, in world axes. (poses, frames, ...)
-        scene: in world axes; None: collisions do not count.
-        settings: other arguments of ``inverse_kinematics``.
-        search: the coordinates that move the frames, with their limits.
-    """
+    """Poses, obstacles and settings by which bases are compared."""
 
     robot: Robot
-    frames: tuple[Frame, ...]
-    rows: tuple[tuple[bool, ...], ...]
-    goal: Goal
-    scene: Scene | None
-    settings: dict[str, Any]
-    search: ChainSearch
+    frames: tuple[Frame, ...]  # those that the poses are of, with their kinematics
+    rows: tuple[tuple[bool, ...], ...]  # of each frame, which rows of its pose count
+    goal: Goal  # the poses, in world axes; (poses, frames, ...)
+    scene: Scene | None  # in world axes; None: collisions do not count
+    settings: dict[str, Any]  # other arguments of ``inverse_kinematics``
+    search: ChainSearch  # the coordinates that move the frames, with their limits
 
     @property
     def entries(self) -> np.ndarray:
@@ -55,19 +45,13 @@ class Task(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Scores of bases, the last axis of each array is that of the poses.
+    """Scores of bases, the last axis of each array is that of the poses."""
 
-    Attributes:
-        reached: whether a configuration is found for each pose. (n, poses)
-        margin: distance of the nearest joint from its limit, over the joint's range; NaN if none is found. (n, poses)
-        manipulability: Yoshikawa's index, the smallest of the frames; NaN if none is found. (n, poses)
-        q: the configurations; NaN if none is found. (n, poses, nq)
-    """
-
-    reached: Bool[np.ndarray, "n poses"]
+    reached: Bool[np.ndarray, "n poses"]  # whether a configuration is found for each pose
+    # distance of the nearest joint from its limit, over the joint's range; NaN if none is found
     margin: Float[np.ndarray, "n poses"]
-    manipulability: Float[np.ndarray, "n poses"]
-    q: Float[np.ndarray, "n poses nq"]
+    manipulability: Float[np.ndarray, "n poses"]  # Yoshikawa's index, the smallest of the frames; NaN if none is found
+    q: Float[np.ndarray, "n poses nq"]  # the configurations; NaN if none is found
 
     @classmethod
     def empty(cls, task: Task, count: int) -> Scores:

@@ -134,19 +134,12 @@ def place_robots(found: Mapping[str, Placement]) -> Team:
 
 @dataclasses.dataclass(frozen=True)
 class Member:
-    """A robot that is placed among others.
+    """A robot that is placed among others."""
 
-    Attributes:
-        task: its poses and scene.
-        home: its configuration while others work. (nq,)
-        bases: those of its grid that reach a pose. (n, 4)
-        reaches: which poses they reach. (n, poses)
-    """
-
-    task: Task
-    home: np.ndarray
-    bases: np.ndarray
-    reaches: np.ndarray
+    task: Task  # its poses and scene
+    home: Float[np.ndarray, " nq"]  # its configuration while others work
+    bases: Float[np.ndarray, "n 4"]  # those of its grid that reach a pose
+    reaches: Bool[np.ndarray, "n poses"]  # which poses they reach
 
     @classmethod
     def of(cls, found: Placement) -> Member:
