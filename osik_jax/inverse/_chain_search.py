@@ -78,7 +78,6 @@ class ChainSearch(eqx.Module):
 
     def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return the starts of the searches with these indices."""
-        del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         if self.near:
             ratio = jnp.minimum(seed.astype(points.dtype) / self.seeds, 1.0)[:, None]
@@ -163,10 +162,13 @@ class ChainSearch(eqx.Module):
 
     def sizes(self, error: Float[Array, " m"]) -> Float[Array, "2"]:
         """Return the largest position error [m] and orientation error [rad] of the used rows."""
-        rows = np.array(self.rows)
-        scale = jnp.where(np.arange(6) < 3, 1.0, self.length)[None].repeat(len(rows), 0)[rows]
-        off = jnp.zeros(rows.shape, error.dtype).at[np.nonzero(rows)].set(error / scale)
-        return greatest(jax.vmap(jax.vmap(safe_norm))(off.reshape(-1, 2, 3)).T)
+        return greatest(jax.vmap(jax.vmap(safe_norm))(self.by_frame(error[:, None]).reshape(-1, 2, 3)).T)
+
+    def by_frame(self, error: Float[Array, "m lanes"]) -> Float[Array, "frames 6 lanes"]:
+        """Return the errors of the used rows [m] as those of all rows [m, rad]; 0 in rows that are not used."""
+        used = np.nonzero(np.array(self.rows))
+        scale = jnp.where(used[1] < 3, 1.0, self.length)[:, None]
+        return jnp.zeros((len(self.rows), 6, error.shape[1]), error.dtype).at[used].set(error / scale)
 
     def polished(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return solutions after one more step where that lowers the error; other configurations stay."""

@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._implicit import attached
 from ._pool import Errors, Search
 from ._solution import InverseKinematicsSolution
 
@@ -104,11 +103,6 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
         good = score <= bound
         best = jnp.where(good.any(-1), jnp.argmin(jnp.where(good, order, jnp.inf), -1), best)
     return best.astype(jnp.int32)
-
-
-def at_solution(search: Any, goal: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x, the result of an undifferentiated search, with the derivative of a solution."""
-    return attached(jax.lax.stop_gradient(x), search, goal)
 
 
 def or_far(answer: InverseKinematicsSolution, valid: Bool[Array, " targets"]) -> InverseKinematicsSolution:

@@ -34,8 +34,8 @@ from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
-from ._chain_problem import ChainRoute, Settings, answer, dof_of_entries
+from ..robot._joint_selection import dof_names, dof_of_entries
+from ._chain_problem import ChainRoute, Settings, answer
 from ._chain_search import Goal
 from ._fixed import Explored, Searches, or_far, with_placeholders
 from ._run import split

@@ -21,6 +21,7 @@ from ._host import in_chunks, lanes_for, only
 from ._packed import Packed, packed, unpacked
 from ._pool import CHECK, Errors, run_pool
 from ._solution import InverseKinematicsSolution
+from ._task_minimum import settled
 from ._whole import whole, whole_is_possible
 
 _HOPELESS = 16
@@ -278,7 +279,7 @@ def explored(
         if not go_on:
             return outcomes, alone, Closest(x, jnp.zeros_like(score), best, jnp.zeros_like(best))
         if not route.starts_anew:
-            rest, more = fixed_search.settled(x, goals, loose)
+            rest, more = settled(fixed_search, x, goals, loose)
             takes = unmet | (jax.vmap(fixed_search.errors)(rest, goals)[1].score <= 1.0)
             return outcomes, alone, Closest(jnp.where(takes[:, None], rest, x), jnp.zeros_like(score), best, more)
         # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch

@@ -16,7 +16,7 @@ from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..numerics._arguments import numbers_for
 from ..robot import Robot
-from ..robot._joint_selection import scalar_layout
+from ..robot._joint_selection import dof_of_entries
 from ..robot._ranges import independent_balls, with_balls_inside
 from ..schemes import Scheme, VelocityProblem
 from ..tasks import Task, TaskRows
@@ -24,7 +24,7 @@ from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
 from ._pool import Errors
 from ._seeds import unit_points
-from ._task_minimum import has_minimum, ranks, rate_at_rest, settled
+from ._task_minimum import has_minimum, ranks, rate_at_rest
 from ._turns import unwound
 
 _LONGEST = 1.0
@@ -79,7 +79,6 @@ class TaskSearch(eqx.Module):
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
         """Return the starts of the searches: the first configuration, then points at growing distances from it."""
-        del goal
         unit = unit_points(self.shift, seed, self.low.dtype)
         points = self.low + (self.high - self.low) * unit
         ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
@@ -133,12 +132,6 @@ class TaskSearch(eqx.Module):
         reached = self.errors(q, goal)[1].score <= self.enough
         return jnp.where(reached, along, rate_at_rest(self, q, goal, rates))
 
-    def settled(
-        self, q: Float[Array, "lanes nq"], goal: Aims, open_: Bool[Array, " lanes"]
-    ) -> tuple[Float[Array, "lanes nq"], Int[Array, " lanes"]]:
-        """Return the configurations of least error that q leads to, for goals of one level, and the steps taken."""
-        return settled(self, q, goal, open_)
-
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
         """Return the rows of the goals at q, and their errors."""
         goals = goals_of(self.aimed(goal))
@@ -172,10 +165,7 @@ class TaskSearch(eqx.Module):
 
     def aimed(self, goal: Aims) -> dict[str, Task]:
         """Return the tasks with a goal's targets."""
-        return {
-            **self.tasks,
-            **{name: self.tasks[name].replace(target=target) for name, target in goal.targets.items()},
-        }
+        return self.tasks | {name: self.tasks[name].replace(target=target) for name, target in goal.targets.items()}
 
     def distance(self, q: Float[Array, " nq"]) -> Float[Array, ""]:
         """Return the distance from the first configuration, over v."""
@@ -292,7 +282,5 @@ def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
 
 def entry_limits(robot: Robot, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the limits of each entry of q, from those of each entry of v."""
-    scalar, index = scalar_layout(robot)
-    dof, numbers = np.full(robot.nq, -1), numbers_for(lower, upper)
-    dof[index[scalar]] = np.flatnonzero(scalar)
+    dof, numbers = dof_of_entries(robot), numbers_for(lower, upper)
     return numbers.where(dof >= 0, lower[dof], -np.inf), numbers.where(dof >= 0, upper[dof], np.inf)

@@ -37,9 +37,26 @@ def unwound(
     return numbers.where(np.array(turns) & (number != 0.0), moved, x).astype(x.dtype)
 
 
-def one_turn(
-    lower: Float[Array, " n"], upper: Float[Array, " n"], about: Float[Array, " n"]
+def starting_range(
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    first: Float[Array, " n"],
+    width: Float[np.ndarray, " n"],
+    turns: Sequence[bool],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return bounds one turn apart within wider limits, centred on a configuration as far as possible."""
-    low = jnp.clip(about - 0.5 * TURN, lower, upper - TURN)
-    return low, low + TURN
+    """Return finite ranges for the starts of searches: the limits, one turn, or a width around a configuration.
+
+    Args:
+        lower: limits, -inf where free [rad or m].
+        upper: likewise.
+        first: the configuration on which a range without limits, or of one turn, is centred as far as possible.
+        width: half the range where a limit is missing [rad or m].
+        turns: of each coordinate, whether a whole turn changes no pose.
+    """
+    free = jnp.isinf(lower) | jnp.isinf(upper)
+    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
+    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
+    # beyond a whole turn, starts would repeat the same poses
+    wide = np.array(turns) & (upper - lower > TURN)
+    once = jnp.clip(first - 0.5 * TURN, lower, upper - TURN)
+    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, once + TURN, high).astype(first.dtype)

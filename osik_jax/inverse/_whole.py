@@ -21,9 +21,9 @@ from ..execution._platform import cuda_is_default
 from ..numerics._constants import SINGLE_TOUCH, TOUCH
 from ..numerics._remembered import remembered
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import dof_names, dof_of_entries
 from ._chain_kernel import integers_of, numbers_of
-from ._chain_problem import STOPPED, ChainRoute, Settings, carried, dof_of_entries, search_of
+from ._chain_problem import STOPPED, ChainRoute, Settings, carried, search_of
 from ._chain_search import DAMPING, LEAST_DAMPING, ChainSearch, Goal
 from ._fixed import LAST, SETTLED, Searches, or_far, with_placeholders
 from ._linear import ISOLATED
