@@ -64,21 +64,20 @@ class _State(NamedTuple):
 def fit(
     rows_of: Callable[[Array], Rows],
     fixed_rows: Callable[[Array], Rows],
-    start: Float[Array, " p"],
     precision: Float[Array, " p"],
     loss: Loss,
     limit: int,
 ) -> Fit:
-    """Minimise the loss of the rows plus ``precision * change^2``.
+    """Minimise the loss of the rows plus ``precision * change^2``, from no change.
 
     Args:
         rows_of: rows at a change, which carry derivatives by robot and readings.
         fixed_rows: the same without, for the search.
-        start: first change. (p,)
         precision: of the prior of each unknown, 1 / variance. (p,)
         loss: how readings are weighted.
         limit: greatest number of iterations.
     """
+    start = jnp.zeros_like(precision)
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.5
 
     def advance(state: _State) -> _State:
@@ -159,10 +158,8 @@ def is_negligible(size: Float[Array, " p"]) -> Bool[Array, " p"]:
 
 
 def _cost(rows: Rows, weights: tuple[Array, ...], precision: Array, change: Array) -> Array:
-    total = (precision * change**2).sum()
-    for r, w in zip(rows, weights, strict=True):
-        total = total + (w[:, None] * r**2).sum()
-    return total
+    parts = ((w[:, None] * r**2).sum() for r, w in zip(rows, weights, strict=True))
+    return sum(parts, (precision * change**2).sum())
 
 
 def _lengths(rows: Rows, loss: Loss) -> tuple[Array, ...]:

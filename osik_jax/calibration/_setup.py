@@ -89,13 +89,7 @@ class Setup(eqx.Module):
 
 
 def make_setup(robot: Robot, frames: Mapping[str, FixedFrame], base: FixedFrame | None) -> Setup:
-    """Return a robot with fixed frames in its precision.
-
-    Raises:
-        KeyError: the parent of a fixed frame is no frame of the robot.
-        TypeError: no ``FixedFrame``.
-        ValueError: a fixed frame has the name of a frame of the robot, or the base has a parent.
-    """
+    """Return a robot with fixed frames in its precision, checked."""
     for name, frame in {"base": base or FixedFrame(), **frames}.items():
         if not isinstance(frame, FixedFrame):
             raise OsikTypeError(f"frame {name!r} is a {type(frame).__name__}; it is a calibration.FixedFrame")

@@ -28,15 +28,10 @@ class Coordinates:
 
 
 def all_solutions(explored: Explored, alone: Bool[np.ndarray, " targets"], own: Coordinates) -> dict[str, np.ndarray]:
-    """Return the solutions that differ, ``q`` first, then the other branches, then their copies by whole turns.
+    """Return the fields ``solutions``, ``count``, ``branches`` and ``isolated`` of the answers.
 
-    Args:
-        explored: the results of all searches.
-        alone: whether each answer ``q`` is an isolated solution.
-        own: the coordinates.
-
-    Returns:
-        The fields ``solutions``, ``count``, ``branches`` and ``isolated`` of the answers.
+    The solutions are ``q`` first, then the other branches, then their copies by whole turns. ``alone``: whether each
+    answer ``q`` is an isolated solution.
     """
     found, isolated = explored.found, np.asarray(explored.isolated)
     score, x, q = np.asarray(explored.outcomes.errors.score), np.asarray(explored.outcomes.x), np.asarray(found.q)

@@ -143,11 +143,11 @@ def _motions(
     skew = jnp.stack([jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], -2)
     sine, versine = compose(turn, skew), compose(turn, compose(skew, skew))
     slide = rotate(turn, axis)
-    hinge, none = hinges[:, None], jnp.zeros_like(slide)
+    hinge = hinges[:, None]
     constant = jnp.concatenate([turn, position[..., None]], -1)
     moved = jnp.where(hinge, -rotate(sine, anchor), slide)
     first = jnp.concatenate([jnp.where(hinge[..., None], sine, 0.0), moved[..., None]], -1)
-    again = jnp.where(hinge, -rotate(versine, anchor), none)
+    again = jnp.where(hinge, -rotate(versine, anchor), 0.0)
     second = jnp.concatenate([jnp.where(hinge[..., None], versine, 0.0), again[..., None]], -1)
     return constant, first, second
 
@@ -162,12 +162,9 @@ class ChainKinematics(NamedTuple):
 
 
 def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"], *, unrolled: bool = False) -> ChainKinematics:
-    """Return forward kinematics of the chain.
+    """Return forward kinematics of the chain at entries ``layout.dofs`` of configurations.
 
-    Args:
-        chain: the chain.
-        x: entries ``layout.dofs`` of configurations.
-        unrolled: whether the joints are no loop of the program, for derivatives in reverse.
+    ``unrolled``: whether the joints are no loop of the program, for derivatives in reverse.
     """
     layout = chain.layout
     local = _local_poses(chain, x)
@@ -268,8 +265,6 @@ def curvature(
     matrix and ``c = (1 - (t / 2) cot(t / 2)) / t^2`` for an angle t.
 
     Args:
-        chain: the chain.
-        kinematics: of it.
         linear: position error of each frame [m].
         angular: orientation error of each frame, axis times angle [rad]; 0 where the orientation is free.
         radian: what a radian of it counts as [m].

@@ -32,8 +32,6 @@ def closest(
     groups, and the best of each group goes on.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
         x: where each search has led.
         open_: targets that are not met; the others are left alone.
         near: of equally good optima, whether to take the nearest to the first configuration, not the first one.

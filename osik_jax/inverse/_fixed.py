@@ -39,8 +39,8 @@ class Explored(NamedTuple):
     """Results of all searches of each target."""
 
     found: InverseKinematicsSolution  # the best
-    outcomes: Any  # their ends; None where the core computed the best alone
-    isolated: Any  # with ``every``, whether these are isolated solutions, else None; (targets, seeds)
+    outcomes: Any = None  # their ends; None where the core computed the best alone
+    isolated: Any = None  # with ``every``, whether these are isolated solutions, else None; (targets, seeds)
 
 
 def search_all(
@@ -55,10 +55,7 @@ def search_all(
     """Run ``seeds`` searches of ``steps`` steps for each target.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
-        seeds: searches for each target.
-        steps: of each; traced where it may be 0, for searches that are not needed.
+        steps: of each search; traced where it may be 0, for searches that are not needed.
         last: the method of a few more steps at the end, if another.
         starts: where the searches start. Default: where the method begins.
     """

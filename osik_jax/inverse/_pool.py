@@ -80,8 +80,6 @@ def run_pool(
     Deterministic: which search a lane takes up depends on nothing but the arguments.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
         open_: targets that are looked for; the others, which fill up a batch, are left alone.
         lanes: searches that go on at the same time.
         check: steps between two looks at how they are doing.

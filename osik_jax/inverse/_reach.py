@@ -59,10 +59,7 @@ def beyond(
 ) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace [m]; 0 where it may be inside.
 
-    Args:
-        reaches: of the frames.
-        position: wanted of each frame [m].
-        asked: whether the whole position of each frame counts. (frames,)
+    ``asked``: whether the whole position of each frame counts. (frames,)
     """
     away = jnp.stack([_outside(reach, position[:, at]) for at, reach in enumerate(reaches)], -1)
     return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(away) & asked, away, 0.0), -1), 0.0)

@@ -49,26 +49,22 @@ def searched(
     ``go_on``: to the configuration with the least error, for targets that are not met. ``wanted``: the targets that are
     searched for; default: all.
     """
-    lanes = lanes_for(len(jax.tree.leaves(goals)[0]))
-    run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
-    hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route, every=False)
+    count, hopeless = len(jax.tree.leaves(goals)[0]), 1 if go_on else _HOPELESS
+    lanes, by_core = lanes_for(count), whole_is_possible(route, every=False)
 
-    def by_the_core(goals: Any, most: np.ndarray) -> InverseKinematicsSolution:
-        how = Searches(0, warm, near=False, every=False)
-        return whole(robot, route, goals, settings, most, hopeless, steps, how, single=False).answer
+    def by(most: int, goals: Any, left: np.ndarray) -> InverseKinematicsSolution:
+        if by_core:
+            counts, how = np.where(left, most, 0), Searches(0, warm, near=False, every=False)
+            return whole(robot, route, goals, settings, counts, hopeless, steps, how, single=False).answer
+        given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
+        return unpacked(jax.device_get(_pooled(robot, given, route=route, warm=warm, lanes=lanes)))
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
-        def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
-            if by_core:
-                return jax.tree.map(np.asarray, by_the_core(goals, np.where(left, most, 0)))
-            given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
-            return unpacked(jax.device_get(run(given)))
-
         alone = warm and not by_core
-        found = by(1 if alone else seeds, wanted)
+        found = jax.device_get(by(1 if alone else seeds, goals, wanted))
         left = wanted & ~found.converged
         if alone and left.any():
-            found = _with(found, left, by(seeds, left))
+            found = _with(found, left, by(seeds, goals, left))
             left &= ~found.converged
         return further(goals, found, left)
 
@@ -85,10 +81,10 @@ def searched(
         return _with(found, left, own)
 
     if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
-        found = by_the_core(goals, np.full(len(goals.position), seeds))
+        found = by(seeds, goals, np.ones(count, bool))
         missed = ~np.asarray(found.converged)
         return further(goals, jax.device_get(found), missed) if missed.any() else found
-    wanted = np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted
+    wanted = np.ones(count, bool) if wanted is None else wanted
     return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
 
 
@@ -102,7 +98,7 @@ def found_at_once(
     found, score, ends, *_ = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
     if not (found.converged and (score is None or score <= ENOUGH)):
         return None
-    return Explored(found, *split(None if ends is None else np.asarray(ends)[None]))
+    return with_ends(found, None if ends is None else np.asarray(ends)[None])
 
 
 def explored_by_core(
@@ -126,14 +122,14 @@ def explored_by_core(
         by_jax = only(further, lambda goals: run(goals, go_on=True, fall_back=False).found, goals)
         kept = found.converged & how.near & (_distances(found, settings) < _distances(by_jax, settings))
         found = _with(found, further & ~kept, by_jax)
-    return Explored(found, *split(ends))
+    return with_ends(found, ends)
 
 
-def split(ends: Any) -> tuple[Outcomes | None, Any]:
-    """Return the ends of all searches by ``whole``, and whether they are isolated solutions."""
+def with_ends(found: InverseKinematicsSolution, ends: Any) -> Explored:
+    """Return answers with the ends of all searches by ``whole``, if there are any."""
     if ends is None:
-        return None, None
-    return Outcomes(ends[..., :-2], Errors(*[ends[..., -2]] * 4)), ends[..., -1] > 0.0
+        return Explored(found)
+    return Explored(found, Outcomes(ends[..., :-2], Errors(*[ends[..., -2]] * 4)), ends[..., -1] > 0.0)
 
 
 def isolated_at_answers(

@@ -22,12 +22,7 @@ def unwound(
 ) -> Float[Array, "*lanes n"]:
     """Add whole turns to coordinates within their limits, so that they are as near as possible to a configuration.
 
-    Args:
-        x: coordinates within the limits [rad or m].
-        about: the configuration [rad or m].
-        lower: limits, -inf where free.
-        upper: likewise.
-        turns: of each coordinate, whether a whole turn changes no pose.
+    ``turns``: of each coordinate, whether a whole turn changes no pose. Limits are -inf and inf where free [rad or m].
     """
     # the numbers of turns that stay inside the limits; infinite limits allow any number
     numbers = numbers_for(x, about, lower, upper)
@@ -44,14 +39,9 @@ def starting_range(
     width: Float[np.ndarray, " n"],
     turns: Sequence[bool],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return finite ranges for the starts of searches: the limits, one turn, or a width around a configuration.
+    """Return finite ranges for the starts of searches: the limits, one turn, or a width where a limit is missing.
 
-    Args:
-        lower: limits, -inf where free [rad or m].
-        upper: likewise.
-        first: the configuration on which a range without limits, or of one turn, is centred as far as possible.
-        width: half the range where a limit is missing [rad or m].
-        turns: of each coordinate, whether a whole turn changes no pose.
+    The last two are centred on the configuration ``first``, as far as the limits allow. Arguments as in ``unwound``.
     """
     free = jnp.isinf(lower) | jnp.isinf(upper)
     low = jnp.where(free, jnp.maximum(first - width, lower), lower)

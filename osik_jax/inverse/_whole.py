@@ -94,10 +94,6 @@ def whole(
     """Return the results of whole searches.
 
     Args:
-        robot: the robot.
-        route: its frames.
-        goals: the targets.
-        settings: numbers, without ``parts``.
         most: number of searches for each target at most, where they do not all run. (targets,)
         hopeless: the same for targets that are out of reach.
         steps: of one search at most.

@@ -105,10 +105,7 @@ def score_grid(task: Task, bases: Float[np.ndarray, "n 4"]) -> Scores:
 def score_bases(task: Task, bases: Float[np.ndarray, "n 4"], *, every: bool = False) -> Scores:
     """Return the scores of bases after all searches for all poses.
 
-    Args:
-        task: the poses and the scene.
-        bases: x, y, yaw, height. (n, 4)
-        every: take the configuration with the largest margin of all that are found, not the first one.
+    ``every``: take the configuration with the largest margin of all that are found, not the first one.
     """
     scores = Scores.empty(task, len(bases))
     pairs = np.indices(scores.reached.shape).reshape(2, -1)
@@ -135,12 +132,10 @@ def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndar
     count = len(base)
     if not count:
         return Scores(*(field[base, pose] for field in Scores.empty(task, len(bases))))
-    each = (
-        1
-        if task.scene is None
-        else task.scene.capacity * (task.scene.capacity + 100) + 3 * len(task.scene.table.vertices)
-    )
     few, many = _PAIRS
+    each, scene = 1, task.scene  # entries of the scene of a pair
+    if scene is not None:
+        each = scene.capacity * (scene.capacity + 100) + 3 * len(scene.table.vertices)
     size = few if count <= 8 * few or each * many > _NUMBERS else many
     padded = np.arange(-(-count // size) * size) % count  # the last call has the first pairs again
     parts = []
@@ -157,10 +152,8 @@ def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndar
 def _roomiest(task: Task, found: InverseKinematicsSolution) -> np.ndarray:
     """Return the solution with the largest margin of each answer."""
     others = np.asarray(found.solutions)
-    pick = np.nan_to_num(joint_margin(task.search, others[..., task.entries]), nan=-1.0).argmax(
-        -1
-    )  # rows without a solution are NaN
-    return np.take_along_axis(others, pick[:, None, None], 1)[:, 0]
+    margin = np.nan_to_num(joint_margin(task.search, others[..., task.entries]), nan=-1.0)  # of rows without a solution
+    return np.take_along_axis(others, margin.argmax(-1)[:, None, None], 1)[:, 0]
 
 
 def solve_pairs(
