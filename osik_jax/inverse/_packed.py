@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,6 +25,11 @@ class Packed:
     words: Int[Array | np.ndarray, " k"]  # numbers of its packed leaves one after another, as integers of 32 bits
     apart: tuple[Array, ...]  # its leaves that are not packed
     form: Any  # shape and type of each leaf, the type None for a leaf that is apart; and the structure (static)
+
+
+def call_packed(program: Callable[[Packed], Packed], *given: Any) -> Any:
+    """Return NumPy's results of a program whose arguments and results are one array each on their way."""
+    return unpacked(jax.device_get(program(packed(given))))
 
 
 def packed(tree: Any) -> Packed:

@@ -18,7 +18,7 @@ from ._chain_problem import ENOUGH, Settings
 from ._closest import Closest, closest
 from ._fixed import LAST, Explored, Outcomes, Searches, choose, or_far, or_plain, search_all, with_placeholders
 from ._host import in_chunks, lanes_for, only
-from ._packed import Packed, packed, unpacked
+from ._packed import Packed, call_packed, packed, unpacked
 from ._pool import CHECK, Errors, run_pool
 from ._solution import InverseKinematicsSolution
 from ._task_minimum import settled
@@ -56,8 +56,8 @@ def searched(
         if by_core:
             counts, how = np.where(left, most, 0), Searches(0, warm, near=False, every=False)
             return whole(robot, route, goals, settings, counts, hopeless, steps, how, single=False).answer
-        given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
-        return unpacked(jax.device_get(_pooled(robot, given, route=route, warm=warm, lanes=lanes)))
+        run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
+        return call_packed(run, goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps))
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
         alone = warm and not by_core
@@ -72,12 +72,8 @@ def searched(
         if not (go_on and left.any()):
             return found
         starts = min(seeds, _STARTS)
-        run_on = partial(_approached, robot, route=route, warm=warm, starts=starts)
-
-        def approach(*args: Any) -> InverseKinematicsSolution:
-            return unpacked(jax.device_get(run_on(packed((settings, *args)))))
-
-        own = only(left, approach, goals, found.q, found.seed, found.steps)
+        approach = partial(_approached, robot, route=route, warm=warm, starts=starts)
+        own = only(left, partial(call_packed, approach, settings), goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
     if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
@@ -178,11 +174,8 @@ def searched_on(
     new = dataclasses.replace(new, steps=found.steps + new.steps)
     left &= np.asarray(new.converged)
     if near and left.any():
-
-        def walk(*args: Any) -> InverseKinematicsSolution:
-            return unpacked(jax.device_get(_walked_home(robot, packed((settings, *args)), route=route, steps=steps)))
-
-        home = only(left, walk, goals, new.q, new.seed, new.steps)
+        walk = partial(_walked_home, robot, route=route, steps=steps)
+        home = only(left, partial(call_packed, walk, settings), goals, new.q, new.seed, new.steps)
         new = _with(new, np.asarray(home.converged) & (_distances(home, settings) < _distances(new, settings)), home)
     return _with(found, left & ~(met & (_distances(found, settings) <= _distances(new, settings))), new)
 
