@@ -177,13 +177,7 @@ def find_free_by_steps(
 
 
 def _traced(
-    robot: Robot,
-    goals: Goal,
-    settings: Settings,
-    most: int,
-    steps: int,
-    how: Searches,
-    obstacles: Obstacles,
+    robot: Robot, goals: Goal, settings: Settings, most: int, steps: int, how: Searches, obstacles: Obstacles
 ) -> InverseKinematicsSolution:
     """Return the answers as differentiable functions of what is traced; pairs have no names there."""
     route, (goals, valid) = obstacles.route, with_placeholders(goals)

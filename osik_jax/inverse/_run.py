@@ -98,15 +98,7 @@ def found_at_once(
 
 
 def explored_by_core(
-    robot: Robot,
-    goals: Any,
-    *,
-    most: int,
-    settings: Settings,
-    how: Searches,
-    steps: int,
-    route: Any,
-    go_on: bool,
+    robot: Robot, goals: Any, *, most: int, settings: Settings, how: Searches, steps: int, route: Any, go_on: bool
 ) -> Explored:
     """Return what ``explored`` does. Only targets that go on to the least error are computed by it."""
     count = np.full(len(goals.position), most)
@@ -232,15 +224,7 @@ def _walked_home(robot: Robot, given: Packed, *, route: Any, steps: int) -> Pack
 
 @partial(jax.jit, static_argnames=("how", "route", "steps", "go_on", "fall_back"))
 def explored(
-    robot: Robot,
-    goals: Any,
-    *,
-    settings: Settings,
-    how: Searches,
-    route: Any,
-    steps: int,
-    go_on: bool,
-    fall_back: bool,
+    robot: Robot, goals: Any, *, settings: Settings, how: Searches, route: Any, steps: int, go_on: bool, fall_back: bool
 ) -> Explored:
     """Return the results of all searches of each target.
 

@@ -233,12 +233,7 @@ def by_core(
 
 
 def gone_on(
-    call: Callable[..., list[Array]],
-    found: list[Array],
-    left: Array,
-    members: int,
-    *lanes: Array,
-    enough: int = 0,
+    call: Callable[..., list[Array]], found: list[Array], left: Array, members: int, *lanes: Array, enough: int = 0
 ) -> tuple[list[Array], Array]:
     """Return ``found`` with what ``call(members, *lanes)`` finds for the targets that are left, and which still are.
 
