@@ -20,7 +20,7 @@ from ._chain_kernel import advanced
 from ._error import rotation_error
 from ._linear import ISOLATED, positive_pivot, solve_positive
 from ._minimum import inverse_hessian, minimum
-from ._pool import Errors
+from ._pool import Errors, stepped
 from ._reach import Reach
 from ._seeds import unit_points
 from ._turns import unwound
@@ -95,15 +95,7 @@ class ChainSearch(eqx.Module):
     def advance_plain(self, x: Float[Array, "lanes n"], goal: Goal, steps: Any) -> tuple[Array, Array, Errors]:
         """Return what ``advance`` does, by plain JAX."""
         turned = lanes_last(goal)
-
-        def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
-            at = carry[1]
-            after, errors = self.step(at, turned)
-            return at, after, errors
-
-        nothing = jnp.zeros(len(x), x.dtype)
-        start = x.T, x.T, Errors(nothing, nothing, nothing, nothing)
-        here, there, errors = jax.lax.fori_loop(0, steps, step, start)
+        here, there, errors = stepped(lambda x: self.step(x, turned), x.T, len(x), steps)
         return here.T, there.T, errors
 
     def step(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Float[Array, "n lanes"], Errors]:

@@ -34,8 +34,8 @@ def lanes_for(targets: int) -> int:
 def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
     """Return ``function(goals, open)`` of chunks of targets, one after another, as NumPy arrays.
 
-    ``open``: which targets of a chunk are looked for, and are not there to fill it up. The results do not depend on the
-    number of threads.
+    ``open``: which targets of a chunk are looked for; the others fill it up. The results do not depend on the number of
+    threads.
     """
     count = len(jax.tree.leaves(goals)[0])
     size = min(_power_of_two(count), _CHUNK.get(jax.default_backend(), _OTHER_CHUNK))

@@ -28,7 +28,7 @@ class Packed:
 
 
 def call_packed(program: Callable[[Packed], Packed], *given: Any) -> Any:
-    """Return NumPy's results of a program whose arguments and results are one array each on their way."""
+    """Run a program with its arguments packed in one array; return its results as NumPy arrays."""
     return unpacked(jax.device_get(program(packed(given))))
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,17 @@ class Errors(NamedTuple):
     cost: Float[Array, "..."]  # what the steps reduce
 
 
-@runtime_checkable
+def stepped(
+    step: Callable[[Array], tuple[Array, Errors]], x: Float[Array, "..."], lanes: int, steps: Any
+) -> tuple[Array, Array, Errors]:
+    """Return start and end of the last of some steps, and the errors at its start, for a number of lanes."""
+
+    def once(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
+        return carry[1], *step(carry[1])
+
+    return jax.lax.fori_loop(0, steps, once, (x, x, Errors(*[jnp.zeros(lanes, x.dtype)] * 4)))
+
+
 class Search(Protocol):
     """Base class of a search: a pytree whose methods take arrays with a leading axis of lanes."""
 

@@ -52,7 +52,7 @@ def searched(
     count, hopeless = len(jax.tree.leaves(goals)[0]), 1 if go_on else _HOPELESS
     lanes, by_core = lanes_for(count), whole_is_possible(route, every=False)
 
-    def by(most: int, goals: Any, left: np.ndarray) -> InverseKinematicsSolution:
+    def search(most: int, goals: Any, left: np.ndarray) -> InverseKinematicsSolution:
         if by_core:
             counts, how = np.where(left, most, 0), Searches(0, warm, near=False, every=False)
             return whole(robot, route, goals, settings, counts, hopeless, steps, how, single=False).answer
@@ -61,10 +61,10 @@ def searched(
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
         alone = warm and not by_core
-        found = jax.device_get(by(1 if alone else seeds, goals, wanted))
+        found = jax.device_get(search(1 if alone else seeds, goals, wanted))
         left = wanted & ~found.converged
         if alone and left.any():
-            found = _with(found, left, by(seeds, goals, left))
+            found = _with(found, left, search(seeds, goals, left))
             left &= ~found.converged
         return further(goals, found, left)
 
@@ -77,7 +77,7 @@ def searched(
         return _with(found, left, own)
 
     if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
-        found = by(seeds, goals, np.ones(count, bool))
+        found = search(seeds, goals, np.ones(count, bool))
         missed = ~np.asarray(found.converged)
         return further(goals, jax.device_get(found), missed) if missed.any() else found
     wanted = np.ones(count, bool) if wanted is None else wanted

@@ -22,7 +22,7 @@ from ..schemes import Scheme, VelocityProblem
 from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
-from ._pool import Errors
+from ._pool import Errors, stepped
 from ._seeds import unit_points
 from ._task_minimum import has_minimum, ranks, rate_at_rest
 from ._turns import unwound
@@ -97,13 +97,7 @@ class TaskSearch(eqx.Module):
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
-
-        def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
-            after, errors = jax.vmap(self.step)(carry[1], goal)
-            return carry[1], after, errors
-
-        nothing = jnp.zeros(len(x), x.dtype)
-        return jax.lax.fori_loop(0, steps, step, (x, x, Errors(nothing, nothing, nothing, nothing)))
+        return stepped(lambda q: jax.vmap(self.step)(q, goal), x, len(x), steps)
 
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Return the next configuration, and the errors at the present one. A finished search does not move."""

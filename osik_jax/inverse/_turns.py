@@ -39,7 +39,7 @@ def starting_range(
     width: Float[np.ndarray, " n"],
     turns: Sequence[bool],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return finite ranges for the starts of searches: the limits, one turn, or a width where a limit is missing.
+    """Return finite ranges for the starts of searches: the limits, one turn, or ``width`` to both sides without limits.
 
     The last two are centred on the configuration ``first``, as far as the limits allow. Arguments as in ``unwound``.
     """
