@@ -110,11 +110,10 @@ def find_free(
     check_length(obstacles.around.scene, count, "targets")
     if is_traced((goals, settings, obstacles.around, robot)):
         return Explored(_traced(robot, goals, settings, most, steps, how, obstacles))
-    counts = np.full(count, most)
+    counts, around = np.full(count, most), obstacles.around
     if not (how.near or how.every):
         how = how._replace(seeds=0)  # static, and ``counts`` says how many
-    given = robot, route, goals, settings, counts, most, steps, how
-    results = whole(*given, single=single, around=obstacles.around)
+    results = whole(robot, route, goals, settings, counts, most, steps, how, single=single, around=around)
     pair = np.asarray(results.pair)
     names = _pair_fields(pair[..., :2], obstacles.shapes, obstacles.scene)
     found = with_fields(results.answer, **names, obstruction=pair[..., 2])
@@ -125,10 +124,8 @@ def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Sce
     """Return the fields of an answer that name its nearest pairs."""
     if pairs.ndim == 1:
         return dict(nearest_pair=np.zeros((), np.int32), pairs=(shape_names(shapes.names, scene.names, pairs, 0),))
-    flat, own_names = pairs.reshape(-1, 2), bool(scene.names) and isinstance(scene.names[0], tuple)
-    of_scene = (
-        np.arange(len(flat)) * (own_names and len(scene.names) > 1) * (flat.max(-1, initial=-1) >= len(shapes.names))
-    )
+    flat, have_own_names = pairs.reshape(-1, 2), len(scene.names) > 1 and isinstance(scene.names[0], tuple)
+    of_scene = np.where(have_own_names & (flat.max(-1, initial=-1) >= len(shapes.names)), np.arange(len(flat)), 0)
     codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))
     _, first, place = np.unique(codes, return_index=True, return_inverse=True)
     named = [shape_names(shapes.names, scene.names, flat[k], of_scene[k]) for k in first]
