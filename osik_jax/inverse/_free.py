@@ -128,7 +128,7 @@ def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Sce
     of_scene = np.where(have_own_names & (flat.max(-1, initial=-1) >= len(shapes.names)), np.arange(len(flat)), 0)
     codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))
     _, first, place = np.unique(codes, return_index=True, return_inverse=True)
-    named = [shape_names(shapes.names, scene.names, flat[k], of_scene[k]) for k in first]
+    named = [shape_names(shapes.names, scene.names, flat[k], int(of_scene[k])) for k in first]
     kinds = {pair: k for k, pair in enumerate(dict.fromkeys(named))}
     number = np.array([kinds[pair] for pair in named], np.int32)[place].reshape(pairs.shape[:-1])
     return dict(nearest_pair=number, pairs=tuple(kinds))
