@@ -109,10 +109,9 @@ def _calibrated(
     estimated: bool,
     limit: int,
 ) -> Calibration:
-    start = jnp.zeros_like(precision)
     fixed = jax.lax.stop_gradient((setup, measurements))
     rows_of, fixed_rows = (partial(rows_at, *parts, parameters) for parts in ((setup, measurements), fixed))
-    found = fit(rows_of, fixed_rows, start, jnp.maximum(precision, _HELD), loss, limit)
+    found = fit(rows_of, fixed_rows, jnp.maximum(precision, _HELD), loss, limit)
     directions, scale, ratios = _directions(found)
     observable = ratios > rank_tolerance
     covariance, deviation = _covariance(found, precision, directions, scale, ratios * observable, estimated)

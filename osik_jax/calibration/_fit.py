@@ -27,43 +27,25 @@ _SHRINK, _GROW = 0.1, 10.0
 
 
 class Loss(NamedTuple):
-    """Weights of readings by their residuals.
+    """Weights of readings by their residuals."""
 
-    Attributes:
-        name: one of ``LOSSES``.
-        least_scale: least scale of the noise relative to the given one.
-        unknowns: how many there are: a fit to few readings makes their residuals smaller than the noise.
-    """
-
-    name: str
-    least_scale: float
-    unknowns: int
+    name: str  # one of ``LOSSES``
+    least_scale: float  # least scale of the noise relative to the given one
+    unknowns: int  # how many there are: a fit to few readings makes their residuals smaller than the noise
 
 
 class Fit(NamedTuple):
-    """Result of a fit.
+    """Result of a fit."""
 
-    Attributes:
-        change: the unknowns. (p,)
-        rows: differences over standard deviations at the end.
-        before: those at the start.
-        jacobian: of each measurement's rows at the end. (n, k, p)
-        weights: of each reading by the loss, 1 for least squares. (n,)
-        spread: of each measurement, the mean square of the weighted rows.
-        slope: of each measurement, the mean derivative of the weighted rows by the rows.
-        iterations: how many were made.
-        converged: whether the last step was below the tolerance.
-    """
-
-    change: Float[Array, " p"]
-    rows: Rows
-    before: Rows
-    jacobian: tuple[Float[Array, "n k p"], ...]
-    weights: tuple[Float[Array, " n"], ...]
-    spread: tuple[Float[Array, ""], ...]
-    slope: tuple[Float[Array, ""], ...]
-    iterations: Int[Array, ""]
-    converged: Bool[Array, ""]
+    change: Float[Array, " p"]  # the unknowns
+    rows: Rows  # differences over standard deviations at the end
+    before: Rows  # those at the start
+    jacobian: tuple[Float[Array, "n k p"], ...]  # of each measurement's rows at the end
+    weights: tuple[Float[Array, " n"], ...]  # of each reading by the loss, 1 for least squares
+    spread: tuple[Float[Array, ""], ...]  # of each measurement, the mean square of the weighted rows
+    slope: tuple[Float[Array, ""], ...]  # of each measurement, the mean derivative of the weighted rows by the rows
+    iterations: Int[Array, ""]  # how many were made
+    converged: Bool[Array, ""]  # whether the last step was below the tolerance
 
 
 class _State(NamedTuple):
@@ -82,21 +64,20 @@ class _State(NamedTuple):
 def fit(
     rows_of: Callable[[Array], Rows],
     fixed_rows: Callable[[Array], Rows],
-    start: Float[Array, " p"],
     precision: Float[Array, " p"],
     loss: Loss,
     limit: int,
 ) -> Fit:
-    """Minimise the loss of the rows plus ``precision * change^2``.
+    """Minimise the loss of the rows plus ``precision * change^2``, from no change.
 
     Args:
         rows_of: rows at a change, which carry derivatives by robot and readings.
         fixed_rows: the same without, for the search.
-        start: first change. (p,)
         precision: of the prior of each unknown, 1 / variance. (p,)
         loss: how readings are weighted.
         limit: greatest number of iterations.
     """
+    start = jnp.zeros_like(precision)
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.5
 
     def advance(state: _State) -> _State:
@@ -177,10 +158,8 @@ def is_negligible(size: Float[Array, " p"]) -> Bool[Array, " p"]:
 
 
 def _cost(rows: Rows, weights: tuple[Array, ...], precision: Array, change: Array) -> Array:
-    total = (precision * change**2).sum()
-    for r, w in zip(rows, weights, strict=True):
-        total = total + (w[:, None] * r**2).sum()
-    return total
+    parts = ((w[:, None] * r**2).sum() for r, w in zip(rows, weights, strict=True))
+    return sum(parts, (precision * change**2).sum())
 
 
 def _lengths(rows: Rows, loss: Loss) -> tuple[Array, ...]:

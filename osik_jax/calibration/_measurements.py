@@ -39,16 +39,11 @@ class Measurement(eqx.Module):
     q: Float[Array, "n nq"]
     sigma: Float[Array, " n"]
 
-    rows = 1
-    """Rows of one reading."""
-    unit = "m"
-    """Unit of the rows."""
-    shared = ()
-    """Names of the arrays that all readings share."""
-    read: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields with what was read."""
-    also = ""
-    """Name of the field that names a second frame."""
+    rows = 1  # of one reading
+    unit = "m"  # of the rows
+    shared = ()  # names of the arrays that all readings share
+    read: ClassVar[tuple[str, ...]] = ()  # names of the fields with what was read
+    also = ""  # name of the field that names a second frame
 
     def _common(self, frame: str, q: Any, sigma: Any, readings: int) -> None:
         self.frame, self.q = frame, _array(q, "q", (readings, None))
@@ -101,7 +96,6 @@ class Points(Measurement):
         sigma: Sigma = 1e-3,
         point: Num[ArrayLike, "3"] | Sequence[float] = (0.0, 0.0, 0.0),
     ):
-        """Record positions."""
         self.position, self.point = _array(position, "position", (None, 3)), _array(point, "point", (3,))
         self._common(frame, q, sigma, len(self.position))
 
@@ -137,7 +131,6 @@ class Poses(Measurement):
         sigma: Sigma = 1e-3,
         sigma_rotation: Sigma = 1e-3,
     ):
-        """Record poses."""
         self.position = _array(position, "position", (None, 3))
         self.rotation = _array(rotation, "rotation", (len(self.position), 3, 3))
         self.sigma_rotation = _sigma(sigma_rotation, "sigma_rotation", len(self.position))
@@ -182,7 +175,6 @@ class Distances(Measurement):
         other_q: Num[ArrayLike, "n nq"] | None = None,
         sigma: Sigma = 1e-3,
     ):
-        """Record distances."""
         self.other, self.distance = other, _array(distance, "distance", (None,))
         self._common(frame, q, sigma, len(self.distance))
         self.other_q = self.q if other_q is None else _array(other_q, "other_q", self.q.shape)
@@ -215,7 +207,6 @@ class PlaneContacts(Measurement):
         height: Num[ArrayLike, " n"] | float = 0.0,
         sigma: Sigma = 1e-3,
     ):
-        """Record contacts."""
         readings = len(_array(q, "q", (None, None)))
         self.plane, self.height = plane, jnp.broadcast_to(as_array(height, "height", float), (readings,))
         self._common(frame, q, sigma, readings)
@@ -233,7 +224,7 @@ class Pixels(Measurement):
         camera: name of the camera's frame, whose z axis looks forward, x to the right and y down (static).
         pixel: columns and rows [pixels]. (n, 2)
         intrinsics: focal lengths and principal point, fx, fy, cx, cy [pixels]. (4,)
-        point: the marker in its frame [m]: a corner of a board. (n, 3)
+        point: the marker in its frame [m]: a corner of a board; one (3,) may be given for all readings. (n, 3)
     """
 
     camera: str = eqx.field(static=True)
@@ -257,17 +248,6 @@ class Pixels(Measurement):
         point: Num[ArrayLike, "*n 3"] | Sequence[float] = (0.0, 0.0, 0.0),
         sigma: Sigma = 1.0,
     ):
-        """Record pixels of a marker.
-
-        Args:
-            frame: the marker's frame; of a board, ``point`` are its corners.
-            camera: the camera's frame.
-            q: configurations. (n, nq)
-            pixel: what was seen. (n, 2)
-            intrinsics: fx, fy, cx, cy.
-            point: one point (3,), or one for each reading (n, 3) [m].
-            sigma: standard deviation [pixels].
-        """
         self.camera, self.pixel = camera, _array(pixel, "pixel", (None, 2))
         self.intrinsics = _array(intrinsics, "intrinsics", (4,))
         points = jnp.asarray(point, self.pixel.dtype)
@@ -303,13 +283,7 @@ def _sigma(value: Any, what: str, readings: int) -> Float[Array, " n"]:
 
 
 def check_measurements(setup: Setup, measurements: Any) -> tuple[Measurement, ...]:
-    """Return measurements as a tuple.
-
-    Raises:
-        KeyError: a frame that is neither the robot's nor a fixed one.
-        TypeError: no measurements.
-        ValueError: none at all, or configurations of another robot.
-    """
+    """Return measurements as a tuple, checked."""
     given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
     if not given:
         raise OsikValueError("there are no measurements: give at least one, such as calibration.Points(...)")

@@ -53,21 +53,13 @@ class FixedFrame(eqx.Module):
 
 
 class Setup(eqx.Module):
-    """A robot and fixed frames, the base first, as arrays that unknowns change.
-
-    Attributes:
-        robot: the robot.
-        names: of the fixed frames; the first is ``BASE`` (static).
-        parents: the robot's frame that carries each, None for the world (static).
-        position: of each in its parent [m]. (m, 3)
-        rotation: from the axes of each to its parent's. (m, 3, 3)
-    """
+    """A robot and fixed frames, the base first, as arrays that unknowns change."""
 
     robot: Robot
-    names: tuple[str, ...] = eqx.field(static=True)
-    parents: tuple[str | None, ...] = eqx.field(static=True)
-    position: Float[Array, "m 3"]
-    rotation: Float[Array, "m 3 3"]
+    names: tuple[str, ...] = eqx.field(static=True)  # of the fixed frames; the first is ``BASE``
+    parents: tuple[str | None, ...] = eqx.field(static=True)  # the robot's frame that carries each, None for the world
+    position: Float[Array, "m 3"]  # of each in its parent [m]
+    rotation: Float[Array, "m 3 3"]  # from the axes of each to its parent's
 
     def check(self, name: str) -> None:
         """Raise KeyError unless a frame of the robot or a fixed frame has this name."""
@@ -97,13 +89,7 @@ class Setup(eqx.Module):
 
 
 def make_setup(robot: Robot, frames: Mapping[str, FixedFrame], base: FixedFrame | None) -> Setup:
-    """Return a robot with fixed frames in its precision.
-
-    Raises:
-        KeyError: the parent of a fixed frame is no frame of the robot.
-        TypeError: no ``FixedFrame``.
-        ValueError: a fixed frame has the name of a frame of the robot, or the base has a parent.
-    """
+    """Return a robot with fixed frames in its precision, checked."""
     for name, frame in {"base": base or FixedFrame(), **frames}.items():
         if not isinstance(frame, FixedFrame):
             raise OsikTypeError(f"frame {name!r} is a {type(frame).__name__}; it is a calibration.FixedFrame")

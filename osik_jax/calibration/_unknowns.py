@@ -96,16 +96,15 @@ def unit_of(setup: Setup, parameter: Parameter) -> str:
 
 
 def parameters_of(setup: Setup, unknowns: Sequence[Unknown]) -> tuple[tuple[Parameter, ...], Float[Array, " p"]]:
-    """Return all numbers that are unknown, and the precision of each prior, 1 / variance.
-
-    Raises:
-        KeyError: a name that does not exist.
-        TypeError: no sequence of ``Unknown``.
-        ValueError: none at all, a number twice, or the offset of a free or ball joint.
-    """
+    """Return all numbers that are unknown, checked, and the precision of each prior, 1 / variance."""
     if isinstance(unknowns, Unknown) or not all(isinstance(unknown, Unknown) for unknown in unknowns):
         raise OsikTypeError("unknowns is a sequence of calibration.Unknown, such as [Unknown('joint_offset', '*')]")
-    found = [(part, 1.0 / unknown.prior**2) for unknown in unknowns for part in _parts(setup, unknown)]
+    found = [
+        (Parameter(unknown.quantity, name, axis), 1.0 / unknown.prior**2)
+        for unknown in unknowns
+        for name in _names(setup, unknown)
+        for axis in _axes(setup.robot, unknown, name)
+    ]
     parts = [part for part, _ in found]
     for part in parts:
         if parts.count(part) > 1:
@@ -113,14 +112,6 @@ def parameters_of(setup: Setup, unknowns: Sequence[Unknown]) -> tuple[tuple[Para
     if not found:
         raise OsikValueError("nothing is unknown: give at least one calibration.Unknown")
     return tuple(parts), jnp.asarray([precision for _, precision in found], setup.position.dtype)
-
-
-def _parts(setup: Setup, unknown: Unknown) -> list[Parameter]:
-    return [
-        Parameter(unknown.quantity, name, axis)
-        for name in _names(setup, unknown)
-        for axis in _axes(setup.robot, unknown, name)
-    ]
 
 
 def _names(setup: Setup, unknown: Unknown) -> list[str]:

@@ -34,10 +34,7 @@ _Jacobians = Callable[[tuple[str, ...]], tuple[np.ndarray, np.ndarray]]
 
 
 def advice(
-    robot: Robot,
-    rows: Mapping[str, tuple[bool, ...]],
-    held: Mapping[str, Task],
-    q: Float[np.ndarray, "answers nq"],
+    robot: Robot, rows: Mapping[str, tuple[bool, ...]], held: Mapping[str, Task], q: Float[np.ndarray, "answers nq"]
 ) -> tuple[str, ...]:
     """Return a sentence for each frame with more rows than ways to move, with the rows to leave out.
 

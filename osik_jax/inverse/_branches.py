@@ -18,33 +18,20 @@ _ISOLATED_SEPARATION = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Coordinates:
-    """Entries of q that a search moves.
+    """Entries of q that a search moves."""
 
-    Attributes:
-        entries: their numbers.
-        turns: whether a whole turn of each changes no pose.
-        lower: limits, -inf where free [rad or m].
-        upper: likewise.
-        first: the configuration that solutions are near to.
-    """
-
-    entries: np.ndarray
-    turns: Bool[np.ndarray, " n"]
-    lower: Float[np.ndarray, " n"]
-    upper: Float[np.ndarray, " n"]
-    first: Float[np.ndarray, " n"]
+    entries: np.ndarray  # their numbers
+    turns: Bool[np.ndarray, " n"]  # whether a whole turn of each changes no pose
+    lower: Float[np.ndarray, " n"]  # limits, -inf where free [rad or m]
+    upper: Float[np.ndarray, " n"]  # likewise
+    first: Float[np.ndarray, " n"]  # the configuration that solutions are near to
 
 
 def all_solutions(explored: Explored, alone: Bool[np.ndarray, " targets"], own: Coordinates) -> dict[str, np.ndarray]:
-    """Return the solutions that differ, ``q`` first, then the other branches, then their copies by whole turns.
+    """Return the fields ``solutions``, ``count``, ``branches`` and ``isolated`` of the answers.
 
-    Args:
-        explored: the results of all searches.
-        alone: whether each answer ``q`` is an isolated solution.
-        own: the coordinates.
-
-    Returns:
-        The fields ``solutions``, ``count``, ``branches`` and ``isolated`` of the answers.
+    The solutions are ``q`` first, then the other branches, then their copies by whole turns. ``alone``: whether each
+    answer ``q`` is an isolated solution.
     """
     found, isolated = explored.found, np.asarray(explored.isolated)
     score, x, q = np.asarray(explored.outcomes.errors.score), np.asarray(explored.outcomes.x), np.asarray(found.q)

@@ -26,27 +26,16 @@ _SMALL_ANGLE_SQUARED = 1e-6
 
 
 class Layout(NamedTuple):
-    """Joints of the chain and their structure; hashable.
+    """Joints of the chain and their structure; hashable."""
 
-    Attributes:
-        joints: the robot's joints, parents first.
-        parents: index in ``joints`` of the joint before each, one past the last for the world.
-        hinges: whether each joint turns; the others slide.
-        entries: entry of q that moves each joint, -1 for a locked one.
-        factors: of that entry.
-        dofs: entries of q that move any of the frames, in order: the coordinates of the search.
-        ends: index in ``joints`` of the joint that carries each frame, one past the last for the world.
-        carries: whether each joint carries each frame.
-    """
-
-    joints: tuple[int, ...]
-    parents: tuple[int, ...]
-    hinges: tuple[bool, ...]
-    entries: tuple[int, ...]
-    factors: tuple[float, ...]
-    dofs: tuple[int, ...]
-    ends: tuple[int, ...]
-    carries: tuple[tuple[bool, ...], ...]
+    joints: tuple[int, ...]  # the robot's joints, parents first
+    parents: tuple[int, ...]  # index in ``joints`` of the joint before each, one past the last for the world
+    hinges: tuple[bool, ...]  # whether each joint turns; the others slide
+    entries: tuple[int, ...]  # entry of q that moves each joint, -1 for a locked one
+    factors: tuple[float, ...]  # of that entry
+    dofs: tuple[int, ...]  # entries of q that move any of the frames, in order: the coordinates of the search
+    ends: tuple[int, ...]  # index in ``joints`` of the joint that carries each frame, one past the last for the world
+    carries: tuple[tuple[bool, ...], ...]  # whether each joint carries each frame
 
 
 class Chain(eqx.Module):
@@ -54,24 +43,16 @@ class Chain(eqx.Module):
 
     The pose of a joint's far side in its near side is ``constant + f(angle) first + g(angle) second``, with sine and
     versine of a hinge's angle, or the travel of a slide and 0.
-
-    Attributes:
-        layout: the structure (static).
-        constant, first, second: [rotation, position] of each joint, from the frame before. (k, 3, 4)
-        offset: added to each joint's coordinate. (k,)
-        axis: of each joint, in its own frame. (k, 3)
-        anchor: of each joint, in its own frame [m]. (k, 3)
-        tip: pose of each frame in that of the joint that carries it. (frames, 3, 4)
     """
 
     layout: Layout = eqx.field(static=True)
-    constant: Float[Array, "k 3 4"]
+    constant: Float[Array, "k 3 4"]  # [rotation, position] of each joint, from the frame before; likewise the next two
     first: Float[Array, "k 3 4"]
     second: Float[Array, "k 3 4"]
-    offset: Float[Array, " k"]
-    axis: Float[Array, "k 3"]
-    anchor: Float[Array, "k 3"]
-    tip: Float[Array, "frames 3 4"]
+    offset: Float[Array, " k"]  # added to each joint's coordinate
+    axis: Float[Array, "k 3"]  # of each joint, in its own frame
+    anchor: Float[Array, "k 3"]  # of each joint, in its own frame [m]
+    tip: Float[Array, "frames 3 4"]  # pose of each frame in that of the joint that carries it
 
 
 def is_plain(tree: KinematicTree, frames: Sequence[str]) -> bool:
@@ -162,38 +143,28 @@ def _motions(
     skew = jnp.stack([jnp.stack([zero, -z, y], -1), jnp.stack([z, zero, -x], -1), jnp.stack([-y, x, zero], -1)], -2)
     sine, versine = compose(turn, skew), compose(turn, compose(skew, skew))
     slide = rotate(turn, axis)
-    hinge, none = hinges[:, None], jnp.zeros_like(slide)
+    hinge = hinges[:, None]
     constant = jnp.concatenate([turn, position[..., None]], -1)
     moved = jnp.where(hinge, -rotate(sine, anchor), slide)
     first = jnp.concatenate([jnp.where(hinge[..., None], sine, 0.0), moved[..., None]], -1)
-    again = jnp.where(hinge, -rotate(versine, anchor), none)
+    again = jnp.where(hinge, -rotate(versine, anchor), 0.0)
     second = jnp.concatenate([jnp.where(hinge[..., None], versine, 0.0), again[..., None]], -1)
     return constant, first, second
 
 
 class ChainKinematics(NamedTuple):
-    """Axes of the joints and poses of the frames, in world axes.
+    """Axes of the joints and poses of the frames, in world axes."""
 
-    Attributes:
-        axis: of each joint. (k, 3, lanes)
-        anchor: a point on it [m]. (k, 3, lanes)
-        position: of each frame [m]. (frames, 3, lanes)
-        rotation: of each frame. (frames, 3, 3, lanes)
-    """
-
-    axis: Float[Array, "k 3 lanes"]
-    anchor: Float[Array, "k 3 lanes"]
-    position: Float[Array, "frames 3 lanes"]
-    rotation: Float[Array, "frames 3 3 lanes"]
+    axis: Float[Array, "k 3 lanes"]  # of each joint
+    anchor: Float[Array, "k 3 lanes"]  # a point on it [m]
+    position: Float[Array, "frames 3 lanes"]  # of each frame [m]
+    rotation: Float[Array, "frames 3 3 lanes"]  # of each frame
 
 
 def chain_kinematics(chain: Chain, x: Float[Array, "n lanes"], *, unrolled: bool = False) -> ChainKinematics:
-    """Return forward kinematics of the chain.
+    """Return forward kinematics of the chain at entries ``layout.dofs`` of configurations.
 
-    Args:
-        chain: the chain.
-        x: entries ``layout.dofs`` of configurations.
-        unrolled: whether the joints are no loop of the program, for derivatives in reverse.
+    ``unrolled``: whether the joints are no loop of the program, for derivatives in reverse.
     """
     layout = chain.layout
     local = _local_poses(chain, x)
@@ -294,8 +265,6 @@ def curvature(
     matrix and ``c = (1 - (t / 2) cot(t / 2)) / t^2`` for an angle t.
 
     Args:
-        chain: the chain.
-        kinematics: of it.
         linear: position error of each frame [m].
         angular: orientation error of each frame, axis times angle [rad]; 0 where the orientation is free.
         radian: what a radian of it counts as [m].

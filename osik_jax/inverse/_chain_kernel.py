@@ -24,9 +24,6 @@ def advanced(
     Args:
         call: calls a method of the core.
         search: the ``ChainSearch``; arrays that all lanes share have an axis of length 1.
-        x: coordinates.
-        goal: the ``Goal``.
-        steps: their number.
         damping: its share of the squared error, and the least one relative to the squared length of a radian.
     """
     goals = jnp.concatenate([goal.position[..., None, :], goal.rotation], -2)

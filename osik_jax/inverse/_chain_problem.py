@@ -10,17 +10,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
 from ..robot import Robot
-from ..robot._joint_selection import dof_names, scalar_layout
+from ..robot._joint_selection import dof_names, dof_of_entries
 from ..tasks import Task
 from ._chain import Chain, Layout, chain_layout, make_chain
 from ._chain_search import ChainSearch, Goal, lanes_last
-from ._fixed import at_solution
-from ._implicit import errors_at
+from ._implicit import attached, errors_at
 from ._pool import Errors
 from ._reach import ROUNDOFF, Reach, beyond, norm, reaches
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
-from ._turns import one_turn
+from ._turns import starting_range
 
 ENOUGH = 0.01
 """Score at which a search is done; the next step would be a rounding."""
@@ -31,39 +30,23 @@ STOPPED = 1e-3
 
 
 class Settings(NamedTuple):
-    """Numbers of a search, all traced.
+    """Numbers of a search, all traced."""
 
-    Attributes:
-        home: what entries of q have that move no frame, and where search 0 of a warm start begins. (nq,)
-        lower: limits of each entry of v. (nv,)
-        upper: (nv,)
-        key: of the starts.
-        tolerance: of position [m] and orientation [rad]. (2,)
-        seeds: number of searches that ``nearest`` spreads out. ()
-        parts: what else a search is made of.
-    """
-
-    home: Float[Array, " nq"]
-    lower: Float[Array, " nv"]
+    home: Float[Array, " nq"]  # what entries of q have that move no frame, and where search 0 of a warm start begins
+    lower: Float[Array, " nv"]  # limits of each entry of v
     upper: Float[Array, " nv"]
-    key: Any
-    tolerance: Float[Array, "2"]
-    seeds: Int[Array, ""] | int
-    parts: Any = None
+    key: Any  # of the starts
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad]
+    seeds: Int[Array, ""] | int  # number of searches that ``nearest`` spreads out
+    parts: Any = None  # what else a search is made of
 
 
 class ChainRoute(NamedTuple):
-    """Problem of poses of frames whose chains have hinges and slides only; hashable.
+    """Problem of poses of frames whose chains have hinges and slides only; hashable."""
 
-    Attributes:
-        frames: names.
-        rows: of each frame, those that count: x, y, z, rotation about x, y, z.
-        by_core: whether the compiled core takes the steps where it is installed: not in a user's program, which may be
-            exported.
-    """
-
-    frames: tuple[str, ...]
-    rows: tuple[tuple[bool, ...], ...]
+    frames: tuple[str, ...]  # names
+    rows: tuple[tuple[bool, ...], ...]  # of each frame, those that count: x, y, z, rotation about x, y, z
+    # whether the compiled core takes the steps where it is installed: not in a user's program, which may be exported
     by_core: bool = True
 
     @property
@@ -73,7 +56,9 @@ class ChainRoute(NamedTuple):
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
         """Return the search for these frames."""
-        return chain_search(robot, self, settings, warm=warm, near=near)
+        own = carried(robot, settings.lower, settings.upper, frames=self.frames)
+        shift = shift_of(settings.key, len(own.lower))
+        return search_of(own, self, settings.home, shift, settings.tolerance, settings.seeds, warm=warm, near=near)
 
     def beyond(self, search: ChainSearch, goal: Goal) -> Float[Array, " targets"]:
         """Return a lower bound on the distance from each target to the workspace [m]; 0 where it may be inside."""
@@ -86,12 +71,10 @@ class ChainRoute(NamedTuple):
 
     def asked(self, settings: Settings) -> dict[str, tuple[bool, ...]]:
         """Return which rows of each frame are used."""
-        del settings
         return dict(zip(self.frames, self.rows, strict=True))
 
     def held(self, settings: Settings) -> dict[str, Task]:
         """Return no tasks: poses tie no joints together."""
-        del settings
         return {}
 
     def turning(self, robot: Robot, settings: Settings) -> np.ndarray:
@@ -105,20 +88,13 @@ class ChainRoute(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What a search needs of a robot and its limits alone.
+    """What a search needs of a robot and its limits alone."""
 
-    Attributes:
-        chain: geometry.
-        lower: limits of the chain's coordinates, -inf where free. (n,)
-        upper: (n,)
-        reaches: bounds on where each frame gets.
-        length: the greatest distance that a frame gets from its root and its slides' travel [m]; may be infinite. ()
-    """
-
-    chain: Chain
-    lower: Float[Array, " n"]
+    chain: Chain  # geometry
+    lower: Float[Array, " n"]  # limits of the chain's coordinates, -inf where free
     upper: Float[Array, " n"]
-    reaches: list[Reach]
+    reaches: list[Reach]  # bounds on where each frame gets
+    # the greatest distance that a frame gets from its root and its slides' travel [m]; may be infinite
     length: Float[Array, ""]
 
 
@@ -132,13 +108,6 @@ def carried(
     found = reaches(chain, *starting_box(lower, upper))
     length = jnp.max(jnp.stack([reach.length + jnp.sum(norm(reach.slides)) for reach in found]))
     return Carried(chain, lower, upper, found, jax.lax.stop_gradient(length))
-
-
-def chain_search(robot: Robot, route: ChainRoute, settings: Settings, *, warm: bool, near: bool) -> ChainSearch:
-    """Return the search for configurations of a robot whose frames hinges and slides carry."""
-    own = carried(robot, settings.lower, settings.upper, frames=route.frames)
-    shift = shift_of(settings.key, len(own.lower))
-    return search_of(own, route, settings.home, shift, settings.tolerance, settings.seeds, warm=warm, near=near)
 
 
 def search_of(
@@ -156,8 +125,8 @@ def search_of(
     chain, lower, upper, _, length = own
     layout = chain.layout
     first = jnp.clip(home[np.array(layout.dofs, int)], lower, upper)
-    box, turns = starting_box(lower, upper), turning(layout)
-    low, high = _starts(layout, turns, *box, first)
+    turns, hinges = turning(layout), [layout.hinges[layout.entries.index(dof)] for dof in layout.dofs]
+    low, high = starting_range(*starting_box(lower, upper), first, np.where(hinges, np.pi, 1.0), turns)
     return ChainSearch(
         rows=route.rows,
         by_core=route.by_core,
@@ -189,31 +158,10 @@ def allowed(tolerance: Float[Array, "2"], length: Float[Array, ""]) -> Float[Arr
     return jnp.maximum(tolerance - hidden, 0.25 * tolerance)
 
 
-def dof_of_entries(robot: Robot) -> np.ndarray:
-    """Return the entry of v of each entry of q, of hinges and slides. (nq,)."""
-    scalar, index = scalar_layout(robot)
-    out = np.zeros(robot.nq, int)
-    out[index[scalar]] = np.flatnonzero(scalar)
-    return out
-
-
 def turning(layout: Layout) -> tuple[bool, ...]:
     """Return whether a whole turn of each coordinate brings every joint that it moves to the same place."""
     moved = [[j for j, entry in enumerate(layout.entries) if entry == dof] for dof in layout.dofs]
     return tuple(all(layout.hinges[j] and layout.factors[j] % 1.0 == 0.0 for j in own) for own in moved)
-
-
-def _starts(layout: Layout, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Return finite ranges for the starts of searches: the limits, one turn, or 1 m around the first configuration."""
-    hinge = np.array([layout.hinges[layout.entries.index(dof)] for dof in layout.dofs])
-    width = np.where(hinge, np.pi, 1.0)
-    free = jnp.isinf(lower) | jnp.isinf(upper)
-    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
-    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
-    once, again = one_turn(lower, upper, first)
-    # beyond a whole turn, starts would repeat the same poses
-    wide = np.array(turns) & (upper - lower > 2.0 * np.pi)
-    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
 
 
 def answer(
@@ -226,7 +174,7 @@ def answer(
     steps: Int[Array, " targets"],
 ) -> InverseKinematicsSolution:
     """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
-    x = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, x)
+    x = jax.vmap(attached, in_axes=(0, None, 0))(jax.lax.stop_gradient(x), search, goal)
     fixed_search, fixed_goal = jax.lax.stop_gradient((search, goal))
     residual, active, errors = _evaluated(fixed_search, jax.lax.stop_gradient(x).T, lanes_last(fixed_goal))
     converged = errors.score <= 1.0
@@ -252,11 +200,8 @@ def answer(
 def _evaluated(search: ChainSearch, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Array, Array, Errors]:
     """Return the residual of each frame (frames, 6, lanes), the limits that stop it (n, lanes), and the errors."""
     error, matrix, errors = search.linearised(x, goal)
-    rows = np.array(search.rows)
-    scale = jnp.where(np.arange(6) < 3, 1.0, search.length)[None].repeat(len(rows), 0)[rows]
-    residual = jnp.zeros((*rows.shape, x.shape[-1]), x.dtype).at[np.nonzero(rows)].set(error / scale[:, None])
     gradient = jnp.sum(matrix * error[:, None], 0)
     most = jnp.sqrt(jnp.sum(matrix**2, 0)) * jnp.sqrt(errors.cost)
     stopped = jnp.abs(gradient) > STOPPED * most
     low, high = (x <= search.lower[:, None]) & (gradient > 0.0), (x >= search.upper[:, None]) & (gradient < 0.0)
-    return residual, jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors
+    return search.by_frame(error), jnp.where(stopped, high.astype(jnp.int32) - low.astype(jnp.int32), 0), errors

@@ -20,7 +20,7 @@ from ._chain_kernel import advanced
 from ._error import rotation_error
 from ._linear import ISOLATED, positive_pivot, solve_positive
 from ._minimum import inverse_hessian, minimum
-from ._pool import Errors
+from ._pool import Errors, stepped
 from ._reach import Reach
 from ._seeds import unit_points
 from ._turns import unwound
@@ -35,14 +35,9 @@ _GAIN = 1e-4
 
 
 class Goal(NamedTuple):
-    """Wanted poses of the frames.
+    """Wanted poses of the frames."""
 
-    Attributes:
-        position: [m]. (..., frames, 3)
-        rotation: (..., frames, 3, 3)
-    """
-
-    position: Float[Array, "*lanes frames 3"]
+    position: Float[Array, "*lanes frames 3"]  # [m]
     rotation: Float[Array, "*lanes frames 3 3"]
 
 
@@ -57,51 +52,32 @@ class ChainSearch(eqx.Module):
     Such a damping needs no line search, and vanishes fast enough for quadratic convergence (T. Sugihara, "Solvability-
     unconcerned inverse kinematics by the Levenberg-Marquardt method", IEEE Transactions on Robotics 27(5), 2011). A
     joint at a limit beyond which the negative gradient points is left out of the step.
-
-    Attributes:
-        rows: of each frame, the rows that count: x, y, z, rotation about x, y, z (static).
-        by_core: whether the compiled core takes the steps where it is installed (static).
-        turns: of each coordinate, whether a whole turn of it changes no pose (static).
-        chain: geometry.
-        lower: of the chain's coordinates, -inf where free. (n,)
-        upper: (n,)
-        reaches: bounds on where each frame gets.
-        low: of where searches start, finite. (n,)
-        high: (n,)
-        first: where search 0 starts, used where ``warm``. (n,)
-        home: the whole configuration that the coordinates are part of. (nq,)
-        warm: whether search 0 starts at ``first`` (static).
-        near: whether the nearest solution to ``first`` is wanted: searches start around it, and what the frames leave
-            free goes towards it (static).
-        seeds: number of searches that ``near`` spreads out. ()
-        shift: of the sequence of starts. (n,)
-        length: what a radian counts as [m]. ()
-        tolerance: of position [m] and orientation [rad], less what rounding may hide. (2,)
-        enough: score at which a search stays where it is. ()
     """
 
+    # of each frame, the rows that count: x, y, z, rotation about x, y, z
     rows: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
-    by_core: bool = eqx.field(static=True)
-    turns: tuple[bool, ...] = eqx.field(static=True)
-    chain: Chain
-    lower: Float[Array, " n"]
+    by_core: bool = eqx.field(static=True)  # whether the compiled core takes the steps where it is installed
+    turns: tuple[bool, ...] = eqx.field(static=True)  # of each coordinate, whether a whole turn of it changes no pose
+    chain: Chain  # geometry
+    lower: Float[Array, " n"]  # of the chain's coordinates, -inf where free
     upper: Float[Array, " n"]
-    reaches: list[Reach]
-    low: Float[Array, " n"]
+    reaches: list[Reach]  # bounds on where each frame gets
+    low: Float[Array, " n"]  # of where searches start, finite
     high: Float[Array, " n"]
-    first: Float[Array, " n"]
-    home: Float[Array, " nq"]
-    warm: bool = eqx.field(static=True)
+    first: Float[Array, " n"]  # where search 0 starts, used where ``warm``
+    home: Float[Array, " nq"]  # the whole configuration that the coordinates are part of
+    warm: bool = eqx.field(static=True)  # whether search 0 starts at ``first``
+    # whether the nearest solution to ``first`` is wanted: searches start around it, and what the frames leave free goes
+    # towards it
     near: bool = eqx.field(static=True)
-    seeds: Float[Array, ""]
-    shift: UInt[Array, " n"]
-    length: Float[Array, ""]
-    tolerance: Float[Array, "2"]
-    enough: Float[Array, ""]
+    seeds: Float[Array, ""]  # number of searches that ``near`` spreads out
+    shift: UInt[Array, " n"]  # of the sequence of starts
+    length: Float[Array, ""]  # what a radian counts as [m]
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad], less what rounding may hide
+    enough: Float[Array, ""]  # score at which a search stays where it is
 
     def begin(self, seed: Int[Array, " lanes"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return the starts of the searches with these indices."""
-        del goal
         points = self.low + (self.high - self.low) * unit_points(self.shift, seed, self.low.dtype)
         if self.near:
             ratio = jnp.minimum(seed.astype(points.dtype) / self.seeds, 1.0)[:, None]
@@ -119,15 +95,7 @@ class ChainSearch(eqx.Module):
     def advance_plain(self, x: Float[Array, "lanes n"], goal: Goal, steps: Any) -> tuple[Array, Array, Errors]:
         """Return what ``advance`` does, by plain JAX."""
         turned = lanes_last(goal)
-
-        def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
-            at = carry[1]
-            after, errors = self.step(at, turned)
-            return at, after, errors
-
-        nothing = jnp.zeros(len(x), x.dtype)
-        start = x.T, x.T, Errors(nothing, nothing, nothing, nothing)
-        here, there, errors = jax.lax.fori_loop(0, steps, step, start)
+        here, there, errors = stepped(lambda x: self.step(x, turned), x.T, len(x), steps)
         return here.T, there.T, errors
 
     def step(self, x: Float[Array, "n lanes"], goal: Goal) -> tuple[Float[Array, "n lanes"], Errors]:
@@ -186,10 +154,13 @@ class ChainSearch(eqx.Module):
 
     def sizes(self, error: Float[Array, " m"]) -> Float[Array, "2"]:
         """Return the largest position error [m] and orientation error [rad] of the used rows."""
-        rows = np.array(self.rows)
-        scale = jnp.where(np.arange(6) < 3, 1.0, self.length)[None].repeat(len(rows), 0)[rows]
-        off = jnp.zeros(rows.shape, error.dtype).at[np.nonzero(rows)].set(error / scale)
-        return greatest(jax.vmap(jax.vmap(safe_norm))(off.reshape(-1, 2, 3)).T)
+        return greatest(jax.vmap(jax.vmap(safe_norm))(self.by_frame(error[:, None]).reshape(-1, 2, 3)).T)
+
+    def by_frame(self, error: Float[Array, "m lanes"]) -> Float[Array, "frames 6 lanes"]:
+        """Return the errors of the used rows [m] as those of all rows [m, rad]; 0 in rows that are not used."""
+        used = np.nonzero(np.array(self.rows))
+        scale = jnp.where(used[1] < 3, 1.0, self.length)[:, None]
+        return jnp.zeros((len(self.rows), 6, error.shape[1]), error.dtype).at[used].set(error / scale)
 
     def polished(self, x: Float[Array, "lanes n"], goal: Goal) -> Float[Array, "lanes n"]:
         """Return solutions after one more step where that lowers the error; other configurations stay."""

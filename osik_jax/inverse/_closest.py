@@ -15,19 +15,12 @@ _EQUAL = 0.01
 
 
 class Closest(NamedTuple):
-    """Best local optimum of each target.
+    """Best local optimum of each target."""
 
-    Attributes:
-        x: coordinates. (targets, n)
-        error: length of all errors [m], where a radian counts as the tolerances' ratio. (targets,)
-        seed: number of the search that it began with. (targets,)
-        steps: that were taken to all of the target's optima. (targets,)
-    """
-
-    x: Float[Array, "targets n"]
-    error: Float[Array, " targets"]
-    seed: Int[Array, " targets"]
-    steps: Int[Array, " targets"]
+    x: Float[Array, "targets n"]  # coordinates
+    error: Float[Array, " targets"]  # length of all errors [m], where a radian counts as the tolerances' ratio
+    seed: Int[Array, " targets"]  # number of the search that it began with
+    steps: Int[Array, " targets"]  # that were taken to all of the target's optima
 
 
 def closest(
@@ -39,8 +32,6 @@ def closest(
     groups, and the best of each group goes on.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
         x: where each search has led.
         open_: targets that are not met; the others are left alone.
         near: of equally good optima, whether to take the nearest to the first configuration, not the first one.

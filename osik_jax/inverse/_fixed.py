@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ._implicit import attached
 from ._pool import Errors, Search
 from ._solution import InverseKinematicsSolution
 
@@ -21,45 +20,27 @@ SETTLED = 0.1
 
 
 class Outcomes(NamedTuple):
-    """End points of all searches of each target.
+    """End points of all searches of each target."""
 
-    Attributes:
-        x: coordinates. (targets, seeds, n)
-        errors: there. (targets, seeds) each
-    """
-
-    x: Float[Array, "targets seeds n"]
-    errors: Errors
+    x: Float[Array, "targets seeds n"]  # coordinates
+    errors: Errors  # there; (targets, seeds) each
 
 
 class Searches(NamedTuple):
-    """Static settings of the searches for a target; hashable.
+    """Static settings of the searches for a target; hashable."""
 
-    Attributes:
-        seeds: their number, where all of them run.
-        warm: whether search 0 starts at the first configuration.
-        near: whether they start around it and go towards it.
-        every: whether the results of all of them are wanted.
-    """
-
-    seeds: int
-    warm: bool
-    near: bool
-    every: bool
+    seeds: int  # their number, where all of them run
+    warm: bool  # whether search 0 starts at the first configuration
+    near: bool  # whether they start around it and go towards it
+    every: bool  # whether the results of all of them are wanted
 
 
 class Explored(NamedTuple):
-    """Results of all searches of each target.
+    """Results of all searches of each target."""
 
-    Attributes:
-        found: the best.
-        outcomes: their ends; None where the core computed the best alone.
-        isolated: with ``every``, whether these are isolated solutions, else None. (targets, seeds)
-    """
-
-    found: InverseKinematicsSolution
-    outcomes: Any
-    isolated: Any
+    found: InverseKinematicsSolution  # the best
+    outcomes: Any = None  # their ends; None where the core computed the best alone
+    isolated: Any = None  # with ``every``, whether these are isolated solutions, else None; (targets, seeds)
 
 
 def search_all(
@@ -74,10 +55,7 @@ def search_all(
     """Run ``seeds`` searches of ``steps`` steps for each target.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
-        seeds: searches for each target.
-        steps: of each; traced where it may be 0, for searches that are not needed.
+        steps: of each search; traced where it may be 0, for searches that are not needed.
         last: the method of a few more steps at the end, if another.
         starts: where the searches start. Default: where the method begins.
     """
@@ -122,11 +100,6 @@ def choose(outcomes: Outcomes, distance: Float[Array, "targets seeds"] | None) -
         good = score <= bound
         best = jnp.where(good.any(-1), jnp.argmin(jnp.where(good, order, jnp.inf), -1), best)
     return best.astype(jnp.int32)
-
-
-def at_solution(search: Any, goal: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Return x, the result of an undifferentiated search, with the derivative of a solution."""
-    return attached(jax.lax.stop_gradient(x), search, goal)
 
 
 def or_far(answer: InverseKinematicsSolution, valid: Bool[Array, " targets"]) -> InverseKinematicsSolution:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
+from jax.custom_batching import custom_vmap, sequential_vmap
 from jaxtyping import Array, Int
 
 from .._errors import OsikError, OsikValueError
@@ -35,14 +35,14 @@ from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
-from ._chain_problem import ChainRoute, Settings, answer, dof_of_entries
+from ..robot._joint_selection import dof_names, dof_of_entries
+from ._chain_problem import ChainRoute, Settings, answer
 from ._chain_search import Goal
 from ._fixed import Explored, Searches, or_far, with_placeholders
-from ._run import split
+from ._run import with_ends
 from ._solution import InverseKinematicsSolution, with_fields
 from ._task_search import CLEAR
-from ._whole import EVERY_SOLUTION, Around, Whole, by_core, named, whole
+from ._whole import EVERY_SOLUTION, Around, by_core, named, whole
 
 _SURE = 1e-6
 """Distance beyond the clearance, against rounding [m]."""
@@ -51,19 +51,12 @@ SEEDS = 256
 
 
 class Obstacles(NamedTuple):
-    """The robot's shapes and the obstacles that a search keeps apart.
+    """The robot's shapes and the obstacles that a search keeps apart."""
 
-    Attributes:
-        route: the frames.
-        shapes: of the robot.
-        scene: the user's.
-        around: both for the core.
-    """
-
-    route: ChainRoute
-    shapes: RobotShapes
-    scene: Scene
-    around: Around
+    route: ChainRoute  # the frames
+    shapes: RobotShapes  # of the robot
+    scene: Scene  # the user's
+    around: Around  # both for the core
 
     @property
     def many(self) -> bool:
@@ -72,12 +65,7 @@ class Obstacles(NamedTuple):
 
 
 def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any, srdf: Given) -> Obstacles:
-    """Return the obstacles of a search.
-
-    Raises:
-        OsikError: there is no core for this device.
-        TypeError, ValueError: no scene; a clearance that is negative.
-    """
+    """Return the obstacles of a search, checked."""
     require_core("inverse_kinematics with a scene", on_gpu=True)
     check_scene(scene)
     shapes, own = _known(robot, srdf, route=route)
@@ -126,33 +114,26 @@ def find_free(
     count = len(goals.position)
     check_length(obstacles.around.scene, count, "targets")
     if traced:
-        return Explored(_traced(robot, goals, settings, most, steps, how, obstacles), *split(None))
-    counts = np.full(count, most)
+        return Explored(_traced(robot, goals, settings, most, steps, how, obstacles))
+    counts, around = np.full(count, most), obstacles.around
     if not (how.near or how.every):
         how = how._replace(seeds=0)  # static, and ``counts`` says how many
-    given = robot, route, goals, settings, counts, most, steps, how
-    results = whole(*given, single=single, around=obstacles.around)
-    return Explored(_named(results, obstacles), *split(None if results.ends is None else np.asarray(results.ends)))
-
-
-def _named(results: Whole, obstacles: Obstacles) -> InverseKinematicsSolution:
-    """Return the answers with the names of their nearest pairs."""
+    results = whole(robot, route, goals, settings, counts, most, steps, how, single=single, around=around)
     pair = np.asarray(results.pair)
     names = _pair_fields(pair[..., :2], obstacles.shapes, obstacles.scene)
-    return with_fields(results.answer, **names, obstruction=pair[..., 2])
+    found = with_fields(results.answer, **names, obstruction=pair[..., 2])
+    return with_ends(found, None if results.ends is None else np.asarray(results.ends))
 
 
 def _pair_fields(pairs: Int[np.ndarray, "*n 2"], shapes: RobotShapes, scene: Scene) -> dict[str, Any]:
     """Return the fields of an answer that name its nearest pairs."""
     if pairs.ndim == 1:
         return dict(nearest_pair=np.zeros((), np.int32), pairs=(shape_names(shapes.names, scene.names, pairs, 0),))
-    flat, own_names = pairs.reshape(-1, 2), bool(scene.names) and isinstance(scene.names[0], tuple)
-    of_scene = (
-        np.arange(len(flat)) * (own_names and len(scene.names) > 1) * (flat.max(-1, initial=-1) >= len(shapes.names))
-    )
+    flat, have_own_names = pairs.reshape(-1, 2), len(scene.names) > 1 and isinstance(scene.names[0], tuple)
+    of_scene = np.where(have_own_names & (flat.max(-1, initial=-1) >= len(shapes.names)), np.arange(len(flat)), 0)
     codes = np.ravel_multi_index((of_scene, *(flat.T + 1)), (len(flat), *[flat.max(initial=-1) + 2] * 2))
     _, first, place = np.unique(codes, return_index=True, return_inverse=True)
-    named = [shape_names(shapes.names, scene.names, flat[k], of_scene[k]) for k in first]
+    named = [shape_names(shapes.names, scene.names, flat[k], int(of_scene[k])) for k in first]
     kinds = {pair: k for k, pair in enumerate(dict.fromkeys(named))}
     number = np.array([kinds[pair] for pair in named], np.int32)[place].reshape(pairs.shape[:-1])
     return dict(nearest_pair=number, pairs=tuple(kinds))
@@ -170,12 +151,8 @@ def find_free_by_steps(
     """Return free configurations for tasks, a scheme or a free base: steps keep off the nearest pairs.
 
     Args:
-        robot: the robot.
         solve: ``inverse_kinematics`` of the tasks, without limits.
         limits: the user's.
-        scene: the obstacles.
-        clearance: distance that all pairs keep [m].
-        srdf: pairs that may touch.
         position_tolerance: of the tasks [m]; rows of limits may be off by a part of it.
 
     Raises:
@@ -202,13 +179,7 @@ def find_free_by_steps(
 
 
 def _traced(
-    robot: Robot,
-    goals: Goal,
-    settings: Settings,
-    most: int,
-    steps: int,
-    how: Searches,
-    obstacles: Obstacles,
+    robot: Robot, goals: Goal, settings: Settings, most: int, steps: int, how: Searches, obstacles: Obstacles
 ) -> InverseKinematicsSolution:
     """Return the answers as differentiable functions of what is traced; pairs have no names there."""
     route, (goals, valid) = obstacles.route, with_placeholders(goals)
@@ -240,7 +211,8 @@ def _in_one_call(how: Searches, dofs: tuple[int, ...], joints: tuple[str, ...]) 
         (search, goal, most, steps, around), targets = given, given[2].shape[-1]
         alike = batched[0], batched[3], batched[4].robot, batched[4].clearance
         if any(jax.tree.leaves(alike)):
-            found = _one_after_another(searched, lanes, batched, given)
+            axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
+            found = jax.vmap(sequential_vmap(searched), axes)(*given)
             return found, [True] * len(found)
 
         def together(array: Array, is_batched: bool) -> Array:
@@ -256,16 +228,3 @@ def _in_one_call(how: Searches, dofs: tuple[int, ...], joints: tuple[str, ...]) 
         return [a.reshape(lanes, targets, *a.shape[1:]) for a in found], [True] * len(found)
 
     return searched
-
-
-def _one_after_another(searched: Callable[..., list[Array]], lanes: int, batched: Any, given: Any) -> list[Array]:
-    (leaves, tree), own = jax.tree.flatten(given), jax.tree.leaves(batched)
-    moving = [leaf for leaf, is_own in zip(leaves, own, strict=True) if is_own]
-
-    def one(moving: list[Array]) -> list[Array]:
-        rest = iter(moving)
-        return searched(
-            *tree.unflatten(next(rest) if is_own else leaf for leaf, is_own in zip(leaves, own, strict=True))
-        )
-
-    return jax.lax.map(one, moving)

@@ -32,33 +32,42 @@ def lanes_for(targets: int) -> int:
 
 
 def in_chunks(function: Callable[[Any, np.ndarray], Any], goals: Any) -> Any:
-    """Return ``function(goals, open)`` computed in chunks of targets, padded with targets that are not open.
+    """Return ``function(goals, open)`` of chunks of targets, one after another, as NumPy arrays.
 
-    On a CPU, chunks run in threads side by side: XLA runs a program in the thread that calls it. What comes out does
-    not depend on how many there are.
-
-    Args:
-        function: of a chunk's goals, and which of them are looked for.
-        goals: pytree with the targets in front.
-
-    Returns:
-        NumPy arrays.
+    ``open``: which targets of a chunk are looked for; the others fill it up. The results do not depend on the number of
+    threads.
     """
     count = len(jax.tree.leaves(goals)[0])
     size = min(_power_of_two(count), _CHUNK.get(jax.default_backend(), _OTHER_CHUNK))
-    starts, goals = range(0, count, size), jax.device_get(goals)
+    return _in_parts(function, goals, np.arange(count), size)
+
+
+def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
+    """Return ``function(*args)`` for the chosen targets, padded to a power of two; results of others are undefined.
+
+    At least one of the targets is chosen. The arguments are pytrees with all targets in front.
+    """
+    number = np.flatnonzero(chosen)
+    size = min(_power_of_two(len(number)), _FEW.get(jax.default_backend(), _OTHER_CHUNK))
+    out = _in_parts(lambda args, _: function(*args), args, number, size)
+    place = np.zeros(len(chosen), int)
+    place[number] = np.arange(len(number))
+    return jax.tree.map(lambda a: a[place], out)
+
+
+def _in_parts(function: Callable[[Any, np.ndarray], Any], given: Any, number: np.ndarray, size: int) -> Any:
+    """Return the results for some targets, ``size`` at a time; the last ones are padded with the last target.
+
+    On a CPU, parts run in a thread on each core: XLA runs a program in the thread that calls it.
+    """
+    given, starts = jax.device_get(given), range(0, len(number), size)
 
     def run(start: int) -> Any:
-        here = min(size, count - start)
-        number = np.minimum(np.arange(start, start + size), count - 1)
-        out = function(jax.tree.map(lambda a: a[number], goals), np.arange(size) < here)
-        return jax.tree.map(lambda a: a[:here], jax.device_get(out))
+        some = number[start : start + size]
+        here = np.pad(some, (0, size - len(some)), mode="edge")
+        out = function(jax.tree.map(lambda a: a[here], given), np.arange(size) < len(some))
+        return jax.tree.map(lambda a: a[: len(some)], jax.device_get(out))
 
-    return _in_threads(run, starts)
-
-
-def _in_threads(run: Callable[[int], Any], starts: range) -> Any:
-    """Return the results of all chunks one after another; on a CPU they are computed in a thread on each core."""
     if len(starts) == 1 or jax.default_backend() != "cpu":
         parts = [run(start) for start in starts]
     else:
@@ -66,29 +75,6 @@ def _in_threads(run: Callable[[int], Any], starts: range) -> Any:
         with ThreadPoolExecutor(cores()) as threads:
             parts = [first, *threads.map(run, starts[1:])]
     return jax.tree.map(lambda *own: np.concatenate(own), *parts) if len(parts) > 1 else parts[0]
-
-
-def only(chosen: np.ndarray, function: Callable[..., Any], *args: Any) -> Any:
-    """Return ``function(*args)`` for the chosen targets, padded to a power of two; results of others are undefined.
-
-    Args:
-        chosen: targets, at least one. (targets,)
-        function: of pytrees with the targets in front.
-        args: what it is called with for all targets.
-    """
-    number, args = np.flatnonzero(chosen), jax.device_get(args)
-    size = min(_power_of_two(len(number)), _FEW.get(jax.default_backend(), _OTHER_CHUNK))
-
-    def run(start: int) -> Any:
-        some = number[start : start + size]
-        here = np.pad(some, (0, size - len(some)), mode="edge")
-        out = jax.device_get(function(*jax.tree.map(lambda a: a[here], args)))
-        return jax.tree.map(lambda a: a[: len(some)], out)
-
-    out = _in_threads(run, range(0, len(number), size))
-    place = np.zeros(len(chosen), int)
-    place[number] = np.arange(len(number))
-    return jax.tree.map(lambda a: a[place], out)
 
 
 def _power_of_two(count: int) -> int:

@@ -20,14 +20,12 @@ def attached(x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, " n"
     of one Newton step from x. Where the error is least and not 0, its gradient is 0, and ``H dx = -d gradient`` with
     the Hessian H of half the squared error.
     """
-    del search, goal
     return x
 
 
 @custom_jvp
 def errors_at(sizes: Float[Array, "2"], x: Float[Array, " n"], search: Any, goal: Any) -> Float[Array, "2"]:
     """Return the position error [m] and the orientation error [rad] unchanged, with their derivatives at x."""
-    del x, search, goal
     return sizes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
 from functools import partial
 from typing import Any
@@ -154,9 +154,7 @@ def inverse_kinematics(
     home = robot.q0 if q0 is None else _start(robot, q0, dtype)
     problem = read_problem(robot, tasks, targets, scheme, limits, home)
     lower, upper = joint_box(robot, limits)
-    tolerance = _together(
-        [checked_tolerance(position_tolerance, dtype), checked_tolerance(orientation_tolerance, dtype)]
-    )
+    tolerance = checked_tolerances(position_tolerance, orientation_tolerance, dtype)
     route = problem.route
     if scene is not None and not isinstance(route, ChainRoute):
         more: dict[str, Any] = dict(targets=targets, scheme=scheme, q0=q0, seeds=seeds, key=key, nearest=nearest)
@@ -287,12 +285,13 @@ def _inward(bound: Array, sign: float) -> Array:
     return bound + jax.lax.stop_gradient(jnp.where(jnp.isfinite(bound), inner - bound, 0.0))
 
 
-def _together(values: Sequence[Any]) -> Any:
-    """Return the stacked values, by NumPy unless traced, because JAX's dispatch costs more than a search."""
-    return (jnp if is_traced(values) else np).stack(values)
+def checked_tolerances(position: Any, orientation: Any, dtype: Any) -> Any:
+    """Return both tolerances (2,), by NumPy unless traced, because JAX's dispatch costs more than a search."""
+    both = [_checked_tolerance(value, dtype) for value in (position, orientation)]
+    return (jnp if is_traced(both) else np).stack(both)
 
 
-def checked_tolerance(value: Any, dtype: Any) -> Any:
+def _checked_tolerance(value: Any, dtype: Any) -> Any:
     out = (jnp if is_traced(value) else np).asarray(value, dtype)
     seen = concrete(out)
     if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen > 0.0)):

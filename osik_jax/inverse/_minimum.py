@@ -38,17 +38,11 @@ Model = Callable[
 
 
 class Minimum(NamedTuple):
-    """Local minima.
+    """Local minima."""
 
-    Attributes:
-        x: coordinates. (n, lanes)
-        cost: half the sum of the squared errors. (lanes,)
-        steps: that were taken. (lanes,)
-    """
-
-    x: Float[Array, "n lanes"]
-    cost: Float[Array, " lanes"]
-    steps: Int[Array, " lanes"]
+    x: Float[Array, "n lanes"]  # coordinates
+    cost: Float[Array, " lanes"]  # half the sum of the squared errors
+    steps: Int[Array, " lanes"]  # that were taken
 
 
 class _State(NamedTuple):
@@ -72,13 +66,9 @@ def minimum(
     open_: Bool[Array, " lanes"],
     gain: Float[Array, "*lanes"],
 ) -> Minimum:
-    """Descend from each start to a local minimum within the box.
+    """Descend from each start to a local minimum within the box, whose ends are infinite where free.
 
     Args:
-        model: the errors and their derivatives.
-        x: starts, within the box.
-        lower: ends of the box, -inf where free; of all lanes or of each.
-        upper: likewise.
         open_: lanes to work on; the others stay where they are.
         gain: a lane ends where a step promises to lower the length of the errors by less.
     """
@@ -134,10 +124,7 @@ def inverse_hessian(
 ) -> Float[Array, "n n"]:
     """Return the pseudo-inverse of the Hessian over the free coordinates; 0 in rows and columns of the others.
 
-    Args:
-        matrix: Jacobian of the errors.
-        curvature: second derivatives of the errors weighted by them.
-        free: coordinates that may move.
+    ``matrix`` and ``curvature``: as a ``Model`` returns them.
     """
     times = partial(jnp.matmul, precision="highest")
     hessian = jnp.where(free & free[:, None], times(matrix.T, matrix) + curvature, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -19,17 +20,16 @@ _WORD = np.dtype(np.int32)
 @partial(jax.tree_util.register_dataclass, data_fields=["words", "apart"], meta_fields=["form"])
 @dataclass(frozen=True)
 class Packed:
-    """A pytree.
+    """A pytree."""
 
-    Attributes:
-        words: numbers of its packed leaves one after another, as integers of 32 bits. (k,)
-        apart: its leaves that are not packed.
-        form: shape and type of each leaf, the type None for a leaf that is apart; and the structure (static).
-    """
+    words: Int[Array | np.ndarray, " k"]  # numbers of its packed leaves one after another, as integers of 32 bits
+    apart: tuple[Array, ...]  # its leaves that are not packed
+    form: Any  # shape and type of each leaf, the type None for a leaf that is apart; and the structure (static)
 
-    words: Int[Array | np.ndarray, " k"]
-    apart: tuple[Array, ...]
-    form: Any
+
+def call_packed(program: Callable[[Packed], Packed], *given: Any) -> Any:
+    """Run a program with its arguments packed in one array; return its results as NumPy arrays."""
+    return unpacked(jax.device_get(program(packed(given))))
 
 
 def packed(tree: Any) -> Packed:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -19,22 +20,25 @@ CHECK = 4
 
 
 class Errors(NamedTuple):
-    """Errors of configurations.
+    """Errors of configurations."""
 
-    Attributes:
-        position: largest of the distances [m].
-        orientation: largest of the angles [rad].
-        score: largest error relative to its tolerance: 1 and less is converged.
-        cost: what the steps reduce.
-    """
-
-    position: Float[Array, "..."]
-    orientation: Float[Array, "..."]
-    score: Float[Array, "..."]
-    cost: Float[Array, "..."]
+    position: Float[Array, "..."]  # largest of the distances [m]
+    orientation: Float[Array, "..."]  # largest of the angles [rad]
+    score: Float[Array, "..."]  # largest error relative to its tolerance: 1 and less is converged
+    cost: Float[Array, "..."]  # what the steps reduce
 
 
-@runtime_checkable
+def stepped(
+    step: Callable[[Array], tuple[Array, Errors]], x: Float[Array, "..."], lanes: int, steps: Any
+) -> tuple[Array, Array, Errors]:
+    """Return start and end of the last of some steps, and the errors at its start, for a number of lanes."""
+
+    def once(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
+        return carry[1], *step(carry[1])
+
+    return jax.lax.fori_loop(0, steps, once, (x, x, Errors(*[jnp.zeros(lanes, x.dtype)] * 4)))
+
+
 class Search(Protocol):
     """Base class of a search: a pytree whose methods take arrays with a leading axis of lanes."""
 
@@ -48,19 +52,12 @@ class Search(Protocol):
 
 
 class Found(NamedTuple):
-    """Best result of each target's searches.
+    """Best result of each target's searches."""
 
-    Attributes:
-        x: coordinates.
-        errors: there.
-        seed: number of the search.
-        steps: that the target's searches took, all together.
-    """
-
-    x: Float[Array, "targets n"]
-    errors: Errors
-    seed: Int[Array, " targets"]
-    steps: Int[Array, " targets"]
+    x: Float[Array, "targets n"]  # coordinates
+    errors: Errors  # there
+    seed: Int[Array, " targets"]  # number of the search
+    steps: Int[Array, " targets"]  # that the target's searches took, all together
 
 
 class _Lanes(NamedTuple):
@@ -94,8 +91,6 @@ def run_pool(
     Deterministic: which search a lane takes up depends on nothing but the arguments.
 
     Args:
-        search: the method.
-        goals: pytree of the targets, with the targets in front.
         open_: targets that are looked for; the others, which fill up a batch, are left alone.
         lanes: searches that go on at the same time.
         check: steps between two looks at how they are doing.

@@ -24,19 +24,12 @@ from ._task_search import CURVATURE, Aims, damped
 
 
 class Problem(NamedTuple):
-    """A search problem.
+    """A search problem."""
 
-    Attributes:
-        route: the search method (static).
-        goals: pytree with the targets in front.
-        parts: what else the search is made of; None for a ``ChainRoute``.
-        many: whether the user gave a batch.
-    """
-
-    route: ChainRoute | TaskRoute
-    goals: Any
-    parts: TaskParts | None
-    many: bool
+    route: ChainRoute | TaskRoute  # the search method
+    goals: Any  # pytree with the targets in front
+    parts: TaskParts | None  # what else the search is made of; None for a ``ChainRoute``
+    many: bool  # whether the user gave a batch
 
 
 def read_problem(

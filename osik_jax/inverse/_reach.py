@@ -19,17 +19,11 @@ _SWEEPS = 4
 
 
 class Reach(NamedTuple):
-    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move.
+    """Bound on where a chain of links brings a frame: within ``length`` of ``root``, which slides move."""
 
-    Attributes:
-        root: the first hinge's position with the slides before it in the middle of their ranges [m]. (3,)
-        slides: half the travel of each of these slides, along its direction in the world [m]. (k, 3)
-        length: of the links from there to the frame, with the slides among them drawn out [m]. ()
-    """
-
-    root: Float[Array, "3"]
-    slides: Float[Array, "k 3"]
-    length: Float[Array, ""]
+    root: Float[Array, "3"]  # the first hinge's position with the slides before it in the middle of their ranges [m]
+    slides: Float[Array, "k 3"]  # half the travel of each of these slides, along its direction in the world [m]
+    length: Float[Array, ""]  # of the links from there to the frame, with the slides among them drawn out [m]
 
 
 def reaches(chain: Chain, lower: Array, upper: Array) -> list[Reach]:
@@ -65,10 +59,7 @@ def beyond(
 ) -> Float[Array, " targets"]:
     """Return a lower bound on the distance from each target to the workspace [m]; 0 where it may be inside.
 
-    Args:
-        reaches: of the frames.
-        position: wanted of each frame [m].
-        asked: whether the whole position of each frame counts. (frames,)
+    ``asked``: whether the whole position of each frame counts. (frames,)
     """
     away = jnp.stack([_outside(reach, position[:, at]) for at, reach in enumerate(reaches)], -1)
     return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(away) & asked, away, 0.0), -1), 0.0)

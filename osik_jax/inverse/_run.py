@@ -18,9 +18,10 @@ from ._chain_problem import ENOUGH, Settings
 from ._closest import Closest, closest
 from ._fixed import LAST, Explored, Outcomes, Searches, choose, or_far, or_plain, search_all, with_placeholders
 from ._host import in_chunks, lanes_for, only
-from ._packed import Packed, packed, unpacked
+from ._packed import Packed, call_packed, packed, unpacked
 from ._pool import CHECK, Errors, run_pool
 from ._solution import InverseKinematicsSolution
+from ._task_minimum import settled
 from ._whole import whole, whole_is_possible
 
 _HOPELESS = 16
@@ -48,26 +49,22 @@ def searched(
     ``go_on``: to the configuration with the least error, for targets that are not met. ``wanted``: the targets that are
     searched for; default: all.
     """
-    lanes = lanes_for(len(jax.tree.leaves(goals)[0]))
-    run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
-    hopeless, by_core = 1 if go_on else _HOPELESS, whole_is_possible(route, every=False)
+    count, hopeless = len(jax.tree.leaves(goals)[0]), 1 if go_on else _HOPELESS
+    lanes, by_core = lanes_for(count), whole_is_possible(route, every=False)
 
-    def by_the_core(goals: Any, most: np.ndarray) -> InverseKinematicsSolution:
-        how = Searches(0, warm, near=False, every=False)
-        return whole(robot, route, goals, settings, most, hopeless, steps, how, single=False).answer
+    def search(most: int, goals: Any, left: np.ndarray) -> InverseKinematicsSolution:
+        if by_core:
+            counts, how = np.where(left, most, 0), Searches(0, warm, near=False, every=False)
+            return whole(robot, route, goals, settings, counts, hopeless, steps, how, single=False).answer
+        run = partial(_pooled, robot, route=route, warm=warm, lanes=lanes)
+        return call_packed(run, goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps))
 
     def chunk(goals: Any, wanted: np.ndarray) -> InverseKinematicsSolution:
-        def by(most: int, left: np.ndarray) -> InverseKinematicsSolution:
-            if by_core:
-                return jax.tree.map(np.asarray, by_the_core(goals, np.where(left, most, 0)))
-            given = packed((goals, settings, left, np.int32(most), np.int32(hopeless), np.int32(steps)))
-            return unpacked(jax.device_get(run(given)))
-
         alone = warm and not by_core
-        found = by(1 if alone else seeds, wanted)
+        found = jax.device_get(search(1 if alone else seeds, goals, wanted))
         left = wanted & ~found.converged
         if alone and left.any():
-            found = _with(found, left, by(seeds, left))
+            found = _with(found, left, search(seeds, goals, left))
             left &= ~found.converged
         return further(goals, found, left)
 
@@ -75,19 +72,15 @@ def searched(
         if not (go_on and left.any()):
             return found
         starts = min(seeds, _STARTS)
-        run_on = partial(_approached, robot, route=route, warm=warm, starts=starts)
-
-        def approach(*args: Any) -> InverseKinematicsSolution:
-            return unpacked(jax.device_get(run_on(packed((settings, *args)))))
-
-        own = only(left, approach, goals, found.q, found.seed, found.steps)
+        approach = partial(_approached, robot, route=route, warm=warm, starts=starts)
+        own = only(left, partial(call_packed, approach, settings), goals, found.q, found.seed, found.steps)
         return _with(found, left, own)
 
     if by_core and cuda_is_default() and wanted is None:  # all targets at once, whose answers stay on the GPU
-        found = by_the_core(goals, np.full(len(goals.position), seeds))
+        found = search(seeds, goals, np.ones(count, bool))
         missed = ~np.asarray(found.converged)
         return further(goals, jax.device_get(found), missed) if missed.any() else found
-    wanted = np.ones(len(jax.tree.leaves(goals)[0]), bool) if wanted is None else wanted
+    wanted = np.ones(count, bool) if wanted is None else wanted
     return in_chunks(lambda given, here: chunk(given[0], here & given[1]), (goals, wanted))
 
 
@@ -101,19 +94,11 @@ def found_at_once(
     found, score, ends, *_ = whole(robot, route, goals, settings, np.array([seeds]), 1, steps, how, single=True)
     if not (found.converged and (score is None or score <= ENOUGH)):
         return None
-    return Explored(found, *split(None if ends is None else np.asarray(ends)[None]))
+    return with_ends(found, None if ends is None else np.asarray(ends)[None])
 
 
 def explored_by_core(
-    robot: Robot,
-    goals: Any,
-    *,
-    most: int,
-    settings: Settings,
-    how: Searches,
-    steps: int,
-    route: Any,
-    go_on: bool,
+    robot: Robot, goals: Any, *, most: int, settings: Settings, how: Searches, steps: int, route: Any, go_on: bool
 ) -> Explored:
     """Return what ``explored`` does. Only targets that go on to the least error are computed by it."""
     count = np.full(len(goals.position), most)
@@ -125,14 +110,14 @@ def explored_by_core(
         by_jax = only(further, lambda goals: run(goals, go_on=True, fall_back=False).found, goals)
         kept = found.converged & how.near & (_distances(found, settings) < _distances(by_jax, settings))
         found = _with(found, further & ~kept, by_jax)
-    return Explored(found, *split(ends))
+    return with_ends(found, ends)
 
 
-def split(ends: Any) -> tuple[Outcomes | None, Any]:
-    """Return the ends of all searches by ``whole``, and whether they are isolated solutions."""
+def with_ends(found: InverseKinematicsSolution, ends: Any) -> Explored:
+    """Return answers with the ends of all searches by ``whole``, if there are any."""
     if ends is None:
-        return None, None
-    return Outcomes(ends[..., :-2], Errors(*[ends[..., -2]] * 4)), ends[..., -1] > 0.0
+        return Explored(found)
+    return Explored(found, Outcomes(ends[..., :-2], Errors(*[ends[..., -2]] * 4)), ends[..., -1] > 0.0)
 
 
 def isolated_at_answers(
@@ -181,11 +166,8 @@ def searched_on(
     new = dataclasses.replace(new, steps=found.steps + new.steps)
     left &= np.asarray(new.converged)
     if near and left.any():
-
-        def walk(*args: Any) -> InverseKinematicsSolution:
-            return unpacked(jax.device_get(_walked_home(robot, packed((settings, *args)), route=route, steps=steps)))
-
-        home = only(left, walk, goals, new.q, new.seed, new.steps)
+        walk = partial(_walked_home, robot, route=route, steps=steps)
+        home = only(left, partial(call_packed, walk, settings), goals, new.q, new.seed, new.steps)
         new = _with(new, np.asarray(home.converged) & (_distances(home, settings) < _distances(new, settings)), home)
     return _with(found, left & ~(met & (_distances(found, settings) <= _distances(new, settings))), new)
 
@@ -242,15 +224,7 @@ def _walked_home(robot: Robot, given: Packed, *, route: Any, steps: int) -> Pack
 
 @partial(jax.jit, static_argnames=("how", "route", "steps", "go_on", "fall_back"))
 def explored(
-    robot: Robot,
-    goals: Any,
-    *,
-    settings: Settings,
-    how: Searches,
-    route: Any,
-    steps: int,
-    go_on: bool,
-    fall_back: bool,
+    robot: Robot, goals: Any, *, settings: Settings, how: Searches, route: Any, steps: int, go_on: bool, fall_back: bool
 ) -> Explored:
     """Return the results of all searches of each target.
 
@@ -278,7 +252,7 @@ def explored(
         if not go_on:
             return outcomes, alone, Closest(x, jnp.zeros_like(score), best, jnp.zeros_like(best))
         if not route.starts_anew:
-            rest, more = fixed_search.settled(x, goals, loose)
+            rest, more = settled(fixed_search, x, goals, loose)
             takes = unmet | (jax.vmap(fixed_search.errors)(rest, goals)[1].score <= 1.0)
             return outcomes, alone, Closest(jnp.where(takes[:, None], rest, x), jnp.zeros_like(score), best, more)
         # a solution just out of reach, or singular, goes on too, but from itself, so that it stays on its branch

@@ -32,11 +32,7 @@ def unit_points(shift: UInt[Array, " n"], number: Int[Array, "..."], dtype: jnp.
 
     Its increments are the powers of 1/phi, phi being the positive root of ``phi**(n + 1) = phi + 1``: the golden ratio
     for n = 1. In integers that wrap around, so that a late point is as exact as the first.
-
-    Args:
-        shift: start, as a fraction of the cube in units of 2**-32.
-        number: of the points.
-        dtype: of the result.
+    ``shift``: the start, as a fraction of the cube in units of 2**-32.
     """
     steps = jnp.asarray(increments(len(shift)))
     bits = shift + number.astype(jnp.uint32)[..., None] * steps

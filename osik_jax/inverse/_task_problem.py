@@ -22,13 +22,13 @@ from ..robot._tree import HINGE, SLIDE
 from ..schemes import Scheme
 from ..tasks import FrameTask, Task
 from ._chain_problem import Settings, allowed
-from ._fixed import at_solution
+from ._implicit import attached
 from ._pool import Errors
 from ._seeds import shift_of, starting_box
 from ._solution import InverseKinematicsSolution
 from ._task_minimum import AT_LIMIT
 from ._task_search import Aims, TaskSearch, entry_limits, is_goal
-from ._turns import TURN, one_turn
+from ._turns import starting_range
 
 _BACKGROUND = 1e-3
 """Largest weight of a preference, relative to the goals': that of a ``PostureTask`` by default."""
@@ -65,12 +65,11 @@ class TaskRoute(NamedTuple):
 
     def search(self, robot: Robot, settings: Settings, *, warm: bool, near: bool) -> TaskSearch:
         """Return the search for these tasks."""
-        del warm, near
         parts: TaskParts = settings.parts
         lower, upper = entry_limits(robot, settings.lower, settings.upper)
-        box, turns = starting_box(lower, upper), turning(robot, parts.tasks)
+        turns = turning(robot, parts.tasks)
         first = with_balls_inside(robot.tree, jnp.clip(settings.home, lower, upper), settings.upper)
-        low, high = _starts(robot, turns, *box, first)
+        low, high = starting_range(*starting_box(lower, upper), first, _widths(robot), turns)
         return TaskSearch(
             robot=robot,
             turns=turns,
@@ -113,7 +112,7 @@ class TaskRoute(NamedTuple):
 
     def answer(self, robot: Robot, search: TaskSearch, goal: Any, x: Array, seed: Array, steps: Array) -> Any:
         """Return the answer for many targets: errors computed anew, with the derivative of a solution."""
-        q = jax.vmap(at_solution, in_axes=(None, 0, 0))(search, goal, search.unwound(x))
+        q = jax.vmap(attached, in_axes=(0, None, 0))(jax.lax.stop_gradient(search.unwound(x)), search, goal)
         here = jax.lax.stop_gradient(q)
         residual, at_limit, errors = jax.vmap(lambda q, goal: _evaluated(search, q, goal))(q, goal)
         avoiding = (limit for limit in search.limits if isinstance(limit, CollisionAvoidanceLimit))
@@ -198,17 +197,12 @@ def turning(robot: Robot, tasks: Mapping[str, Task]) -> tuple[bool, ...]:
     return tuple(turns.tolist())
 
 
-def _starts(robot: Robot, turns: tuple[bool, ...], lower: Array, upper: Array, first: Array) -> tuple[Array, Array]:
-    """Return the box of starts: limits or half a turn; free and ball joints keep their values here."""
-    once, again = one_turn(lower, upper, first)
-    wide = np.array(turns) & (upper - lower > TURN)
+def _widths(robot: Robot) -> Float[np.ndarray, " nq"]:
+    """Return half the range of starts of joints without limits; free and ball joints keep their values."""
     width = np.zeros(robot.nq)
     for joint, at in robot.tree.qpos_address.items():
         width[at] = {HINGE: np.pi, SLIDE: 1.0}.get(robot.tree.joint_types[joint], 0.0)
-    free = jnp.isinf(lower) | jnp.isinf(upper)
-    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
-    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
-    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, again, high).astype(first.dtype)
+    return width
 
 
 def _evaluated(

@@ -16,15 +16,15 @@ from ..kinematics import Kinematics, difference, forward_kinematics, integrate
 from ..limits import ConfigurationLimit, Limit, limit_rows
 from ..numerics._arguments import numbers_for
 from ..robot import Robot
-from ..robot._joint_selection import scalar_layout
+from ..robot._joint_selection import dof_of_entries
 from ..robot._ranges import independent_balls, with_balls_inside
 from ..schemes import Scheme, VelocityProblem
 from ..tasks import Task, TaskRows
 from ..tasks._rows import rows_of
 from ._linear import ISOLATED, positive_pivot
-from ._pool import Errors
+from ._pool import Errors, stepped
 from ._seeds import unit_points
-from ._task_minimum import has_minimum, ranks, rate_at_rest, settled
+from ._task_minimum import has_minimum, ranks, rate_at_rest
 from ._turns import unwound
 
 _LONGEST = 1.0
@@ -48,15 +48,10 @@ _SPREADS = 8
 
 
 class Aims(NamedTuple):
-    """Targets of the tasks of one search, where a batch has many.
+    """Targets of the tasks of one search, where a batch has many."""
 
-    Attributes:
-        number: number of the target in the batch.
-        targets: targets by name of the task; other tasks keep their own.
-    """
-
-    number: Int[Array, "*n"]
-    targets: dict[str, Any]
+    number: Int[Array, "*n"]  # number of the target in the batch
+    targets: dict[str, Any]  # targets by name of the task; other tasks keep their own
 
 
 class TaskSearch(eqx.Module):
@@ -64,44 +59,26 @@ class TaskSearch(eqx.Module):
 
     The tasks' own curvature, as damping, keeps long steps in check. Tasks that are no goals fade out as the goals are
     met, so that a posture decides between solutions and never keeps the goals from being met.
-
-    Attributes:
-        robot: the robot.
-        turns: of each entry of q, whether a whole turn of it changes no task (static).
-        tasks: all of them, gains 1.
-        scheme: whose steps are taken.
-        limits: on configurations.
-        first: where search 0 starts. (nq,)
-        low: of where searches start, of each entry of q. (nq,)
-        high: (nq,)
-        lower: limits of each entry of q, -inf where free. (nq,)
-        upper: (nq,)
-        angles: greatest angles of ball joints, in their three entries of v, inf where free. (nv,)
-        shift: of the sequence of starts. (nq,)
-        tolerance: of position [m] and orientation [rad]. (2,)
-        enough: score at which a search stays where it is. ()
-        preferred: largest gain of the preferences. ()
     """
 
     robot: Robot
-    turns: tuple[bool, ...] = eqx.field(static=True)
-    tasks: dict[str, Task]
-    scheme: Scheme
-    limits: tuple[Limit, ...]
-    first: Float[Array, " nq"]
-    low: Float[Array, " nq"]
+    turns: tuple[bool, ...] = eqx.field(static=True)  # of each entry of q, whether a whole turn of it changes no task
+    tasks: dict[str, Task]  # all of them, gains 1
+    scheme: Scheme  # whose steps are taken
+    limits: tuple[Limit, ...]  # on configurations
+    first: Float[Array, " nq"]  # where search 0 starts
+    low: Float[Array, " nq"]  # of where searches start, of each entry of q
     high: Float[Array, " nq"]
-    lower: Float[Array, " nq"]
+    lower: Float[Array, " nq"]  # limits of each entry of q, -inf where free
     upper: Float[Array, " nq"]
-    angles: Float[Array, " nv"]
-    shift: UInt[Array, " nq"]
-    tolerance: Float[Array, "2"]
-    enough: Float[Array, ""]
-    preferred: Float[Array, ""]
+    angles: Float[Array, " nv"]  # greatest angles of ball joints, in their three entries of v, inf where free
+    shift: UInt[Array, " nq"]  # of the sequence of starts
+    tolerance: Float[Array, "2"]  # of position [m] and orientation [rad]
+    enough: Float[Array, ""]  # score at which a search stays where it is
+    preferred: Float[Array, ""]  # largest gain of the preferences
 
     def begin(self, seed: Int[Array, " lanes"], goal: Aims) -> Float[Array, "lanes nq"]:
         """Return the starts of the searches: the first configuration, then points at growing distances from it."""
-        del goal
         unit = unit_points(self.shift, seed, self.low.dtype)
         points = self.low + (self.high - self.low) * unit
         ratio = ((seed + _SPREADS - 1) % _SPREADS + 1).astype(points.dtype) / _SPREADS
@@ -120,13 +97,7 @@ class TaskSearch(eqx.Module):
 
     def advance(self, x: Float[Array, "lanes nq"], goal: Aims, steps: Any) -> tuple[Array, Array, Errors]:
         """Return the state after some steps: start and end of the last one, and the errors at its start."""
-
-        def step(_: Array, carry: tuple[Array, Array, Errors]) -> tuple[Array, Array, Errors]:
-            after, errors = jax.vmap(self.step)(carry[1], goal)
-            return carry[1], after, errors
-
-        nothing = jnp.zeros(len(x), x.dtype)
-        return jax.lax.fori_loop(0, steps, step, (x, x, Errors(nothing, nothing, nothing, nothing)))
+        return stepped(lambda q: jax.vmap(self.step)(q, goal), x, len(x), steps)
 
     def step(self, q: Float[Array, " nq"], goal: Aims) -> tuple[Float[Array, " nq"], Errors]:
         """Return the next configuration, and the errors at the present one. A finished search does not move."""
@@ -154,12 +125,6 @@ class TaskSearch(eqx.Module):
             return along
         reached = self.errors(q, goal)[1].score <= self.enough
         return jnp.where(reached, along, rate_at_rest(self, q, goal, rates))
-
-    def settled(
-        self, q: Float[Array, "lanes nq"], goal: Aims, open_: Bool[Array, " lanes"]
-    ) -> tuple[Float[Array, "lanes nq"], Int[Array, " lanes"]]:
-        """Return the configurations of least error that q leads to, for goals of one level, and the steps taken."""
-        return settled(self, q, goal, open_)
 
     def errors(self, q: Float[Array, " nq"], goal: Aims) -> tuple[dict[str, TaskRows], Errors]:
         """Return the rows of the goals at q, and their errors."""
@@ -194,10 +159,7 @@ class TaskSearch(eqx.Module):
 
     def aimed(self, goal: Aims) -> dict[str, Task]:
         """Return the tasks with a goal's targets."""
-        return {
-            **self.tasks,
-            **{name: self.tasks[name].replace(target=target) for name, target in goal.targets.items()},
-        }
+        return self.tasks | {name: self.tasks[name].replace(target=target) for name, target in goal.targets.items()}
 
     def distance(self, q: Float[Array, " nq"]) -> Float[Array, ""]:
         """Return the distance from the first configuration, over v."""
@@ -314,7 +276,5 @@ def sizes_of(task: Task, rows: TaskRows) -> tuple[Array, Array]:
 
 def entry_limits(robot: Robot, lower: Array, upper: Array) -> tuple[Array, Array]:
     """Return the limits of each entry of q, from those of each entry of v."""
-    scalar, index = scalar_layout(robot)
-    dof, numbers = np.full(robot.nq, -1), numbers_for(lower, upper)
-    dof[index[scalar]] = np.flatnonzero(scalar)
+    dof, numbers = dof_of_entries(robot), numbers_for(lower, upper)
     return numbers.where(dof >= 0, lower[dof], -np.inf), numbers.where(dof >= 0, upper[dof], np.inf)

@@ -22,12 +22,7 @@ def unwound(
 ) -> Float[Array, "*lanes n"]:
     """Add whole turns to coordinates within their limits, so that they are as near as possible to a configuration.
 
-    Args:
-        x: coordinates within the limits [rad or m].
-        about: the configuration [rad or m].
-        lower: limits, -inf where free.
-        upper: likewise.
-        turns: of each coordinate, whether a whole turn changes no pose.
+    ``turns``: of each coordinate, whether a whole turn changes no pose. Limits are -inf and inf where free [rad or m].
     """
     # the numbers of turns that stay inside the limits; infinite limits allow any number
     numbers = numbers_for(x, about, lower, upper)
@@ -37,9 +32,21 @@ def unwound(
     return numbers.where(np.array(turns) & (number != 0.0), moved, x).astype(x.dtype)
 
 
-def one_turn(
-    lower: Float[Array, " n"], upper: Float[Array, " n"], about: Float[Array, " n"]
+def starting_range(
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    first: Float[Array, " n"],
+    width: Float[np.ndarray, " n"],
+    turns: Sequence[bool],
 ) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return bounds one turn apart within wider limits, centred on a configuration as far as possible."""
-    low = jnp.clip(about - 0.5 * TURN, lower, upper - TURN)
-    return low, low + TURN
+    """Return finite ranges for the starts of searches: the limits, one turn, or ``width`` to both sides without limits.
+
+    The last two are centred on the configuration ``first``, as far as the limits allow. Arguments as in ``unwound``.
+    """
+    free = jnp.isinf(lower) | jnp.isinf(upper)
+    low = jnp.where(free, jnp.maximum(first - width, lower), lower)
+    high = jnp.where(free, jnp.minimum(first + width, upper), upper)
+    # beyond a whole turn, starts would repeat the same poses
+    wide = np.array(turns) & (upper - lower > TURN)
+    once = jnp.clip(first - 0.5 * TURN, lower, upper - TURN)
+    return jnp.where(wide, once, low).astype(first.dtype), jnp.where(wide, once + TURN, high).astype(first.dtype)

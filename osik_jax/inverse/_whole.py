@@ -21,9 +21,9 @@ from ..execution._platform import cuda_is_default
 from ..numerics._constants import SINGLE_TOUCH, TOUCH
 from ..numerics._remembered import remembered
 from ..robot import Robot
-from ..robot._joint_selection import dof_names
+from ..robot._joint_selection import dof_names, dof_of_entries
 from ._chain_kernel import integers_of, numbers_of
-from ._chain_problem import STOPPED, ChainRoute, Settings, carried, dof_of_entries, search_of
+from ._chain_problem import STOPPED, ChainRoute, Settings, carried, search_of
 from ._chain_search import DAMPING, LEAST_DAMPING, ChainSearch, Goal
 from ._fixed import LAST, SETTLED, Searches, or_far, with_placeholders
 from ._linear import ISOLATED
@@ -42,34 +42,23 @@ _STILL = 1e-9
 
 
 class Whole(NamedTuple):
-    """Results of whole searches.
+    """Results of whole searches."""
 
-    Attributes:
-        answer: the answers, as of ``ChainRoute.answer``.
-        score: of the answers, where all searches run. (targets,)
-        ends: with ``every``, of each search its end point, the score there, and whether it is an isolated solution.
-        pair: with a scene, numbers of the two shapes of the nearest pair, and why there is no free solution, as in
-            ``core/freedom.hpp``. (targets, 3)
-    """
-
-    answer: InverseKinematicsSolution
-    score: Float[Array, "*targets"] | None
+    answer: InverseKinematicsSolution  # the answers, as of ``ChainRoute.answer``
+    score: Float[Array, "*targets"] | None  # of the answers, where all searches run
+    # with ``every``, of each search its end point, the score there, and whether it is an isolated solution
     ends: Float[Array, "*targets seeds n_and_2"] | None
+    # with a scene, numbers of the two shapes of the nearest pair, and why there is no free solution, as in
+    # ``core/freedom.hpp``
     pair: Int[Array, "*targets 3"] | None = None
 
 
 class Around(NamedTuple):
-    """Arrays of the robot's shapes and of the obstacles for the core.
+    """Arrays of the robot's shapes and of the obstacles for the core."""
 
-    Attributes:
-        robot: its shapes.
-        scene: the obstacles.
-        clearance: distance that all pairs keep [m]. (1,)
-    """
-
-    robot: CoreRobot
-    scene: CoreScene
-    clearance: Float[Array, "1"] | np.ndarray
+    robot: CoreRobot  # its shapes
+    scene: CoreScene  # the obstacles
+    clearance: Float[Array, "1"] | np.ndarray  # distance that all pairs keep [m]
 
 
 class _Known(NamedTuple):
@@ -105,10 +94,6 @@ def whole(
     """Return the results of whole searches.
 
     Args:
-        robot: the robot.
-        route: its frames.
-        goals: the targets.
-        settings: numbers, without ``parts``.
         most: number of searches for each target at most, where they do not all run. (targets,)
         hopeless: the same for targets that are out of reach.
         steps: of one search at most.
@@ -248,12 +233,7 @@ def by_core(
 
 
 def gone_on(
-    call: Callable[..., list[Array]],
-    found: list[Array],
-    left: Array,
-    members: int,
-    *lanes: Array,
-    enough: int = 0,
+    call: Callable[..., list[Array]], found: list[Array], left: Array, members: int, *lanes: Array, enough: int = 0
 ) -> tuple[list[Array], Array]:
     """Return ``found`` with what ``call(members, *lanes)`` finds for the targets that are left, and which still are.
 

@@ -21,18 +21,13 @@ from ..numerics._host import Numbers, module_of
 from ..robot import Robot
 
 AXES = ("x", "y", "yaw", "height")
+"""Coordinates of a base, in the order of the grid's axes."""
 _ROUNDING = 1e-6
 """Largest error of distances by rounding [m]."""
-"""Coordinates of a base, in the order of the grid's axes."""
 
 
 def checked_axis(name: str, given: Any) -> Float[np.ndarray, " n"]:
-    """Return the coordinates of a grid along one axis.
-
-    Raises:
-        TypeError: no numbers.
-        ValueError: not finite, or not increasing.
-    """
+    """Return the coordinates of a grid along one axis, checked."""
     try:
         axis = np.atleast_1d(np.asarray(given, float))
     except (TypeError, ValueError):
@@ -58,13 +53,7 @@ def base_poses(bases: Float[Numbers, "n 4"]) -> tuple[Float[Numbers, "n 3"], Flo
 
 
 def in_bases(bases: Float[Numbers, "n 4"], position: Any, rotation: Any) -> tuple[Numbers, Numbers]:
-    """Return poses in the axes of each base, from the world's.
-
-    Args:
-        bases: x, y, yaw, height. (n, 4)
-        position: [m]. (k, 3), or one set for each base (n, k, 3)
-        rotation: (k, 3, 3) or (n, k, 3, 3)
-    """
+    """Return poses in the axes of each base, from the world's: (k, 3) [m] and (k, 3, 3), or those of each base."""
     origin, turn = base_poses(bases)
     inverse = turn.swapaxes(-1, -2)[:, None]
     return rotate(inverse, position - origin[:, None]), compose(inverse, rotation)

@@ -85,21 +85,13 @@ def goal_in_base(base: Any, goal: Goal) -> Goal:
 
 
 class Climber(NamedTuple):
-    """Climb of the smallest margin of the poses that a base reaches.
+    """Climb of the smallest margin of the poses that a base reaches."""
 
-    Attributes:
-        task: poses and scene.
-        lower: bounds of the base's coordinates. (4,)
-        upper: (4,)
-        steps: largest first step of each. (4,)
-        stands: whether bases stand free.
-    """
-
-    task: Task
-    lower: np.ndarray
-    upper: np.ndarray
-    steps: np.ndarray
-    stands: Callable[[np.ndarray], np.ndarray]
+    task: Task  # poses and scene
+    lower: Float[np.ndarray, "4"]  # bounds of the base's coordinates
+    upper: Float[np.ndarray, "4"]
+    steps: Float[np.ndarray, "4"]  # largest first step of each
+    stands: Callable[[np.ndarray], np.ndarray]  # whether bases stand free
 
     def climb(self, base: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return a base and configurations with larger margins, from ones of poses that are reached.

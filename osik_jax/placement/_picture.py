@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull
 
 from ..collision import Scene
 from ..collision._table import ShapeKind
-from ..reachability._slices import NOTHING, cell_edges, share_colors
+from ..reachability._picture import NOTHING, cell_edges, share_colors
 
 _INK, _GREY, _BEST = "#2b2f36", "#5b636d", "#f08c3a"
 

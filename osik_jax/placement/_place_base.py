@@ -20,13 +20,14 @@ from ..control._checks import check_setting, checked_start
 from ..inverse._chain_problem import ChainRoute, search_of
 from ..inverse._chain_search import Goal
 from ..inverse._free import checked_clearance
-from ..inverse._inverse_kinematics import checked_tolerance, joint_box
+from ..inverse._inverse_kinematics import checked_tolerances, joint_box
 from ..inverse._poses import read_poses
 from ..inverse._seeds import shift_of
 from ..inverse._whole import carried_by
 from ..kinematics._pose_forms import PoseLike
 from ..numerics._arguments import check_count
 from ..reachability._frame import read_frame
+from ..reachability._grid import spread
 from ..robot import Robot
 from ._bases import AXES, base_clearances, checked_axis, grid_bases, stands_free
 from ._gradient import Climber
@@ -129,11 +130,10 @@ def place_base(
             f"Give other x, y or height; if the base stands on it, let them touch by scene=scene.allow({pair}), or "
             f"--allow {':'.join(pair)}"
         )
-    scores = score_grid(task, grid[allowed])
+    scores, shape, count = score_grid(task, grid[allowed]), tuple(map(len, axes)), len(task.goal.position)
     best = grid[allowed][_order(*scores.table)[:_BEST]]
-    reaches, margin, index = _spread(allowed, (scores.reached, *scores.table[1:]))
+    margin, index = (spread(part, allowed, np.nan).reshape(shape) for part in scores.table[1:])
     base, q = _refined(task, best, axes, refine, lambda bases: stands_free(gaps(bases)[0], clearance))
-    shape, count = tuple(map(len, axes)), len(task.goal.position)
     return Placement(
         robot=robot,
         scene=scene,
@@ -142,10 +142,10 @@ def place_base(
         **dict(zip(AXES, axes, strict=True)),
         base_clearance=gap.reshape(shape),
         blocked_by=dict(Counter(pair for pair, free in zip(pairs, allowed, strict=False) if not free).most_common()),
-        reaches=reaches.reshape(*shape, count),
+        reaches=spread(scores.reached, allowed, False).reshape(*shape, count),
         too_far=is_too_far(task, grid).sum(1).reshape(shape),
-        margin=margin.reshape(shape),
-        manipulability=index.reshape(shape),
+        margin=margin,
+        manipulability=index,
         best=base,
         q=q,
         best_margin=joint_margin(task.search, q[:, task.entries]),
@@ -169,22 +169,12 @@ def _read_task(robot: Robot, poses: Any, scene: Scene | None, settings: dict[str
     goal, rows, _ = read_poses(robot, poses)
     lower, upper = joint_box(robot, None)
     home = robot.q0 if settings["q0"] is None else checked_start(robot, settings["q0"])
-    sizes = (settings[f"{of}_tolerance"] for of in ("position", "orientation"))
-    tolerance = jnp.stack([checked_tolerance(size, home.dtype) for size in sizes])
+    sizes = settings["position_tolerance"], settings["orientation_tolerance"]
+    tolerance = jnp.asarray(checked_tolerances(*sizes, home.dtype))
     route, own = ChainRoute(tuple(poses), rows), carried_by(robot, lower, upper, frames=tuple(poses))
     shift = shift_of(key, len(own.lower))
     search = search_of(own, route, home, shift, tolerance, 1, warm=False, near=False)
     return Task(robot, frames, rows, goal, scene, settings, search)
-
-
-def _spread(allowed: np.ndarray, table: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the scores of the allowed bases as those of all bases: False and NaN for those that are not allowed."""
-    whole = []
-    for values in table:
-        nothing = False if values.dtype == bool else np.nan
-        whole.append(np.full((len(allowed), *values.shape[1:]), nothing, values.dtype))
-        whole[-1][allowed] = values
-    return whole
 
 
 def _refined(

@@ -28,25 +28,15 @@ _NUMBERS = 8_000_000
 
 
 class Task(NamedTuple):
-    """Poses, obstacles and settings by which bases are compared.
-
-    Attributes:
-        robot: the robot.
-        frames: those that the poses are of, with their kinematics.
-        rows: of each frame, which rows of its pose count.
-        goal: the poses, in world axes. (poses, frames, ...)
-        scene: in world axes; None: collisions do not count.
-        settings: other arguments of ``inverse_kinematics``.
-        search: the coordinates that move the frames, with their limits.
-    """
+    """Poses, obstacles and settings by which bases are compared."""
 
     robot: Robot
-    frames: tuple[Frame, ...]
-    rows: tuple[tuple[bool, ...], ...]
-    goal: Goal
-    scene: Scene | None
-    settings: dict[str, Any]
-    search: ChainSearch
+    frames: tuple[Frame, ...]  # those that the poses are of, with their kinematics
+    rows: tuple[tuple[bool, ...], ...]  # of each frame, which rows of its pose count
+    goal: Goal  # the poses, in world axes; (poses, frames, ...)
+    scene: Scene | None  # in world axes; None: collisions do not count
+    settings: dict[str, Any]  # other arguments of ``inverse_kinematics``
+    search: ChainSearch  # the coordinates that move the frames, with their limits
 
     @property
     def entries(self) -> np.ndarray:
@@ -55,19 +45,13 @@ class Task(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """Scores of bases, the last axis of each array is that of the poses.
+    """Scores of bases, the last axis of each array is that of the poses."""
 
-    Attributes:
-        reached: whether a configuration is found for each pose. (n, poses)
-        margin: distance of the nearest joint from its limit, over the joint's range; NaN if none is found. (n, poses)
-        manipulability: Yoshikawa's index, the smallest of the frames; NaN if none is found. (n, poses)
-        q: the configurations; NaN if none is found. (n, poses, nq)
-    """
-
-    reached: Bool[np.ndarray, "n poses"]
+    reached: Bool[np.ndarray, "n poses"]  # whether a configuration is found for each pose
+    # distance of the nearest joint from its limit, over the joint's range; NaN if none is found
     margin: Float[np.ndarray, "n poses"]
-    manipulability: Float[np.ndarray, "n poses"]
-    q: Float[np.ndarray, "n poses nq"]
+    manipulability: Float[np.ndarray, "n poses"]  # Yoshikawa's index, the smallest of the frames; NaN if none is found
+    q: Float[np.ndarray, "n poses nq"]  # the configurations; NaN if none is found
 
     @classmethod
     def empty(cls, task: Task, count: int) -> Scores:
@@ -121,10 +105,7 @@ def score_grid(task: Task, bases: Float[np.ndarray, "n 4"]) -> Scores:
 def score_bases(task: Task, bases: Float[np.ndarray, "n 4"], *, every: bool = False) -> Scores:
     """Return the scores of bases after all searches for all poses.
 
-    Args:
-        task: the poses and the scene.
-        bases: x, y, yaw, height. (n, 4)
-        every: take the configuration with the largest margin of all that are found, not the first one.
+    ``every``: take the configuration with the largest margin of all that are found, not the first one.
     """
     scores = Scores.empty(task, len(bases))
     pairs = np.indices(scores.reached.shape).reshape(2, -1)
@@ -151,12 +132,10 @@ def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndar
     count = len(base)
     if not count:
         return Scores(*(field[base, pose] for field in Scores.empty(task, len(bases))))
-    each = (
-        1
-        if task.scene is None
-        else task.scene.capacity * (task.scene.capacity + 100) + 3 * len(task.scene.table.vertices)
-    )
     few, many = _PAIRS
+    each, scene = 1, task.scene  # entries of the scene of a pair
+    if scene is not None:
+        each = scene.capacity * (scene.capacity + 100) + 3 * len(scene.table.vertices)
     size = few if count <= 8 * few or each * many > _NUMBERS else many
     padded = np.arange(-(-count // size) * size) % count  # the last call has the first pairs again
     parts = []
@@ -173,10 +152,8 @@ def _search_pairs(task: Task, bases: np.ndarray, base: np.ndarray, pose: np.ndar
 def _roomiest(task: Task, found: InverseKinematicsSolution) -> np.ndarray:
     """Return the solution with the largest margin of each answer."""
     others = np.asarray(found.solutions)
-    pick = np.nan_to_num(joint_margin(task.search, others[..., task.entries]), nan=-1.0).argmax(
-        -1
-    )  # rows without a solution are NaN
-    return np.take_along_axis(others, pick[:, None, None], 1)[:, 0]
+    margin = np.nan_to_num(joint_margin(task.search, others[..., task.entries]), nan=-1.0)  # of rows without a solution
+    return np.take_along_axis(others, margin.argmax(-1)[:, None, None], 1)[:, 0]
 
 
 def solve_pairs(

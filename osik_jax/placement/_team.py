@@ -134,19 +134,12 @@ def place_robots(found: Mapping[str, Placement]) -> Team:
 
 @dataclasses.dataclass(frozen=True)
 class Member:
-    """A robot that is placed among others.
+    """A robot that is placed among others."""
 
-    Attributes:
-        task: its poses and scene.
-        home: its configuration while others work. (nq,)
-        bases: those of its grid that reach a pose. (n, 4)
-        reaches: which poses they reach. (n, poses)
-    """
-
-    task: Task
-    home: np.ndarray
-    bases: np.ndarray
-    reaches: np.ndarray
+    task: Task  # its poses and scene
+    home: Float[np.ndarray, " nq"]  # its configuration while others work
+    bases: Float[np.ndarray, "n 4"]  # those of its grid that reach a pose
+    reaches: Bool[np.ndarray, "n poses"]  # which poses they reach
 
     @classmethod
     def of(cls, found: Placement) -> Member:
@@ -185,10 +178,6 @@ class Member:
         alone = self.shapes._replace(pairs=np.zeros((0, 2), np.int32), world=np.ones(len(self.shapes.names), bool))
         return shape_clearances(self.task.robot, bases, Scene({"others": others}), alone, q)[0]
 
-    def clear_of(self, others: Sequence[ConvexShape]) -> np.ndarray:
-        """Return whether the robot at home keeps the clearance to some shapes, at each of its bases."""
-        return self.distances(self.bases, others, self.home) >= self.task.settings["clearance"]
-
 
 def _chosen(members: Sequence[Member], start: int) -> list[int]:
     """Return the number of each robot's base, from one of the first robot.
@@ -198,11 +187,10 @@ def _chosen(members: Sequence[Member], start: int) -> list[int]:
     """
     chosen: list[int] = [start, *[-1] * (len(members) - 1)]
     for k in [*range(1, len(members)), *range(len(members)), *range(len(members))]:
-        others = [
-            (member, at) for j, (member, at) in enumerate(zip(members, chosen, strict=True)) if j != k and at >= 0
-        ]
-        gain = (members[k].reaches & ~_covered(others)).sum(1)
-        gain[~members[k].clear_of([shape for member, at in others for shape in member.home_at(at)])] = -1
+        own, others = members[k], [(members[j], at) for j, at in enumerate(chosen) if j != k and at >= 0]
+        gain = (own.reaches & ~_covered(others)).sum(1)
+        shapes = [shape for member, at in others for shape in member.home_at(at)]
+        gain[~(own.distances(own.bases, shapes, own.home) >= own.task.settings["clearance"])] = -1
         if gain.max() < 0:
             raise OsikValueError(f"robot {k} stands nowhere clear of the others: give grids that are wider apart")
         if gain[chosen[k]] < gain.max() or chosen[k] < 0:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._rigid import rotation_matrix
@@ -77,6 +79,13 @@ def checked_grid(grid: object) -> Grid:
         if axis.ndim != 1 or not axis.size or not np.isfinite(axis).all() or not (np.diff(axis) > 0.0).all():
             raise OsikValueError(f"{name} of the grid is {axis}; {expected}")
     return axes  # pyright: ignore[reportReturnType]
+
+
+def spread(values: np.ndarray, chosen: Bool[np.ndarray, " m"], elsewhere: Any) -> np.ndarray:
+    """Return values (k, ...) of the chosen points as those of all points. (m, ...)."""
+    whole = np.full((len(chosen), *values.shape[1:]), elsewhere, values.dtype)
+    whole[chosen] = values
+    return whole
 
 
 def spread_rotations(count: int) -> Float[np.ndarray, "count 3 3"]:

@@ -72,10 +72,9 @@ class ReachabilityMap:
         Raises:
             ValueError: ``at`` is no point.
         """
-        from ._picture import Field, draw_slices
+        from ._picture import draw_slices  # matplotlib, an extra
 
-        field = Field(self.axes, self.share, self.beyond_reach, self.links)
-        return draw_slices(field, self.frame, len(self.rotations), at)
+        return draw_slices(self, at)
 
 
 def load_map(path: str | os.PathLike[str]) -> ReachabilityMap:

@@ -18,14 +18,14 @@ from ..collision._core import check_scene
 from ..collision._robot_shapes import Given, robot_shapes
 from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
-from ..inverse._inverse_kinematics import checked_tolerance
+from ..inverse._inverse_kinematics import checked_tolerances
 from ..inverse._poses import read_poses
 from ..limits import Limits
 from ..numerics._arguments import check_count
 from ..robot import Robot
 from ..scaling import run_in_chunks
 from ._frame import Frame, read_frame
-from ._grid import Grid, around, checked_grid, spread_rotations
+from ._grid import Grid, around, checked_grid, spread, spread_rotations
 from ._map import ReachabilityMap
 
 _POSES = 16_384
@@ -104,8 +104,7 @@ def reachability_map(
     check_setting("reachability_map(robot, frame)", robot, None, 1.0)
     check_count("seeds", seeds)
     check_count("key", key, least=0)
-    for tolerance in (position_tolerance, orientation_tolerance):
-        checked_tolerance(tolerance, robot.q0.dtype)
+    checked_tolerances(position_tolerance, orientation_tolerance, robot.q0.dtype)
     if scene is not None:
         check_scene(scene)
     limits = checked_limits(robot, limits)
@@ -114,7 +113,7 @@ def reachability_map(
     rotations = _rotations(robot, frame, orientations)
     positions = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     beyond = np.asarray(own.beyond_reach(jnp.asarray(positions, robot.q0.dtype)))
-    near = np.flatnonzero(beyond <= 0.0)
+    near = beyond <= 0.0
     tolerances = dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
     settings = dict(limits=limits, seeds=seeds, key=key, scene=scene, clearance=clearance, **tolerances)
     # the pairs take part in what tells one job from another
@@ -122,19 +121,14 @@ def reachability_map(
     found = _run(own, positions[near], rotations, settings, (srdf, pairs), out, progress)
     shape = tuple(len(axis) for axis in axes)
 
-    def spread(values: np.ndarray, elsewhere: Any) -> np.ndarray:
-        whole = np.full((len(positions), *values.shape[1:]), elsewhere, values.dtype)
-        whole[near] = values
-        return whole.reshape(*shape, *values.shape[1:])
-
     return ReachabilityMap(
         frame=frame,
         **dict(zip("xyz", axes, strict=True)),
         rotations=rotations,
-        reached=spread(found["reached"], False),
+        reached=spread(found["reached"], near, False).reshape(*shape, -1),
         beyond_reach=beyond.reshape(shape),
-        manipulability=spread(found["manipulability"], np.nan),
-        q=spread(found["q"], np.nan),
+        manipulability=spread(found["manipulability"], near, np.nan).reshape(shape),
+        q=spread(found["q"], near, np.nan).reshape(*shape, -1),
         links=np.asarray(own.links()),
     )
 

@@ -67,6 +67,14 @@ def scalar_layout(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     return mask, index
 
 
+def dof_of_entries(robot: Robot) -> np.ndarray:
+    """Return the entry of v of each entry of q that is a hinge or a slide; -1 for other entries. (nq,)."""
+    scalar, index = scalar_layout(robot)
+    out = np.full(robot.nq, -1)
+    out[index[scalar]] = np.flatnonzero(scalar)
+    return out
+
+
 def dof_names(robot: Robot) -> list[str]:
     """Return the joint name of each entry of v, for messages. (nv,)."""
     return [robot.tree.joint_names[j] for j in robot.tree.dof_joint[robot.tree.own_dofs]]

@@ -160,7 +160,11 @@ class Scenarios(eqx.Module):
         places = [place for name in self.values for place in find_leaves(loop.names, name)]
         values = {loop.names[place]: leaves[loop.names[place]] for place in places}
         self._check_targets(loop)
-        q0 = None if self.q0 is None else _starts(self.q0, loop)
+        q0 = self.q0
+        if q0 is not None:
+            if q0.shape[1:] != (loop.robot.nq,):
+                raise OsikValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
+            q0 = q0.astype(loop.robot.q0.dtype)
         return eqx.tree_at(lambda s: (s.q0, s.values), self, (q0, values), is_leaf=lambda leaf: leaf is None)
 
     def _check_targets(self, loop: Loop) -> None:
@@ -177,13 +181,6 @@ class Scenarios(eqx.Module):
                         f"targets[{name!r}] has shape {leaf.shape}; it is (n, {loop.steps}, ...), one target a step. "
                         f"For targets that stand still: values={{'{name}.target': ...}}"
                     )
-
-
-def _starts(q0: Array, loop: Loop) -> Float[Array, "n nq"]:
-    """Return start configurations in the precision of the loop. (n, nq)."""
-    if q0.shape[1:] != (loop.robot.nq,):
-        raise OsikValueError(f"q0 has shape {q0.shape}, expected (n, {loop.robot.nq})")
-    return q0.astype(loop.robot.q0.dtype)
 
 
 def run_one(loop: Loop, scenario: Scenarios) -> tuple[Trajectory, Loop]:

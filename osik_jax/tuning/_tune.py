@@ -171,11 +171,9 @@ def _step(
     """Return the next vector, the next optimiser state, and the history row of this step."""
     problem: Problem = put_together(numbers, static)
     trained, gradient = problem.gradient(vector, batches[0], chunks[0])
-    held = (
-        problem.value(vector, batches[1], chunks[1])
-        if len(batches) > 1
-        else Evaluation(jnp.zeros(0), jnp.zeros(0, bool))
-    )
+    held = Evaluation(jnp.zeros(0), jnp.zeros(0, bool))
+    if len(batches) > 1:
+        held = problem.value(vector, batches[1], chunks[1])
 
     def objective(other: Float[Array, " p"]) -> Float[Array, ""]:
         tried = problem.value(other, batches[0], chunks[0])

@@ -189,9 +189,8 @@ def test_next_poses_tell_more_than_random_ones(ur5: osik.Robot):
     assert all((row == drawn).all(1).any() for row in best)
 
     def determinant(q: np.ndarray) -> float:
-        return float(
-            np.linalg.slogdet(cal.calibrate(ur5, cal.Points("tool0", q, tips_of(ur5, q)[0]), unknowns).information)[1]
-        )
+        found = cal.calibrate(ur5, cal.Points("tool0", q, tips_of(ur5, q)[0]), unknowns)
+        return float(np.linalg.slogdet(found.information)[1])
 
     others = [determinant(drawn[drawn[:, 0] > 0.0][4 * k : 4 * k + 4]) for k in range(10)]
     assert determinant(best) > max(others)
@@ -279,12 +278,7 @@ def test_a_saved_file_has_numbers_for_readers_of_yaml_and_json(ur5: osik.Robot, 
         (KeyError, "no body 'tool0'", [("body_position", "tool0")], {}),
         (KeyError, "no frame 'camera'", [("frame_position", "camera")], {}),
         (ValueError, "is unknown twice", [("joint_offset", "*"), ("joint_offset", "elbow_joint")], {}),
-        (
-            ValueError,
-            "called 'tool0', as a frame of the robot",
-            [("joint_offset", "*")],
-            dict(frames={"tool0": cal.FixedFrame()}),
-        ),
+        (ValueError, "called 'tool0', as a frame", [("joint_offset", "*")], dict(frames={"tool0": cal.FixedFrame()})),
         (KeyError, "no frame 'hand'", [("joint_offset", "*")], dict(frames={"camera": cal.FixedFrame("hand")})),
     ],
 )

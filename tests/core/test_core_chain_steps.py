@@ -10,7 +10,7 @@ from chain_robots import made
 from core_checks import needs_core
 
 import osik_jax as osik
-from osik_jax.inverse._chain_problem import ChainRoute, Settings, chain_search
+from osik_jax.inverse._chain_problem import ChainRoute, Settings
 from osik_jax.inverse._chain_search import ChainSearch, Goal
 
 LANES = 40
@@ -26,7 +26,7 @@ def test_steps_are_those_of_plain_jax(name, near, rng):
     high, tolerance = np.asarray(robot.position_upper), jnp.array([1e-3, 1e-2])
     limits = jnp.where(jnp.isfinite(low), 0.5 * low, low), jnp.where(jnp.isfinite(high), 0.5 * high, high)
     settings = Settings(robot.q0, *limits, 0, tolerance, 64)
-    search = jax.jit(lambda: chain_search(robot, route, settings, warm=False, near=near))()  # one program, not hundreds
+    search = jax.jit(lambda: route.search(robot, settings, warm=False, near=near))()  # one program, not hundreds
 
     def poses(q):
         return osik.forward_kinematics(robot, q).frame_poses(robot, route.frames)
@@ -57,7 +57,7 @@ def test_robots_of_a_batch_have_their_own_chains(rng):
 
     def both(robot, x, goal):
         settings = Settings(robot.q0, robot.position_lower, robot.position_upper, 0, jnp.array([1e-3, 1e-2]), 64)
-        search = chain_search(robot, route, settings, warm=False, near=False)
+        search = route.search(robot, settings, warm=False, near=False)
         return search.advance(x, goal, 3), search.advance_plain(x, goal, 3)
 
     found, expected = jax.jit(jax.vmap(both))(robots, x, goal)

@@ -17,7 +17,7 @@ from model_files import mjcf
 import osik_jax as osik
 from osik_jax.core import _cuda, _library
 from osik_jax.inverse._chain_kernel import advanced
-from osik_jax.inverse._chain_problem import ChainRoute, Settings, chain_search
+from osik_jax.inverse._chain_problem import ChainRoute, Settings
 from osik_jax.inverse._chain_search import Goal
 from osik_jax.kinematics import _kernels
 from osik_jax.tasks import _com, _frame, _pose
@@ -76,7 +76,7 @@ def test_searches_for_poses(tmp_path, rng, monkeypatch):
     robot, frame = made("arm7")
     route, lower, upper = ChainRoute((frame,), ((True,) * 6,)), robot.position_lower, robot.position_upper
     settings = Settings(robot.q0, jnp.asarray(lower), jnp.asarray(upper), 0, jnp.array([1e-3, 1e-2]), 64)
-    search = chain_search(robot, route, settings, warm=False, near=False)
+    search = route.search(robot, settings, warm=False, near=False)
     q = robot.q0 + 0.4 * rng.standard_normal((LANES, robot.nq))
     goal = Goal(*jax.vmap(lambda q: osik.forward_kinematics(robot, q).frame_poses(robot, route.frames))(q))
     given = with_lanes(search, False), jnp.asarray(search.begin(jnp.arange(LANES), goal)), goal

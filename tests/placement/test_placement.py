@@ -37,14 +37,8 @@ GRID: dict[str, Any] = dict(x=np.linspace(-0.2, 0.8, 6), y=np.linspace(-0.6, 0.6
 
 def mjcf(base: np.ndarray | None = None) -> str:
     """Return the arm alone, or on a base x, y, yaw, height among the boxes."""
-    boxes = (
-        ""
-        if base is None
-        else "".join(
-            f'<geom name="{name}" type="box" size="{" ".join(map(str, size))}" pos="{" ".join(map(str, at))}"/>'
-            for name, (size, at) in BOXES.items()
-        )
-    )
+    box = '<geom name="{}" type="box" size="{} {} {}" pos="{} {} {}"/>'.format
+    boxes = "" if base is None else "".join(box(name, *size, *at) for name, (size, at) in BOXES.items())
     x, y, yaw, height = np.zeros(4) if base is None else base
     arm = ARM.format(pos=f"{x} {y} {height}", yaw=yaw)
     return f'<mujoco><compiler angle="radian"/><worldbody>{boxes}{arm}</worldbody></mujoco>'
@@ -146,9 +140,8 @@ def test_poses_too_far_are_counted_and_searched_for_nowhere(arm, scene):
     far = np.array([[0.3, 0.0, 0.4], [5.0, 0.0, 0.4]])
     found = place_base(arm, {"tip": far}, x=[0.0, 0.1, 4.5], y=0.0, yaw=[0.0], scene=scene, refine=1)
     assert found.too_far.ravel().tolist() == [1, 1, 1] and found.reached.ravel().tolist() == [1, 1, 1]
-    assert (
-        "of 3 bases of the grid 0 reach all poses, 0 do not stand free, 3 have a pose out of reach" in found.explain()
-    )
+    said = "of 3 bases of the grid 0 reach all poses, 0 do not stand free, 3 have a pose out of reach"
+    assert said in found.explain()
     none = place_base(
         arm, {"tip": far + np.array([0.0, 9.0, 0.0])}, x=[0.0, 0.1], y=0.0, yaw=[0.0], scene=scene, refine=1
     )
@@ -181,9 +174,7 @@ def test_the_bases_that_reach_all_poses_are_those_that_all_searches_find(arm, sc
 def test_which_bases_stand_free_is_as_mujoco_says(found):
     gaps = np.zeros(found.reached.shape)
     for at in np.ndindex(gaps.shape):
-        model = mujoco.MjModel.from_xml_string(
-            mjcf(np.array([axis[k] for axis, k in zip(_axes(found), at, strict=True)]))
-        )
+        model = mujoco.MjModel.from_xml_string(mjcf(base_at(found, at)))
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
         gaps[at] = distance(model, data, ("stand",))
@@ -197,13 +188,14 @@ def test_which_bases_stand_free_is_as_mujoco_says(found):
     assert f"{blocked} do not stand free (table and stand: {blocked})" in found.explain()
 
 
-def _axes(found: Placement) -> tuple[np.ndarray, ...]:
-    return found.x, found.y, found.yaw, found.height
+def base_at(found: Placement, at: tuple[int, ...]) -> np.ndarray:
+    axes = found.x, found.y, found.yaw, found.height
+    return np.array([axis[k] for axis, k in zip(axes, at, strict=True)])
 
 
 def test_a_base_of_the_grid_gets_what_a_search_for_it_alone_gets(arm, found, points):
     for at in [(1, 2, 1, 0), (0, 1, 1, 0), (2, 4, 0, 0)]:
-        (x, y, yaw, _), turn = [axis[k] for axis, k in zip(_axes(found), at, strict=True)], np.eye(3)
+        (x, y, yaw, _), turn = base_at(found, at), np.eye(3)
         turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         boxes = {
             n: osik.CollisionShape.box(size, np.subtract(p, [x, y, 0]) @ turn, turn.T) for n, (size, p) in BOXES.items()
@@ -225,16 +217,8 @@ def test_a_footprint_and_what_the_base_may_touch_count(arm, scene, points):
     given: dict[str, Any] = dict(x=[0.1], y=[0.0], yaw=[0.0], refine=0)
     found = place_base(arm, {"tip": points}, **given, scene=scene)
     assert np.isclose(found.base_clearance, 0.15, atol=1e-6)
-    refuses(
-        ValueError,
-        r"stands free: at the best one table and footprint are -.*allow\(\('table', 'footprint'\)\)",
-        place_base,
-        arm,
-        {"tip": points},
-        **given,
-        scene=scene,
-        footprint=wide,
-    )
+    said = r"stands free: at the best one table and footprint are -.*allow\(\('table', 'footprint'\)\)"
+    refuses(ValueError, said, place_base, arm, {"tip": points}, **given, scene=scene, footprint=wide)
     on = place_base(arm, {"tip": points}, x=[0.6], y=[0.0], yaw=[0.0], refine=0, scene=scene.allow(("table", "stand")))
     assert on.base_clearance > 0.0
 
@@ -255,10 +239,8 @@ def team(around) -> Team:
 def two_arms(bases: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData, list[tuple[int, int]]]:
     """Return MuJoCo's model of two arms on their bases (2, 4), and all pairs of a shape of each."""
     bodies = [mjcf(base).split("<worldbody>")[1].split("</worldbody>")[0] for base in bases]
-    arms = [
-        body[body.index("<body") :].replace('name="', f'name="{name}_') for body, name in zip(bodies, "ab", strict=True)
-    ]
-    boxes = bodies[0][: bodies[0].index("<body")]
+    boxes, arms = bodies[0][: bodies[0].index("<body")], [body[body.index("<body") :] for body in bodies]
+    arms = [body.replace('name="', f'name="{name}_') for body, name in zip(arms, "ab", strict=True)]
     text = f'<mujoco><compiler angle="radian"/><worldbody>{boxes}{"".join(arms)}</worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(text)
     pairs = [(model.geom(f"a_{first}").id, model.geom(f"b_{second}").id) for first in PARTS for second in PARTS]

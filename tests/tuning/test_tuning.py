@@ -93,15 +93,8 @@ def run(loop, scenarios, **options):
 
 class TestNames:
     def test_of_all_parts_of_the_loop(self, loop):
-        wanted = {
-            "hand.gain.maximum",
-            "hand.target[1]",
-            "scheme.damping",
-            "limits[1].velocity",
-            "robot.body_mass",
-            "dt",
-        }
-        assert wanted <= set(loop.names) and "tasks.hand.weight" not in loop.names
+        wanted = "hand.gain.maximum", "hand.target[1]", "scheme.damping", "limits[1].velocity", "robot.body_mass", "dt"
+        assert set(wanted) <= set(loop.names) and "tasks.hand.weight" not in loop.names
 
     def test_replace(self, loop):
         other: Any = loop.replace({"*.gain": 7.0, "limits[1].velocity": 2.0, "dt": 0.1})
@@ -131,9 +124,8 @@ BOUNDS = [
 class TestParameterSpace:
     def test_begins_at_the_loops_numbers(self, loop):
         space = ParameterSpace(loop, BOUNDS)
-        for a, b in zip(
-            jax.tree.leaves(eqx.filter_jit(space.apply)(loop, space.initial)), jax.tree.leaves(loop), strict=True
-        ):
+        started = eqx.filter_jit(space.apply)(loop, space.initial)
+        for a, b in zip(jax.tree.leaves(started), jax.tree.leaves(loop), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
     @settings(max_examples=20, deadline=None)
@@ -162,9 +154,8 @@ class TestParameterSpace:
 
     def test_every_finite_entry_is_a_parameter(self, arm, nao):
         hand = osik.FrameTask(nao, "l_gripper", position_weight=[1.0, 2.0, 3.0])
-        loop = tuning.Loop(
-            nao, {"hand": hand}, scheme=osik.NullSpace(), limits=(osik.VelocityLimit(nao),), dt=0.01, steps=1
-        )
+        limits = (osik.VelocityLimit(nao),)
+        loop = tuning.Loop(nao, {"hand": hand}, scheme=osik.NullSpace(), limits=limits, dt=0.01, steps=1)
         space = ParameterSpace(loop, ["hand.position_weight", "limits[0].velocity"])
         assert space.names[:3] == tuple(f"hand.position_weight[{i}]" for i in range(3))
         assert len(space.names) == 3 + nao.nv - 6 and "limits[0].velocity[5]" not in space.names
@@ -186,11 +177,7 @@ class TestParameterSpace:
                 ValueError,
                 "begins at 1.0, which is not between its bounds",
             ),
-            (
-                [tuning.Parameter("posture.target_velocity", log=True)],
-                ValueError,
-                "in log space it begins at a positive number",
-            ),
+            ([tuning.Parameter("posture.target_velocity", log=True)], ValueError, "in log space it begins at a"),
         ],
     )
     def test_mistakes(self, loop, parameters, error, message):
@@ -223,9 +210,8 @@ class TestScenarios:
 def path(arm, rng, steps=5):
     """A trajectory of random numbers, with errors of three tasks."""
     q = np.asarray(arm.q0) + 0.5 * rng.normal(size=(steps + 1, 7))
-    solution = osik.solve(
-        arm, arm.q0, {"p": osik.PostureTask(arm, weight=1.0)}, scheme=osik.NullSpace(), limits=osik.no_limits
-    )
+    tasks = {"p": osik.PostureTask(arm, weight=1.0)}
+    solution = osik.solve(arm, arm.q0, tasks, scheme=osik.NullSpace(), limits=osik.no_limits)
     error = {"hand": rng.normal(size=(steps, 3)), "com": rng.normal(size=(steps, 2)), "posture": np.zeros((steps, 7))}
     solution = eqx.tree_at(lambda s: (s.velocity, s.error), solution, (rng.normal(size=(steps, 7)), error))
     return osik.Trajectory(DT * jnp.arange(steps), jnp.asarray(q), jax.tree.map(jnp.asarray, solution))
@@ -247,10 +233,8 @@ class TestLosses:
         trajectory, _ = judged
         error = {name: np.asarray(value) for name, value in trajectory.solution.error.items()}
         x = error["com"]
-        outside = np.stack(
-            [np.maximum.reduce([-0.2 - x[:, 0], x[:, 0] - 0.3, 0 * x[:, 0]]), np.maximum(x[:, 1] - 0.1, 0)]
-        )
-        hand, com = (error["hand"] ** 2).sum(1), (outside**2).sum(0)
+        outside = np.maximum([-0.2, -np.inf] - x, 0.0) + np.maximum(x - [0.3, 0.1], 0.0)
+        hand, com = (error["hand"] ** 2).sum(1), (outside**2).sum(1)
         assert float(tuning.Tracking("hand")(*judged)) == pytest.approx(hand.mean())
         assert float(tuning.Tracking("hand", "com")(*judged)) == pytest.approx((hand + com).mean())
         assert float(tuning.Tracking(after=2 * DT)(*judged)) == pytest.approx((hand + com)[2:].mean())
@@ -420,11 +404,8 @@ class TestTune:
         loop = tuning.Loop(small, swing, scheme=LeastSquares(), dt=DT, steps=STEPS, limits=osik.no_limits)
         start = tuning.Scenarios(q0=scenarios.q0)
         space = ParameterSpace(loop, ["hand.gain", "speed"])
-        losses = [
-            tuning.evaluate(tuning.Tracking("hand"), space.apply(loop, space.initial + i * step), start).loss
-            for i in (0.0, 0.5)
-            for step in np.eye(2)
-        ]
+        loops = [space.apply(loop, space.initial + i * step) for i in (0.0, 0.5) for step in np.eye(2)]
+        losses = [tuning.evaluate(tuning.Tracking("hand"), own, start).loss for own in loops]
         assert losses[0] == losses[1] and losses[2] < losses[0] and losses[3] != losses[0]
 
 
