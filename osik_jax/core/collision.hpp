@@ -98,7 +98,7 @@ template <class R> class Collision {
   Real lower_bound(Pair p) const { return osik::lower_bound(world[p.i], ball[p.i], world[p.j], ball[p.j]); }
   // f(pair, far) of the pairs whose distance changes and is perhaps less than `far`, the likely nearest first; it returns
   // what is far from then on. One thread takes all pairs.
-  template <class F> void each_near_pair(Real far, int, int, F f) {
+  template <class F> void each_near_pair(Real far, int, int, Pair*, F f) {
     candidates.clear();
     for (int k = fixed; k < int(pairs.size()); ++k) {
       if (ball[pairs[k].i].is_out_of_reach(ball[pairs[k].j], far)) continue;

@@ -25,7 +25,8 @@ int osik_clearances_space(int bodies, int dofs, int shapes, int rows) {
   return LaneCollision<double>::space_of(bodies, dofs, shapes, rows);
 }
 int osik_near_rows_space(int bodies, int dofs, int shapes, int rows, int most) {
-  return NearRows<LaneCollision<float>>::space_of(most) + osik_clearances_space(bodies, dofs, shapes, rows);
+  return NearRows<LaneCollision<float>>::space_of(most, most_pairs(shapes, rows)) +
+         osik_clearances_space(bodies, dofs, shapes, rows);
 }
 int osik_chain_find_space(int n, int frames, int joints, int nq) {
   return n + ChainFinder<Robots, true>::space_of(n, frames, joints, nq);

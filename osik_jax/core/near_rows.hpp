@@ -22,6 +22,9 @@ template <class Real> struct AvoidanceNumbers {
   Real least, detection, gain, recovery, dt;
 };
 
+// How many pairs there are at most.
+constexpr OSIK_HOST int most_pairs(int shapes, int rows) { return shapes * (shapes - 1) / 2 + rows * (shapes + rows); }
+
 // Collision: collision.hpp, or on a GPU lane_collision.hpp.
 template <class Collision> class NearRows {
   using Real = typename Collision::Real;
@@ -34,13 +37,18 @@ template <class Collision> class NearRows {
   const ShapedRobot<Real>& robot;
   Collision collision;
   Near* near;  // [most] the nearest pairs of this thread, sorted
+  Pair* list;  // of a GPU: pairs whose distances are looked for
   int most, count = 0, first_free = 0, stride = 1;
 
  public:
   // space: space_of numbers, then those of the collision
-  NearRows(const ShapedRobot<Real>& robot, int most, Real* space)
-      : robot(robot), collision(robot, space + space_of(most)), near(reinterpret_cast<Near*>(space)), most(most) {}
-  static constexpr OSIK_HOST int space_of(int most) { return most * int(sizeof(Near) / sizeof(Real)); }
+  NearRows(const ShapedRobot<Real>& robot, int most, int pairs, Real* space)
+      : robot(robot), collision(robot, space + space_of(most, pairs)), near(reinterpret_cast<Near*>(space)),
+        list(reinterpret_cast<Pair*>(space + space_of(most, 0))), most(most) {}
+  // pairs: how many there can be on a GPU
+  static constexpr OSIK_HOST int space_of(int most, int pairs) {
+    return most * int(sizeof(Near) / sizeof(Real)) + pairs * int(sizeof(Pair) / sizeof(float));
+  }
   void set(const SceneRows<Real>& scene) { collision.set(scene); }
 
   // Write the rows of the nearest pairs: J [most, nv], lower bounds and distances [most], and the bodies of the two shapes
@@ -101,7 +109,7 @@ template <class Collision> class NearRows {
   // The nearest of this thread's pairs that are not farther than `detection`, exact and sorted.
   OSIK_CALL void find_nearest(Real detection, int member, int members) {
     count = 0;
-    collision.each_near_pair(detection, member, members, [&](Pair p, Real far) {
+    collision.each_near_pair(detection, member, members, list, [&](Pair p, Real far) {
       const Gap<Real> gap = gap_between<Real>(collision.shape(p.i), collision.shape(p.j), far);
       if (!(gap.distance < far)) return far;
       int k = count < most ? count++ : most - 1;
@@ -157,7 +165,8 @@ template <bool with_geometry, class Call> void find_near_pairs(const Call& call)
   const ShapedRobot<Real> robot(call.integers(5), call.numbers(6, 0));
   const int most = call.result_size(0, 1);
   auto space = call.space();
-  NearRows<typename Call::Collision> rows(robot, most, space.data());
+  NearRows<typename Call::Collision> rows(robot, most, most_pairs(robot.shapes, scene_of(call, 7, robot.shapes, 0).rows),
+                                          space.data());
   bool is_set = false;
   call.each_group([&](int lane, bool) {  // threads without a lane write what others write
     if (!is_set || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane)), is_set = true;

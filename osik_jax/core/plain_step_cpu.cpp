@@ -18,8 +18,8 @@ struct PlainRows {
   NearRows<Collision<double>> rows;
 
   PlainRows(const int* integers, const double* numbers, int most)
-      : robot(integers, numbers), near(rows.space_of(most)), space(12 * robot.bodies + 9 * robot.dofs), distance(most),
-        pair(4 * most), rows(robot, most, near.data()) {}
+      : robot(integers, numbers), near(rows.space_of(most, 0)), space(12 * robot.bodies + 9 * robot.dofs), distance(most),
+        pair(4 * most), rows(robot, most, 0, near.data()) {}
   void find(const double* q, const double* limit, double* J, double* lower) {
     double *position = space.data(), *turn = position + 3 * robot.bodies, *axes = turn + 9 * robot.bodies;
     const int dofs = 3 * robot.dofs;
