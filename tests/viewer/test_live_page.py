@@ -21,8 +21,10 @@ from osik_jax.retargeting._robot_motion import in_mujoco_order
 from osik_jax.viewer import export_html, serve
 from osik_jax.viewer._parts import Part, robot_parts
 from osik_jax.viewer.live._open import sole_polygon, standing
+from osik_jax.viewer.live._page import BalanceMarks
 from osik_jax.viewer.live._panel import error_text
 from osik_jax.viewer.live._playback import read_motion
+from osik_jax.viewer.live._server import close_server, open_server
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
@@ -184,12 +186,34 @@ def _area(vertices: Any) -> float:
     return 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
 
 
+def square(half: float) -> osik.SupportPolygon:
+    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    made: Any = osik.SupportPolygon
+    return made(*map(jnp.asarray, (normals, np.full(4, half), half * normals)))
+
+
+def test_balance_marks_follow_slow_motions_and_turn_red_outside() -> None:
+    server = open_server("127.0.0.1", 0, "test")
+    try:
+        marks = BalanceMarks(server.scene, 0.0, 1.0)
+        marks.show_polygon(square(0.1))
+        for x in np.linspace(0.0, 1e-3, 401):  # less in a picture than what is worth a message
+            marks.place(np.array([x, 0.0, 0.5]))
+        np.testing.assert_allclose(marks._ball.position, [1e-3, 0.0, 0.5], atol=1.1e-5)
+        inside = marks._ball.color
+        marks.place(np.array([0.2, 0.0, 0.5]))
+        assert marks._ball.color == marks._disc.color != inside
+        marks.show_polygon(None)
+        marks.place(np.array([0.2, 0.0, 0.5]))
+        assert marks._ball.color == marks._disc.color == inside
+    finally:
+        close_server(server)
+
+
 def test_readings() -> None:
     task = osik.FrameTask(ARM, "hand")
     assert error_text(task, np.array([3e-3, 4e-3, 0.0, np.pi / 180.0, 0.0, 0.0])) == "5.0 mm, 1.0°"
-    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    polygon: Any = osik.SupportPolygon(*map(jnp.asarray, (normals, np.full(4, 0.1), 0.1 * normals)))
-    balance = osik.ComTask(ARM, polygon=polygon)
+    balance = osik.ComTask(ARM, polygon=square(0.1))
     assert error_text(balance, np.array([0.08, 0.0, -0.08, 0.0])) == "20 mm inside"
     assert error_text(balance, np.array([0.13, 0.0, -0.13, 0.0])) == "30.0 mm outside"
     height = osik.FrameTask(ARM, "hand", rows="position", lower=-0.1)

@@ -228,7 +228,7 @@ class ControlLoop:
         new = task.replace(target=target).target
         with self._lock:
             self._owners[name] = owner
-            self._wanted = with_targets(self._wanted, {name: new})
+            self._wanted = self._aimed({name: new})
 
     def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
         """Set position and rotation of an obstacle."""
@@ -349,7 +349,11 @@ class ControlLoop:
         here = targets_here(self.robot, self._snapshot.q, self._wanted.tasks, names)
         with self._lock:
             self._owners = {name: other for name, other in self._owners.items() if name not in names}
-            self._wanted = with_targets(self._wanted, here)
+            self._wanted = self._aimed(here)
+
+    def _aimed(self, targets: Mapping[str, Any]) -> Controller:
+        """Return the requested controller with some targets replaced."""
+        return replace(self._wanted, tasks=with_targets(self._wanted.tasks, targets))
 
 
 def _percentiles(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:

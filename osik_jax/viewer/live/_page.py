@@ -44,6 +44,8 @@ _LIFT = 0.002
 """Height of flat marks above the floor [m]."""
 _TOUCHING = 1e-3
 """Distance beyond a polygon's edge up to which a point counts as inside [m]."""
+_MOVED = 1e-5
+"""Motion of the centre of mass below which its marks stay where they are [m]."""
 
 
 class LiveView:
@@ -220,11 +222,6 @@ def serve(
     check_tasks(tasks, robot)
     used = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
     session = Session(robot, tasks, used, given, period, np.asarray(start), source=source)
-    return serve_session(session, host=host, port=port, open_browser=open_browser)
-
-
-def serve_session(session: Session, *, host: str, port: int, open_browser: bool = False) -> LiveView:
-    """Return the page of a session."""
     view = LiveView(session, host=host, port=port)
     if open_browser:
         webbrowser.open(view.url)
@@ -251,14 +248,16 @@ class BalanceMarks:
 
     def __init__(self, scene: SceneApi, floor: float, size: float) -> None:
         """Take the height of the floor and the size of the robot [m]."""
-        self._scene, self._floor, self._size = scene, floor, size
+        self._scene, self._floor = scene, floor
         self._polygon: SupportPolygon | None = None
-        self._color: tuple[int, int, int] | None = None
-        self._at = np.full(3, np.inf)
+        self._color, self._at = _IN, np.full(3, np.inf)
+        look: Any = dict(radius=0.016 * size, color=_IN, cast_shadow=False)
+        self._ball = scene.add_icosphere("/balance/com", opacity=0.75, **look)
+        self._disc = scene.add_cylinder("/balance/below", height=_LIFT, **look)
 
     def show_polygon(self, polygon: SupportPolygon | None) -> None:
         """Draw the polygon; None removes it."""
-        self._polygon, self._color = polygon, None
+        self._polygon = polygon
         self._scene.remove_by_name("/balance/area")
         self._scene.remove_by_name("/balance/edge")
         if polygon is None:
@@ -276,24 +275,8 @@ class BalanceMarks:
         inside = self._polygon is None or float(self._polygon.distance(com[:2])) > -_TOUCHING
         color = _IN if inside else _OUT
         if color != self._color:
-            self._color = color
-            self._draw(com, color)
+            self._color = self._ball.color = self._disc.color = color
         # smaller motions are invisible and need no message to the page
-        elif np.abs(com - self._at).max() > 1e-5:
-            self._ball.position = com
+        if np.abs(com - self._at).max() > _MOVED:
+            self._ball.position = self._at = np.array(com)
             self._disc.position = (com[0], com[1], self._floor + 2.0 * _LIFT)
-        self._at = np.array(com)
-
-    def _draw(self, com: np.ndarray, color: tuple[int, int, int]) -> None:
-        radius = 0.016 * self._size
-        self._ball = self._scene.add_icosphere(
-            "/balance/com", radius=radius, color=color, opacity=0.75, cast_shadow=False, position=com
-        )
-        self._disc = self._scene.add_cylinder(
-            "/balance/below",
-            radius=radius,
-            height=_LIFT,
-            color=color,
-            cast_shadow=False,
-            position=(com[0], com[1], self._floor + 2.0 * _LIFT),
-        )
