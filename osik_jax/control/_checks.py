@@ -117,11 +117,7 @@ def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
 
 
 def checked_start(robot: Robot, q0: Any) -> Array:
-    """Return a configuration to start from, as ``checked_configuration`` does; warn of joints far outside their range.
-
-    Raises:
-        TypeError, ValueError: as ``checked_configuration``.
-    """
+    """Return a checked configuration to start from; warn of joints far outside their range."""
     q0 = checked_configuration(robot, q0)
     warn_of_far_joints(robot, q0, "q0")
     return q0
@@ -135,10 +131,9 @@ def warn_of_degrees(robot: Robot, q: Array | np.ndarray) -> None:
 
 
 def plain_configuration(robot: Robot, q: Any) -> np.ndarray | None:
-    """Return a checked concrete q in double precision, with the warning of degrees; None if it is not of that kind.
+    """Return a concrete q as ``checked_configuration``, in double precision; None if it is not of that kind.
 
-    Raises:
-        TypeError, ValueError: as ``checked_configuration``.
+    It warns of degrees too.
     """
     if isinstance(q, Tracer):
         return None

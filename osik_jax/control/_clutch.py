@@ -63,13 +63,7 @@ class Clutch(Replaceable):
     target: Pose
     frame: Pose
 
-    def __init__(
-        self,
-        frame: PoseLike,
-        *,
-        scale: ArrayLike = 1.0,
-        axes: ArrayLike | None = None,
-    ):
+    def __init__(self, frame: PoseLike, *, scale: ArrayLike = 1.0, axes: ArrayLike | None = None):
         dtype = jnp.result_type(float)
         self.engaged = jnp.asarray(False)
         self.scale = as_scalar(scale, "scale", dtype)

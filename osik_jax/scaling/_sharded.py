@@ -17,12 +17,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..execution._lanes import refuse_explicit_axes
 
 
-def sharded(
-    function: Callable[..., Any],
-    in_axes: Any = 0,
-    *,
-    mesh: Mesh | None = None,
-) -> ShardedFunction:
+def sharded(function: Callable[..., Any], in_axes: Any = 0, *, mesh: Mesh | None = None) -> ShardedFunction:
     """Return a function like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
 
     Each device runs its own lanes to their own end: no device waits for another one's slowest lane, and nothing is

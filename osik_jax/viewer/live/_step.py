@@ -71,6 +71,5 @@ def laid_out(robot: Robot, controller: Controller, dt: float) -> control.Control
 
     Its warnings are left out: that a weighted scheme ignores priorities is no news in a page with a menu of schemes.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)
+    with warnings.catch_warnings(action="ignore", category=OsikWarning):
         return control.Controller(robot, controller.tasks, scheme=controller.scheme, limits=controller.limits, dt=dt)
