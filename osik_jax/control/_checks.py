@@ -278,9 +278,6 @@ def check_steps(steps: Any) -> None:
         raise OsikValueError(f"steps is {steps!r}; it is the number of steps, an integer")
 
 
-_BY_STEP = "targets by step"
-
-
 def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
     """Raise TypeError unless targets are a mapping, KeyError for a task that does not exist."""
     if targets is not None and not isinstance(targets, Mapping):
@@ -302,13 +299,11 @@ def check_targets(
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
         return
     check_tasks(tasks, robot)
-    check_target_names(tasks, targets, _BY_STEP)
+    check_target_names(tasks, targets, "targets by step")
     for name, target in (targets or {}).items():
         parts = jax.tree.leaves(target, is_leaf=lambda part: isinstance(part, list))
-        if any(
-            isinstance(part, list) and any(isinstance(leaf, int | float) for leaf in jax.tree.leaves(part))
-            for part in parts
-        ):
+        in_lists = jax.tree.leaves([part for part in parts if isinstance(part, list)])
+        if any(isinstance(leaf, int | float) for leaf in in_lists):
             raise OsikTypeError(f"targets[{name!r}] is or holds a list of numbers; make it an array: jnp.asarray(list)")
         for leaf in jax.tree.leaves(target):
             if not eqx.is_array_like(leaf):

@@ -86,7 +86,7 @@ class RobotParts:
     """Shapes of a robot for pictures."""
 
     model: mujoco.MjModel  # the MuJoCo model
-    style: Literal["look", "geoms", "sticks"]  # ``"look"``, ``"geoms"`` or ``"sticks"``
+    style: Literal["look", "geoms", "sticks"]  # visual shapes of a URDF, geoms of the model, or sticks
     parts: tuple[Part, ...]  # the shapes
     bodies: Int[np.ndarray, " parts"]  # MuJoCo's index of the body that carries each part
     # position [m] and rotation of each part in its body; of sticks, which change with the configuration, the bodies

@@ -160,7 +160,7 @@ class Desk:
             while name in session.tasks:
                 name += "'"
             task = FrameTask(session.robot, frame, rows="position", weight=1e2, priority=3)
-            self._put(name, task.at(session.robot, jnp.asarray(self.loop.snapshot.q)), off=session.off)
+            self._put(name, task.at(session.robot, jnp.asarray(self.loop.snapshot.q)))
             return name
 
     def remove(self, name: str) -> None:

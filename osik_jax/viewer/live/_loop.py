@@ -147,9 +147,8 @@ class ControlLoop:
     def start(self) -> Self:
         """Start the thread.
 
-        While it runs, Python's threads change places every 0.05 ms, not every 5: the control thread would wait that
-        long for each of the others that computes. What was there when a step was laid out is left out of garbage
-        collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
+        While it runs, the GIL switch interval is 0.05 ms (default 5 ms): the control thread may wait that long for each
+        other thread that computes. Garbage collection skips the objects that exist when a step is laid out.
         """
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
