@@ -105,12 +105,7 @@ class LiveView:
         self.stop()
 
     def aim(self, task: str, target: Any) -> None:
-        """Set the target of a task.
-
-        Raises:
-            KeyError: no such task.
-            TypeError, ValueError: no such target.
-        """
+        """Set the target of a task; exceptions are those of ``loop.aim``."""
         self.loop.aim(task, target)
 
     def _run(self) -> None:
