@@ -36,7 +36,7 @@ _GEOM = mujoco.mjtGeom
 def test_a_box_is_sharp_at_its_edges() -> None:
     """Each corner is there once for each side."""
     size = np.array([0.1, 0.2, 0.3])
-    vertices, _ = part_triangles(Part(0, _GEOM.mjGEOM_BOX, size, np.ones(4)))
+    vertices, _ = part_triangles(Part(_GEOM.mjGEOM_BOX, size, np.ones(4)))
     assert np.all(np.isclose(np.abs(vertices), size), axis=1).sum() == 8 * 3
 
 
@@ -47,7 +47,7 @@ def test_large_meshes_become_smaller_and_stay_where_they_were() -> None:
     i, j = (k.ravel() for k in np.meshgrid(np.arange(fine - 1), np.arange(fine), indexing="ij"))
     a, b = i * fine + j, i * fine + (j + 1) % fine
     faces = np.concatenate([np.stack([a, b, b + fine], 1), np.stack([a, b + fine, a + fine], 1)])
-    big = Part(0, _GEOM.mjGEOM_MESH, np.zeros(3), np.ones(4), (points, faces))
+    big = Part(_GEOM.mjGEOM_MESH, np.zeros(3), np.ones(4), (points, faces))
     vertices, fewer = part_triangles(big)
     assert len(fewer) <= 4000 < len(faces)
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=0.02)
