@@ -142,11 +142,6 @@ class Checked:
             self._setting, self._seen = (robot, *_given(limits)), dict(tasks)
             self._look_at_gains()
 
-    def fits(self, tasks: Mapping[str, Task]) -> bool:
-        """Return whether tasks of the same structure have numbers of the sizes that are known."""
-        del tasks
-        return True
-
     def _look_at_gains(self) -> None:
         """Find the longest time of a step in which no gain is too large."""
         gains = [getattr(task, "gain", 0.0) for task in self._seen.values()]

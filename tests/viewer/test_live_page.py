@@ -140,8 +140,13 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             assert told in error and error.count("\n") == 1 and error.startswith("osik: ")
 
 
-def test_what_a_controller_has_is_not_given_beside_it() -> None:
+def test_wrong_arguments_are_named() -> None:
     tasks = {"posture": osik.PostureTask(ARM)}
+    refuses(TypeError, r"serve\(robot, tasks\)", serve, "arm7", tasks, port=0)
+    refuses(TypeError, "tasks is a list; it is a dict from names to tasks", serve, ARM, list(tasks.values()), port=0)
+    refuses(ValueError, "there is no task", serve, ARM, port=0)
+    refuses(ValueError, "q0 has shape", serve, ARM, tasks, q0=np.zeros(3), port=0)
+    # what a controller has is not given beside it
     parts: dict[str, Any] = dict(tasks=tasks, scheme=osik.NullSpace(), limits=osik.no_limits, dt=0.005)
     for name, part in parts.items():
         refuses(ValueError, "a controller has its own", serve, osik.Controller(ARM, tasks), port=0, **{name: part})

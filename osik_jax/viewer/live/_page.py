@@ -210,13 +210,14 @@ def serve(
         if any(part is not None for part in (tasks, scheme, limits, dt)):
             raise OsikValueError("a controller has its own tasks, scheme, limits and dt: leave out what is beside it")
         robot, tasks, scheme, limits, dt = robot.robot, robot.tasks, robot.scheme, robot.limits, robot.dt
-    tasks, given = dict(tasks or {}), checked_limits(robot, limits) or ()
-    start, period = robot.q0 if q0 is None else q0, 0.005 if dt is None else dt
-    robot.check_configuration(start, "q0")
+    tasks, period = {} if tasks is None else tasks, 0.005 if dt is None else dt
     check_setting("serve(robot, tasks)", robot, scheme, period)
+    given = checked_limits(robot, limits) or ()
     check_tasks(tasks, robot)
+    start = robot.q0 if q0 is None else q0
+    robot.check_configuration(start, "q0")
     used = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
-    session = Session(robot, tasks, used, given, period, np.asarray(start), source=source)
+    session = Session(robot, dict(tasks), used, given, period, np.asarray(start), source=source)
     view = LiveView(session, host=host, port=port)
     if open_browser:
         webbrowser.open(view.url)
