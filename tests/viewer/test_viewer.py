@@ -198,9 +198,11 @@ def test_gif_has_its_frames(tmp_path, nao):
         assert len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) > 30
 
 
-def test_film_of_another_kind_is_refused(tmp_path, nao, monkeypatch):
+def test_films_of_another_kind_or_of_nothing_are_refused(tmp_path, nao, monkeypatch):
     q = np.asarray(nao.q0)[None]
     refuses(ValueError, r"\.gif or \.mp4", viewer.animate, tmp_path / "m.avi", nao, q, dt=0.01)
+    for wrong in (q[:0], q[0], q[:, 1:]):
+        refuses(ValueError, r"q has shape .*\(T, 32\)", viewer.animate, tmp_path / "m.gif", nao, wrong, dt=0.01)
     monkeypatch.setattr(_animate.shutil, "which", lambda name: None)
     refuses(ValueError, "ffmpeg", viewer.animate, tmp_path / "m.mp4", nao, q, dt=0.01)
 
