@@ -94,9 +94,7 @@ def check_dt(dt: Any) -> None:
         raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
     if np.shape(dt) != ():
         raise OsikValueError(f"dt has shape {np.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
-    if seen is None:
-        return
-    if not ((seen > 0.0) & np.isfinite(seen)).all():
+    if seen is not None and not 0.0 < seen < np.inf:
         raise OsikValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
 
 

@@ -105,7 +105,7 @@ def decode(data: Any, robot: Robot, where: str) -> Any:
     try:
         if cls is CollisionAvoidanceLimit:
             return _collision_limit(robot, given)
-        made = cls(robot, **given) if takes_robot(cls) else cls(**given)
+        made = cls(robot, **given) if "robot" in inspect.signature(cls).parameters else cls(**given)
     except TypeError as error:
         raise OsikValueError(f"{where}: {error}") from error
     return _with_exact_directions(made, given)
@@ -124,11 +124,6 @@ def _with_exact_directions(made: Any, given: Mapping[str, Any]) -> Any:
 
 def _is_real(value: Any) -> bool:
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
-
-
-def takes_robot(cls: type) -> bool:
-    """Return whether the first argument of a class is the robot."""
-    return next(iter(inspect.signature(cls).parameters), None) == "robot"
 
 
 def _is_kept(cls: Any) -> bool:
