@@ -94,9 +94,7 @@ def check_dt(dt: Any) -> None:
         raise OsikTypeError(f"dt is {dt!r}; it is a number, in seconds")
     if np.shape(dt) != ():
         raise OsikValueError(f"dt has shape {np.shape(dt)}; it is one number, in seconds. Batch with jax.vmap.")
-    if seen is None:
-        return
-    if not ((seen > 0.0) & np.isfinite(seen)).all():
+    if seen is not None and not 0.0 < seen < np.inf:
         raise OsikValueError(f"dt is {dt}; it has to be positive and finite, in seconds")
 
 
@@ -117,11 +115,7 @@ def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
 
 
 def checked_start(robot: Robot, q0: Any) -> Array:
-    """Return a configuration to start from, as ``checked_configuration`` does; warn of joints far outside their range.
-
-    Raises:
-        TypeError, ValueError: as ``checked_configuration``.
-    """
+    """Return a checked configuration to start from; warn of joints far outside their range."""
     q0 = checked_configuration(robot, q0)
     warn_of_far_joints(robot, q0, "q0")
     return q0
@@ -135,10 +129,9 @@ def warn_of_degrees(robot: Robot, q: Array | np.ndarray) -> None:
 
 
 def plain_configuration(robot: Robot, q: Any) -> np.ndarray | None:
-    """Return a checked concrete q in double precision, with the warning of degrees; None if it is not of that kind.
+    """Return a concrete q as ``checked_configuration``, in double precision; None if it is not of that kind.
 
-    Raises:
-        TypeError, ValueError: as ``checked_configuration``.
+    It warns of degrees too.
     """
     if isinstance(q, Tracer):
         return None
@@ -283,9 +276,6 @@ def check_steps(steps: Any) -> None:
         raise OsikValueError(f"steps is {steps!r}; it is the number of steps, an integer")
 
 
-_BY_STEP = "targets by step"
-
-
 def check_target_names(tasks: Mapping[str, Task], targets: Any, what: str = "targets") -> None:
     """Raise TypeError unless targets are a mapping, KeyError for a task that does not exist."""
     if targets is not None and not isinstance(targets, Mapping):
@@ -307,13 +297,11 @@ def check_targets(
             raise OsikValueError("targets go with a dict of tasks; a function of time sets them itself")
         return
     check_tasks(tasks, robot)
-    check_target_names(tasks, targets, _BY_STEP)
+    check_target_names(tasks, targets, "targets by step")
     for name, target in (targets or {}).items():
         parts = jax.tree.leaves(target, is_leaf=lambda part: isinstance(part, list))
-        if any(
-            isinstance(part, list) and any(isinstance(leaf, int | float) for leaf in jax.tree.leaves(part))
-            for part in parts
-        ):
+        in_lists = jax.tree.leaves([part for part in parts if isinstance(part, list)])
+        if any(isinstance(leaf, int | float) for leaf in in_lists):
             raise OsikTypeError(f"targets[{name!r}] is or holds a list of numbers; make it an array: jnp.asarray(list)")
         for leaf in jax.tree.leaves(target):
             if not eqx.is_array_like(leaf):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,7 +19,6 @@ from ..tasks._rotation import dot
 
 _REST = 1e-5
 """Metres and radians in a step: 2 mm/s at 200 Hz."""
-_Own = TypeVar("_Own", bound="Clutch")
 
 
 class Clutch(Replaceable):
@@ -63,13 +62,7 @@ class Clutch(Replaceable):
     target: Pose
     frame: Pose
 
-    def __init__(
-        self,
-        frame: PoseLike,
-        *,
-        scale: ArrayLike = 1.0,
-        axes: ArrayLike | None = None,
-    ):
+    def __init__(self, frame: PoseLike, *, scale: ArrayLike = 1.0, axes: ArrayLike | None = None):
         dtype = jnp.result_type(float)
         self.engaged = jnp.asarray(False)
         self.scale = as_scalar(scale, "scale", dtype)
@@ -97,7 +90,7 @@ class Clutch(Replaceable):
 
 
 @jax.jit
-def _step(clutch: _Own, engaged: Array, device: PoseLike, frame: PoseLike) -> tuple[_Own, Pose]:
+def _step(clutch: Clutch, engaged: Array, device: PoseLike, frame: PoseLike) -> tuple[Clutch, Pose]:
     held: Pose = as_pose(device, clutch.scale.dtype)
     device, frame = held, as_pose(frame, clutch.scale.dtype)
     tracked = jnp.isfinite(held[0]).all() & jnp.isfinite(held[1]).all()

@@ -119,9 +119,9 @@ def _unknown(robot: Robot, task: Task) -> str | None:
     if task.hard:
         return "is hard"
     card = task.core(robot)
-    if not isinstance(card, str) and isinstance(task.gain, AdaptiveGain):
-        return "has an AdaptiveGain"
-    return card if isinstance(card, str) else None
+    if isinstance(card, str):
+        return card
+    return "has an AdaptiveGain" if isinstance(task.gain, AdaptiveGain) else None
 
 
 def _card(robot: Robot, task: Task) -> CoreCard:
@@ -207,12 +207,8 @@ def _is_moving(given: tuple[Any, ...], path: tuple[Any, ...]) -> bool:
 class Layout:
     """Sizes and indices of a step's rows, in the order of the core's ``StepSizes``.
 
-    Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: the scheme.
-        given: rows that JAX computes, of which the structure and shapes count.
-        limit_rows: number of rows of limits.
+    Of the rows that JAX computes, ``given`` by task, structure and shapes count. ``limit_rows`` is how many rows limits
+    have.
 
     Attributes:
         labels: shapes of the warm start's arrays.
@@ -371,10 +367,9 @@ def _offsets(count: Mapping[str, int], order: Sequence[str]) -> dict[str, int]:
 
 
 def compiled(plain: Step) -> Step:
-    """Return the step by the compiled core: of those arguments that ``is_compiled`` accepts.
+    """Return the step by the compiled core, for arguments that ``is_compiled`` accepts.
 
-    Args:
-        plain: the definition, which has the derivative too and runs on platforms without the core.
+    ``plain`` is the definition: it gives the derivative, and runs on platforms without the core.
     """
     lanes = in_shared_lanes(partial(_steps, plain))
 
@@ -437,11 +432,7 @@ def solution_shapes(
 ) -> Solution:
     """Return the solution of one step with shapes and types in place of arrays.
 
-    Args:
-        scheme: class of the scheme.
-        nv: length of the velocity.
-        rows: number of rows of each task.
-        labels: shapes of the warm start's arrays.
+    ``rows`` is the number of rows of each task, ``labels`` are the shapes of the warm start's arrays.
     """
     number, integer = (partial(jax.ShapeDtypeStruct, dtype=kind) for kind in (jnp.result_type(float), np.int32))
     own: list[Any] = [integer(shape) for shape in labels]

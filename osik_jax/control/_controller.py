@@ -44,17 +44,11 @@ class Controller:
     belongs to one thread at a time, and is not for use inside ``jit``: there is ``solve``.
 
     Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: as in ``solve``.
-        limits: as in ``solve``. Limits and tasks that remember the last velocity get that of the step before.
-        dt: time of a step [s].
-
-    Attributes:
-        robot: the robot.
-        tasks: by name; a dict of the controller's own.
-        scheme: how they share the robot.
-        limits: the given ones, beside the robot's own.
+        robot: the robot. Like all arguments it is an attribute too.
+        tasks: by name; the attribute is a dict of the controller's own.
+        scheme: as in ``solve``; the attribute is the one that is used.
+        limits: as in ``solve``. Limits and tasks that remember the last velocity get that of the step before. The
+            attribute has the given ones, beside the robot's own.
         dt: time of a step [s].
 
     Raises:

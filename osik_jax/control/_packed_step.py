@@ -61,14 +61,8 @@ def pack(
 ) -> PackedStep:
     """Return the step of tasks, scheme and all limits, of which the core has every part but rows that are given.
 
-    Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: how they share the robot.
-        bounds: all limits.
-        dt: time of a step [s].
-        limit_rows: number of rows of limits, for which there is room in the last three leaves: Jacobian, bounds.
-        given: rows that JAX computes, by task, of which the shapes count.
+    For ``limit_rows`` rows of limits there is room in the last three leaves: Jacobian, lower and upper bounds. Of the
+    rows that JAX computes, ``given`` by task, the shapes count.
     """
     arguments = arguments_of(robot, tasks, scheme, bounds, dt)
     leaves, tree = jax.tree.flatten(arguments)
@@ -110,13 +104,6 @@ def packed_section(
     robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Sequence[Limit], dt: float
 ) -> dict[str, Any]:
     """Return what ``osik_load`` in ``core/c`` reads: names, and all numbers of a step in double precision.
-
-    Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: how they share the robot.
-        limits: beside the robot's own.
-        dt: time of a step [s].
 
     Returns:
         ``version``, and ``missing`` alone if the core lacks a part: which one. Else ``dt``; names of the entries of

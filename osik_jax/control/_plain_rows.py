@@ -19,13 +19,7 @@ def with_plain_rows(limits: Sequence[Limit]) -> list[CollisionAvoidanceLimit]:
 
 
 class PlainRows:
-    """Rows of a ``CollisionAvoidanceLimit`` with a scene.
-
-    Args:
-        limit: the limit; its numbers are known.
-        jacobian: where the rows go. (k, nv)
-        lower: where their lower bounds go. (k,)
-    """
+    """Rows of a ``CollisionAvoidanceLimit`` with a scene, written into ``jacobian`` and ``lower``."""
 
     def __init__(
         self, limit: CollisionAvoidanceLimit, jacobian: Float[np.ndarray, "k nv"], lower: Float[np.ndarray, " k"]

@@ -117,14 +117,7 @@ def _is_open(tree: Any) -> bool:
 
 
 class Checked:
-    """Arguments that were checked, recognised by their identity.
-
-    Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: how they share the robot, None for the default.
-        limits: beside the robot's own, as they are given.
-    """
+    """Arguments of ``solve`` that were checked, recognised by their identity."""
 
     def __init__(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme | None, limits: Any) -> None:
         self._seen: dict[str, Any] = dict(tasks)
@@ -149,11 +142,6 @@ class Checked:
             self._setting, self._seen = (robot, *_given(limits)), dict(tasks)
             self._look_at_gains()
 
-    def fits(self, tasks: Mapping[str, Task]) -> bool:
-        """Return whether tasks of the same structure have numbers of the sizes that are known."""
-        del tasks
-        return True
-
     def _look_at_gains(self) -> None:
         """Find the longest time of a step in which no gain is too large."""
         gains = [getattr(task, "gain", 0.0) for task in self._seen.values()]
@@ -164,14 +152,8 @@ class Checked:
 class PlainStep(Checked):
     """A step of the core with its numbers; one thread at a time computes.
 
-    Args:
-        robot: the robot.
-        tasks: by name.
-        scheme: how they share the robot, None for the default.
-        limits: beside the robot's own, as they are given.
-        dt: time of a step [s].
-        chosen: the scheme that is used.
-        bounds: all limits, the given ones first.
+    ``scheme`` and ``limits`` are those that ``solve`` was given; ``chosen`` is the scheme that is used, and ``bounds``
+    are all limits, the given ones first.
 
     Attributes:
         as_arrays: from what ``solve`` returns to a solution, with JAX's arrays.
@@ -270,17 +252,7 @@ class PlainStep(Checked):
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Return numbers and integers of the answer; None where structures differ, or numbers are traced.
 
-        Robot, tasks, scheme and limits that are new are copied.
-
-        Args:
-            robot: the robot.
-            q: a checked configuration. (nq,)
-            tasks: by name.
-            scheme: None for the default.
-            limits: as they are given.
-            dt: time of the step [s].
-            targets: of some tasks, as ``replace(target=...)`` takes them.
-            warm_start: as in ``solve``.
+        The arguments are those of ``solve``, and q is checked. Robot, tasks, scheme and limits that are new are copied.
 
         Raises:
             TypeError, ValueError: as ``replace``.
@@ -434,11 +406,7 @@ def _makers(
 ) -> tuple[Callable[..., Solution], Callable[..., Solution]]:
     """Return the functions from the core's results to a solution, with NumPy's arrays and with JAX's.
 
-    Args:
-        scheme: class of the scheme.
-        nv: length of the velocity.
-        rows: names of the tasks in their order, with the number of rows of each.
-        labels: shapes of the warm start's arrays.
+    The arguments are those of ``solution_shapes``, with the rows as pairs.
     """
     leaves, structure = jax.tree.flatten(solution_shapes(scheme, nv, dict(rows), labels))
     # numbers by their index: a slice and its shape take longer

@@ -97,17 +97,7 @@ def rollout(
     q0 = checked_start(robot, q0)
     if not callable(tasks):
         warn_of_tasks(robot, q0, tasks, scheme, dt)
-    path = _rollout(
-        robot,
-        q0,
-        numbers,
-        scheme,
-        limits,
-        in_type_of(dt, q0),
-        targets,
-        static=static,
-        steps=steps,
-    )
+    path = _rollout(robot, q0, numbers, scheme, limits, in_type_of(dt, q0), targets, static=static, steps=steps)
     watch_memory_maps("rollout", _rollout)
     return path
 

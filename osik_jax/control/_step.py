@@ -102,7 +102,7 @@ def solve(
         check_tasks(tasks, robot)
         warn_of_tasks(robot, checked_configuration(robot, q), tasks, scheme, dt)
         plain = kept_step(robot, tasks, scheme, limits)
-        if plain is None or not plain.fits(tasks):
+        if plain is None or (isinstance(plain, PlainStep) and not plain.fits(tasks)):
             plain = keep_step(robot, q, tasks, scheme, limits, dt)
         elif not isinstance(plain, PlainStep):
             plain.note(robot, tasks, limits)

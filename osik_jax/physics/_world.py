@@ -19,8 +19,7 @@ from ..robot._guesses import with_corners
 from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose
 from ..robot._tree import BALL, FREE
 from ..robot.loading._mjmodel import element_names
-from ._servo import Servo as Servo
-from ._servo import add_servo, choose_servos
+from ._servo import Servo, add_servo, choose_servos
 
 Feet = Mapping[str, ArrayLike] | Sequence[str]
 """Frames that touch the floor: names with their contact points in the frame [m], or names alone (see ``build_world``).

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import hashlib
 import json
 import os
 import warnings
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -142,7 +141,7 @@ def read_controller(text: bytes, path: str) -> Controller:
     try:
         found = _made(content, _robot(content["robot"]))
         check_setting("load_controller(path)", found.robot, found.scheme, found.dt)
-        with _no_own_warnings():  # check_setting has given them
+        with warnings.catch_warnings(action="ignore", category=OsikWarning):  # check_setting has given them
             jax.eval_shape(lambda q: build_problem(found.robot, q, found.tasks, limits=found.limits), found.robot.q0)
     except OSError:  # of the robot's file
         raise
@@ -241,15 +240,9 @@ def _arrays_are_close(one: Any, other: Any) -> bool:
 
 
 def _quietly_loaded(described: Mapping[str, Any]) -> Robot:
-    with _no_own_warnings():  # what the robot does not keep was said when it was loaded
+    # what the robot does not keep was said when it was loaded
+    with warnings.catch_warnings(action="ignore", category=OsikWarning):
         return _loaded(described)
-
-
-@contextlib.contextmanager
-def _no_own_warnings() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)
-        yield
 
 
 def _robot(described: Mapping[str, Any]) -> Robot:

@@ -82,8 +82,7 @@ def encode(part: Any, robot: Robot, where: str) -> Data:
 
 def makes(data: Data, robot: Robot, part: Any) -> bool:
     """Return whether data makes an object of the same structure and with the same numbers, to the last bit."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)
+    with warnings.catch_warnings(action="ignore", category=OsikWarning):
         try:
             made = decode(data, robot, "it")
         except (KeyError, ValueError):
@@ -106,7 +105,7 @@ def decode(data: Any, robot: Robot, where: str) -> Any:
     try:
         if cls is CollisionAvoidanceLimit:
             return _collision_limit(robot, given)
-        made = cls(robot, **given) if takes_robot(cls) else cls(**given)
+        made = cls(robot, **given) if "robot" in inspect.signature(cls).parameters else cls(**given)
     except TypeError as error:
         raise OsikValueError(f"{where}: {error}") from error
     return _with_exact_directions(made, given)
@@ -127,19 +126,19 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)
 
 
-def takes_robot(cls: type) -> bool:
-    """Return whether the first argument of a class is the robot."""
-    return next(iter(inspect.signature(cls).parameters), None) == "robot"
-
-
 def _is_kept(cls: Any) -> bool:
     return inspect.isclass(cls) and issubclass(cls, _CLASSES)
 
 
 def _collision_limit(robot: Robot, given: Mapping[str, Any]) -> CollisionAvoidanceLimit:
-    arguments, left_out = collision_arguments(given)
+    """Return the limit of data; its pairs are those that were kept, so none is left out (``q0_distance=-inf``)."""
+    arguments = {"q0_distance": -np.inf, **given}
+    left_out = tuple((first, second) for first, second in arguments.pop("left_out", ()))
+    if "pairs" in arguments:
+        arguments["pairs"] = [tuple(pair) for pair in arguments["pairs"]]
+    arguments["shapes"] = {name: _shape(one) for name, one in arguments.get("shapes", {}).items()}
     made = CollisionAvoidanceLimit(robot, **arguments)
-    object.__setattr__(made, "left_out", left_out)  # a record alone: all pairs of the file are kept
+    object.__setattr__(made, "left_out", left_out)  # a record alone
     return made
 
 
@@ -193,19 +192,6 @@ def collision_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, An
     numbers = {name: np.asarray(getattr(limit, name)).tolist() for name in limit.replaceable}
     pairs = {name: [list(pair) for pair in getattr(limit, name)] for name in ("pairs", "left_out")}
     return {**pairs, "shapes": _shapes_data(limit, robot), **numbers, "max_pairs": limit.max_pairs}
-
-
-def collision_arguments(given: Mapping[str, Any]) -> tuple[dict[str, Any], tuple[tuple[str, str], ...]]:
-    """Return the constructor's arguments of data, and the pairs that were left out.
-
-    The pairs are those that were kept, so the constructor leaves none out (``q0_distance=-inf``).
-    """
-    arguments = {"q0_distance": -np.inf, **given}
-    left_out = tuple((first, second) for first, second in arguments.pop("left_out", ()))
-    if "pairs" in arguments:
-        arguments["pairs"] = [tuple(pair) for pair in arguments["pairs"]]
-    arguments["shapes"] = {name: _shape(one) for name, one in arguments.get("shapes", {}).items()}
-    return arguments, left_out
 
 
 def _shapes_data(limit: CollisionAvoidanceLimit, robot: Robot) -> dict[str, dict[str, Any]]:

@@ -25,9 +25,8 @@ def fingerprint(tree: Any) -> dict[str, str]:
 
 
 def identifier(manifest: Mapping[str, Any]) -> str:
-    """Return a hash of a manifest without its entry "job"."""
-    said = {key: value for key, value in manifest.items() if key != "job"}
-    return _digest(json.dumps(said, sort_keys=True).encode())
+    """Return a hash of a manifest."""
+    return _digest(json.dumps(manifest, sort_keys=True).encode())
 
 
 def _described(array: np.ndarray) -> str:

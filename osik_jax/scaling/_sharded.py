@@ -17,12 +17,7 @@ from .._errors import OsikTypeError, OsikValueError
 from ..execution._lanes import refuse_explicit_axes
 
 
-def sharded(
-    function: Callable[..., Any],
-    in_axes: Any = 0,
-    *,
-    mesh: Mesh | None = None,
-) -> ShardedFunction:
+def sharded(function: Callable[..., Any], in_axes: Any = 0, *, mesh: Mesh | None = None) -> ShardedFunction:
     """Return a function like ``jax.jit(jax.vmap(function, in_axes))``, with the batch split over devices.
 
     Each device runs its own lanes to their own end: no device waits for another one's slowest lane, and nothing is
@@ -63,12 +58,12 @@ class ShardedFunction:
         self.function, self.in_axes, self.mesh = function, in_axes, mesh
         self._axes = tuple(in_axes) if isinstance(in_axes, list) else in_axes
         self._known: dict[Any, list[NamedSharding]] = {}  # where arrays are wanted, by the structure of the arguments
-        specs = jax.tree.map(self._spec, self._axes, is_leaf=lambda axis: axis is None)
+        self._places = jax.tree.map(self._place, self._axes, is_leaf=lambda axis: axis is None)
         # Checks of what varies over the mesh are off: loops inside the solvers begin with constants, which do not.
         mapped = jax.shard_map(
             jax.vmap(_making_empty_arrays(function), in_axes=self._axes),
             mesh=mesh,
-            in_specs=specs,
+            in_specs=jax.tree.map(lambda place: place.spec, self._places),
             out_specs=PartitionSpec(mesh.axis_names),
             check_vma=False,
         )
@@ -118,16 +113,14 @@ class ShardedFunction:
         if structure not in self._known:
             if isinstance(self._axes, tuple) and len(self._axes) != len(args):
                 raise OsikValueError(f"in_axes has {len(self._axes)} parts, for {len(args)} arguments")
-            places = jax.tree.map(
-                lambda axis: NamedSharding(self.mesh, self._spec(axis)), self._axes, is_leaf=lambda axis: axis is None
-            )
-            self._known[structure] = jax.tree.leaves(jax.tree.broadcast(places, args))
+            self._known[structure] = jax.tree.leaves(jax.tree.broadcast(self._places, args))
         return leaves, structure, self._known[structure]
 
-    def _spec(self, axis: int | None) -> PartitionSpec:
+    def _place(self, axis: int | None) -> NamedSharding:
         if axis is not None and axis < 0:
             raise OsikValueError(f"in_axes has axis {axis}; axes count from the first, 0")
-        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, self.mesh.axis_names)
+        split = () if axis is None else (*[None] * axis, self.mesh.axis_names)
+        return NamedSharding(self.mesh, PartitionSpec(*split))
 
 
 _NUMBERS = (bool, int, float, complex)

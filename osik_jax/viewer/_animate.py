@@ -70,11 +70,13 @@ def animate(
         The path written.
 
     Raises:
-        ValueError: the suffix is neither .gif nor .mp4, or ffmpeg is missing for .mp4.
+        ValueError: the suffix is neither .gif nor .mp4, ffmpeg is missing for .mp4, or q is not (T, nq).
         OSError: the file cannot be written.
     """
     path = Path(path)
     _check_path(path)
+    if np.ndim(q) != 2 or len(q) == 0 or np.shape(q)[1] != robot.nq:
+        raise OsikValueError(f"q has shape {np.shape(q)}; it is configurations (T, {robot.nq}), one at least")
     stride = max(1, round(1.0 / (frames_per_second * dt)))
     frames = np.arange(0, len(q), stride)
     q, time = np.asarray(q)[frames], frames * dt

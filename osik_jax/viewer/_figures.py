@@ -109,8 +109,8 @@ def _sphere_parts(robot: Robot, spheres: CoveringSpheres) -> RobotParts:
     """Return the covering spheres as parts; neighbouring shapes have different colours."""
     colors = np.array([[0.16, 0.45, 0.75, 1.0], [0.93, 0.55, 0.19, 1.0], [0.35, 0.65, 0.35, 1.0]])
     parts = tuple(
-        Part(k, mujoco.mjtGeom.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), colors[shape % len(colors)])
-        for k, (radius, shape) in enumerate(zip(spheres.radius, spheres.shape, strict=True))
+        Part(mujoco.mjtGeom.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), colors[shape % len(colors)])
+        for radius, shape in zip(spheres.radius, spheres.shape, strict=True)
     )
     bodies = np.array(model_bodies(robot))[spheres.body]
     turns = np.broadcast_to(np.eye(3), (len(parts), 3, 3))

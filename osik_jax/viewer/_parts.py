@@ -42,7 +42,6 @@ _HIDDEN_GROUP = 3
 class Part:
     """One shape of a robot."""
 
-    index: int  # of a stick: the body of a dot, then of a line the number of bodies and its place in ``_stick_ends``
     kind: mujoco.mjtGeom  # MuJoCo's geom type
     size: np.ndarray  # MuJoCo's geom sizes [m]. (3,)
     color: np.ndarray  # red, green, blue, alpha. (4,)
@@ -86,12 +85,13 @@ class RobotParts:
     """Shapes of a robot for pictures."""
 
     model: mujoco.MjModel  # the MuJoCo model
-    style: Literal["look", "geoms", "sticks"]  # ``"look"``, ``"geoms"`` or ``"sticks"``
+    style: Literal["look", "geoms", "sticks"]  # visual shapes of a URDF, geoms of the model, or sticks
     parts: tuple[Part, ...]  # the shapes
     bodies: Int[np.ndarray, " parts"]  # MuJoCo's index of the body that carries each part
     # position [m] and rotation of each part in its body; of sticks, which change with the configuration, the bodies
     # without children, and of each the farthest named point in its frame [m]
     anchors: tuple[np.ndarray, np.ndarray]
+    rows: Int[np.ndarray, " parts"] | None = None  # of sticks: a dot's body, or the bodies' number and a line's number
 
     def corners(self, data: mujoco.MjData) -> Float[np.ndarray, "points 3"]:
         """Return the corners of the parts' bounding boxes in the world [m], which a camera must show."""
@@ -102,11 +102,10 @@ class RobotParts:
     def poses(self, data: mujoco.MjData) -> tuple[Float[np.ndarray, "parts 3"], Float[np.ndarray, "parts 3 3"]]:
         """Return positions [m] and rotations of the parts in the world, from ``data`` after ``mj_kinematics``."""
         frames = data.xmat.reshape(-1, 3, 3)
-        if self.style == "sticks":
+        if self.rows is not None:
             start, end = _stick_ends(data, self.model.body_parentid, self.anchors)
-            index = [part.index for part in self.parts]
             position = np.concatenate([data.xpos, 0.5 * (start + end)])
-            return position[index], np.concatenate([frames, _link_frames(end - start)])[index]
+            return position[self.rows], np.concatenate([frames, _link_frames(end - start)])[self.rows]
         (shift, turn), frames = self.anchors, frames[self.bodies]
         return data.xpos[self.bodies] + np.einsum("pij,pj->pi", frames, shift), frames @ turn
 
@@ -133,8 +132,8 @@ def robot_parts(robot: Robot) -> RobotParts:
 
 def _look_parts(model: mujoco.MjModel, look: Look, bodies: list[int]) -> RobotParts:
     parts = tuple(
-        Part(k, shape.kind, shape.size, _PLAIN if shape.color is None else np.asarray(shape.color), shape.mesh)
-        for k, shape in enumerate(look.shapes)
+        Part(shape.kind, shape.size, _PLAIN if shape.color is None else np.asarray(shape.color), shape.mesh)
+        for shape in look.shapes
     )
     places = np.array([s.position for s in look.shapes]), np.array([s.rotation for s in look.shapes])
     return RobotParts(model, "look", parts, np.array(bodies), places)
@@ -161,7 +160,7 @@ def _visible_geoms(model: mujoco.MjModel) -> list[int]:
 def _geom_part(model: mujoco.MjModel, geom: int) -> Part:
     kind = _GEOM(model.geom_type[geom])
     mesh = _mesh(model, int(model.geom_dataid[geom])) if kind == _GEOM.mjGEOM_MESH else None
-    return Part(geom, kind, model.geom_size[geom].copy(), _geom_color(model, geom), mesh)
+    return Part(kind, model.geom_size[geom].copy(), _geom_color(model, geom), mesh)
 
 
 def _mesh(model: mujoco.MjModel, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +176,7 @@ def _geom_color(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _sticks(robot: Robot) -> RobotParts:
-    """Return dots on bodies with joints, and sticks from each body to its parent and to its tip."""
+    """Return dots on bodies with joints, and lines from each body to its parent and to its tip."""
     model, tips, data = robot.mj_model, _tips(robot), home_poses(robot)
     start, end = _stick_ends(data, model.body_parentid, tips)
     length = np.linalg.norm(end - start, axis=-1)
@@ -185,16 +184,14 @@ def _sticks(robot: Robot) -> RobotParts:
     extent = float(np.linalg.norm(np.ptp(np.concatenate([start, end]), axis=0)))
     # thin beside typical links and beside the whole robot, also if one of both sizes is unusual
     radius = min(0.13 * float(np.median(length[length > 1e-6])), 0.02 * extent) if np.any(length > 1e-6) else 0.02
-    dots = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
+    dots, lines = np.flatnonzero(model.body_jntnum), np.flatnonzero(length > 1e-6)
     parts = (
-        *(Part(body, _GEOM.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), _JOINT) for body in dots),
-        *(
-            Part(model.nbody + link, _GEOM.mjGEOM_CAPSULE, np.array([0.55 * radius, 0.5 * length[link], 0.0]), _STICK)
-            for link in np.flatnonzero(length > 1e-6)
-        ),
+        *(Part(_GEOM.mjGEOM_SPHERE, np.array([radius, 0.0, 0.0]), _JOINT) for _ in dots),
+        *(Part(_GEOM.mjGEOM_CAPSULE, np.array([0.55 * radius, 0.5 * along, 0.0]), _STICK) for along in length[lines]),
     )
     ends = np.concatenate([np.arange(model.nbody), model.body_parentid, tips[0]])
-    return RobotParts(model, "sticks", parts, ends[[part.index for part in parts]], tips)
+    rows = np.concatenate([dots, model.nbody + lines])
+    return RobotParts(model, "sticks", parts, ends[rows], tips, rows)
 
 
 def _tips(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +233,7 @@ def fixed_parts(robot: Robot, shapes: Iterable[CollisionShape]) -> RobotParts:
                 f"a {shape.kind.name.lower()} on frame {shape.frame!r} is not drawn; shapes are spheres, capsules, "
                 "boxes and cylinders of the world"
             )
-    parts = tuple(Part(k, _geom_type(shape), np.asarray(shape.size, float), _ORANGE) for k, shape in enumerate(shapes))
+    parts = tuple(Part(_geom_type(shape), np.asarray(shape.size, float), _ORANGE) for shape in shapes)
     positions = np.array([shape.position for shape in shapes], float).reshape(-1, 3)
     rotations = np.array([shape.rotation for shape in shapes], float).reshape(-1, 3, 3)
     return RobotParts(robot.mj_model, "look", parts, np.zeros(len(parts), int), (positions, rotations))

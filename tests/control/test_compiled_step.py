@@ -18,7 +18,9 @@ from step_checks import (
     SCHEMES,
     arguments,
     assert_alike_where_numbers_are_not_valid,
+    assert_answers_of_plain_jax,
     assert_close,
+    assert_near_in_single_precision,
     assert_slopes_are_differences,
     by_core,
     frames_of,
@@ -90,15 +92,7 @@ CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed"
 def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
     robot = osik.load_robot(name)
     given = arguments(robot, SETS[tasks](robot), SCHEMES[scheme]())
-    q = lanes_of(robot)
-    assert _step.is_compiled(robot, q[0], *given)
-    found, done = by_core(robot, q, *given)
-    wanted = plain(robot, q, *given)
-    assert done.mean() > 0.8
-    assert (np.asarray(wanted.status)[done] == 0).all()
-    for field in ("velocity", "slack", "error"):
-        a, b = (jax.tree.map(lambda x: x[done], getattr(s, field)) for s in (found, wanted))
-        assert_close(a, b, 1e-12 * (1.0 + max(float(jnp.abs(x).max()) for x in jax.tree.leaves(b))))
+    found, wanted = assert_answers_of_plain_jax(robot, given, 1e-12)
     if isinstance(given[1], osik.NullSpace):  # the residual is that of the first priority, met or not
         np.testing.assert_allclose(found.kkt_residual, wanted.kkt_residual, rtol=1e-9, atol=1e-9)
         # rounding decides in which of two orders joints that are at their bounds were saturated
@@ -113,16 +107,7 @@ def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
 @pytest.mark.variants(slow=["weighted"], release=["hierarchy", "null-space", "saturated"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_in_single_precision_the_core_answers_within_its_roundoff(scheme):
-    with jax.enable_x64(False):
-        robot = osik.load_robot("nao")
-        given = arguments(robot, mixed(robot), SCHEMES[scheme]())
-        q = lanes_of(robot)
-        found, done = by_core(robot, q, *given)
-        assert found.velocity.dtype == jnp.float32 and done.all()
-    robot = osik.load_robot("nao")
-    given = arguments(robot, mixed(robot), SCHEMES[scheme]())
-    wanted = plain(robot, jnp.asarray(q, float), *given)
-    np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
+    assert_near_in_single_precision("nao", mixed, scheme)
 
 
 @pytest.mark.variants(slow=["weighted", "hierarchy"], release=["null-space", "saturated"])

@@ -17,7 +17,9 @@ from step_checks import (
     SCHEMES,
     arguments,
     assert_alike,
+    assert_answers_of_plain_jax,
     assert_close,
+    assert_near_in_single_precision,
     assert_slopes_are_differences,
     by_core,
     frames_of,
@@ -115,16 +117,9 @@ def test_the_step_with_rows_of_jax_is_that_of_plain_jax(case, scheme):
     load, tasks_of = ROBOTS[case]
     robot = load()
     given = arguments(robot, tasks_of(robot), SCHEMES[scheme]())
-    q = lanes_of(robot)
-    assert _step.is_compiled(robot, q[0], *given)
-    found, done = by_core(robot, q, *given)
-    wanted = plain(robot, q, *given)
-    assert done.mean() > 0.8
+    found, wanted = assert_answers_of_plain_jax(robot, given, 1e-10)
     assert float(jnp.abs(wanted.velocity).max()) > 1e-2
     np.testing.assert_array_equal(found.status, wanted.status)
-    for field in ("velocity", "slack", "error"):
-        a, b = (jax.tree.map(lambda x: x[done], getattr(s, field)) for s in (found, wanted))
-        assert_close(a, b, 1e-10 * (1.0 + max(float(jnp.abs(x).max()) for x in jax.tree.leaves(b))))
 
 
 FIELDS = ("error", "jacobian", "lower", "upper", "weight", "pull", "levers", "curvature")
@@ -179,14 +174,7 @@ def test_a_limit_of_ones_own_without_rows_is_the_box_of_the_one_call():
 
 @pytest.mark.release
 def test_in_single_precision_the_step_with_rows_of_jax_is_within_its_roundoff():
-    with jax.enable_x64(False):
-        robot = osik.load_robot("nao")
-        q = lanes_of(robot)
-        found, done = by_core(robot, q, *arguments(robot, looking(robot), osik.WeightedQP()))
-        assert found.velocity.dtype == jnp.float32 and done.all()
-    robot = osik.load_robot("nao")
-    wanted = plain(robot, jnp.asarray(q, float), *arguments(robot, looking(robot), osik.WeightedQP()))
-    np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
+    assert_near_in_single_precision("nao", looking, "weighted")
 
 
 @pytest.mark.slow

@@ -32,16 +32,6 @@ def short(tmp_path_factory):
     return folder, shown, motion, run
 
 
-def look_all(robot, q):
-    """MuJoCo's data at every configuration of a trajectory."""
-    for qpos in np.asarray(jax.vmap(robot.mujoco_qpos)(q)):
-        data = mujoco.MjData(robot.mj_model)
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(robot.mj_model, data)
-        mujoco.mj_comPos(robot.mj_model, data)
-        yield data
-
-
 def corners(data, *feet):
     return np.array([data.site(f"{foot}_corner_{k}").xpos[:2] for foot in feet for k in range(4)])
 
@@ -136,7 +126,7 @@ def check_requirements(motion, run, lifted=None):
     first = mujoco_at(robot, run.q[0])
     hulls = {feet: ConvexHull(corners(first, *feet)).equations for feet in (("l_sole", "r_sole"), ("l_sole",))}
     paths = jax.jit(jax.vmap(motion.goals["waist"].path.at))(DT * np.arange(len(run.q)))[0][0]
-    for k, data in enumerate(look_all(robot, run.q)):
+    for k, data in enumerate(mujoco_at(robot, q) for q in run.q):
         feet = ("l_sole",) if lifted is not None and lifted[0] < DT * k < lifted[1] else ("l_sole", "r_sole")
         for foot in feet:
             assert np.linalg.norm(data.site(foot).xpos - first.site(foot).xpos) <= 1e-4, (k, foot)
@@ -183,7 +173,7 @@ def test_files_and_figures_agree_with_mujoco(short, nao):
     arrays = np.load(folder / "motion.npz")
     assert arrays["q_weighted"].shape == (101, nao.nq) and arrays["v_weighted"].shape == (100, nao.nv)
     assert [column.header for column in shown.columns] == ["", "Weighted QP"]
-    data = list(look_all(nao, run.q))
+    data = [mujoco_at(nao, q) for q in run.q]
     drift = max(np.linalg.norm(d.site(foot).xpos - data[0].site(foot).xpos) for d in data for foot in FEET)
     assert run.seen.drift.max() == pytest.approx(drift, rel=1e-6, abs=1e-12)
     hull = ConvexHull(corners(data[0], *FEET)).equations

@@ -6,7 +6,7 @@ import inspect
 import json
 from typing import Any
 
-import jax
+import equinox as eqx
 import numpy as np
 import pytest
 from model_files import mjcf
@@ -136,16 +136,11 @@ SCHEMES = [
 MADE = [cls(ROBOT, *first, **given) for cls, first, given in PARTS] + [BARRIER, osik.no_limits, *SCHEMES]
 
 
-def same(a: Any, b: Any) -> bool:
-    (first, structure), (second, other) = jax.tree.flatten(a), jax.tree.flatten(b)
-    return structure == other and all(map(np.array_equal, first, second))
-
-
 def test_every_public_class_and_argument_comes_back_and_a_missing_one_is_its_default():
     needed: dict[str, set[str]] = {}
     for part in MADE:
         data = json.loads(json.dumps(encode(part, ROBOT, "it")))
-        assert same(decode(data, ROBOT, "it"), part), data
+        assert eqx.tree_equal(decode(data, ROBOT, "it"), part), data
         own = needed.setdefault(type(part).__name__, set())
         own |= {name for name in data if not makes({n: v for n, v in data.items() if n != name}, ROBOT, part)}
     bases = (osik.Task, osik.Limit, osik.Scheme)
@@ -187,4 +182,4 @@ def test_rotations_and_directions_are_kept_to_the_last_bit_in_both_precisions(ar
                 ),
             ]
             for part in parts:
-                assert same(decode(json.loads(json.dumps(encode(part, robot, "it"))), robot, "it"), part)
+                assert eqx.tree_equal(decode(json.loads(json.dumps(encode(part, robot, "it"))), robot, "it"), part)

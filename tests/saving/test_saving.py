@@ -5,6 +5,7 @@ import os
 import stat
 from typing import Any, cast
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,22 +18,14 @@ import osik_jax as osik
 from osik_jax._whole_file import whole_file, write_text
 
 
-def same(a: Any, b: Any) -> bool:
-    first, second = jax.tree.flatten(a), jax.tree.flatten(b)
-    return first[1] == second[1] and all(
-        np.array_equal(x, y) and np.asarray(x).dtype == np.asarray(y).dtype
-        for x, y in zip(first[0], second[0], strict=True)
-    )
-
-
 def test_everything_comes_back(arm, tmp_path):
     path, tasks, limits, scheme = tmp_path / "c.json", all_tasks(arm), all_limits(arm), osik.WeightedQP(2e-6)
     osik.save_controller(path, arm, tasks, scheme=scheme, limits=limits, dt=0.01, source="arm7")
     found = osik.load_controller(path)
-    assert found.dt == 0.01 and same(found.scheme, scheme) and same(found.robot, arm)
+    assert found.dt == 0.01 and eqx.tree_equal(found.scheme, scheme) and eqx.tree_equal(found.robot, arm)
     assert list(found.tasks) == list(tasks)
-    assert [name for name, task in tasks.items() if not same(found.tasks[name], task)] == []
-    assert all(same(*pair) for pair in zip(found.limits, limits, strict=True))
+    assert [name for name, task in tasks.items() if not eqx.tree_equal(found.tasks[name], task)] == []
+    assert all(eqx.tree_equal(*pair) for pair in zip(found.limits, limits, strict=True))
 
 
 def test_it_gives_the_same_velocity_and_keeps_changed_numbers(arm, tmp_path):
@@ -70,7 +63,7 @@ def test_a_robot_from_text_and_a_file_that_changed(tmp_path):
     file = tmp_path / "robot.xml"
     file.write_text(text)
     osik.save_controller(tmp_path / "f.json", robot, tasks, source=file)
-    assert same(osik.load_controller(tmp_path / "f.json").robot, robot)
+    assert eqx.tree_equal(osik.load_controller(tmp_path / "f.json").robot, robot)
     file.write_text(text.replace(".3 0 0", ".4 0 0"))
     refuses(ValueError, "has changed since", osik.load_controller, tmp_path / "f.json")
 
@@ -115,7 +108,7 @@ def test_a_limit_on_meshes_needs_the_source(tmp_path):
     osik.save_controller(tmp_path / "c.json", robot, tasks)
     (tmp_path / "r.xml").write_text(text)
     osik.save_controller(tmp_path / "f.json", robot, tasks, limits=limits, source=tmp_path / "r.xml")
-    assert same(osik.load_controller(tmp_path / "f.json").limits[0], limits[0])
+    assert eqx.tree_equal(osik.load_controller(tmp_path / "f.json").limits[0], limits[0])
 
 
 FUSED = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom size=".05"/>
@@ -202,8 +195,8 @@ def test_a_file_has_public_names_and_what_is_missing_in_it_is_the_default(saved,
     (path := tmp_path / "c.json").write_text(edited(content))
     found = osik.load_controller(path)
     wanted = {"hand": osik.FrameTask(arm, "hand", weight=7.0), "rest": osik.PostureTask(arm)}
-    assert same(found.tasks, wanted) and same(found.scheme, osik.HierarchicalQP())
-    assert same(found.limits, (osik.ConfigurationLimit(arm, gain=0.5),))
+    assert eqx.tree_equal(found.tasks, wanted) and eqx.tree_equal(found.scheme, osik.HierarchicalQP())
+    assert eqx.tree_equal(found.limits, (osik.ConfigurationLimit(arm, gain=0.5),))
 
 
 def edited(content: dict[str, Any]) -> str:

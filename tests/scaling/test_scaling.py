@@ -13,6 +13,7 @@ from refusals import refuses
 
 import osik_jax as osik
 from osik_jax import scaling
+from osik_jax.scaling._fingerprint import differences, fingerprint
 
 EIGHT = """
 import json
@@ -168,9 +169,6 @@ def test_another_job_is_refused(tmp_path, changes, message):
 
 def test_structure_of_robots_and_tasks_is_part_of_the_job():
     """The same in every process, and another for another scheme or other rows."""
-    import osik_jax as osik
-    from osik_jax.scaling._fingerprint import differences, fingerprint
-
     arm, again = osik.load_robot("arm7"), osik.load_robot("arm7")
     assert fingerprint(arm) == fingerprint(again)
     assert differences(fingerprint(arm), fingerprint(arm.scaled(mass={"link7": 2.0})))[0].startswith("body_mass was")

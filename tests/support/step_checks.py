@@ -73,6 +73,33 @@ def assert_close(found: Any, wanted: Any, tolerance: float) -> None:
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance)
 
 
+def assert_answers_of_plain_jax(
+    robot: osik.Robot, given: tuple[Any, ...], tolerance: float
+) -> tuple[osik.Solution, osik.Solution]:
+    """Return the core's answers and those of plain JAX; assert that they agree within a relative tolerance."""
+    q = lanes_of(robot)
+    assert _step.is_compiled(robot, q[0], *given)
+    found, done = by_core(robot, q, *given)
+    wanted = plain(robot, q, *given)
+    assert done.mean() > 0.8 and (np.asarray(wanted.status)[done] == 0).all()
+    for field in ("velocity", "slack", "error"):
+        a, b = (jax.tree.map(lambda x: x[done], getattr(s, field)) for s in (found, wanted))
+        assert_close(a, b, tolerance * (1.0 + max(float(jnp.abs(x).max()) for x in jax.tree.leaves(b))))
+    return found, wanted
+
+
+def assert_near_in_single_precision(name: str, tasks_of: Any, scheme: str) -> None:
+    """Assert that the core's answer for a robot by name in float32 is plain JAX's in float64, but for roundoff."""
+    with jax.enable_x64(False):
+        robot = osik.load_robot(name)
+        q = lanes_of(robot)
+        found, done = by_core(robot, q, *arguments(robot, tasks_of(robot), SCHEMES[scheme]()))
+        assert found.velocity.dtype == jnp.float32 and done.all()
+    robot = osik.load_robot(name)
+    wanted = plain(robot, jnp.asarray(q, float), *arguments(robot, tasks_of(robot), SCHEMES[scheme]()))
+    np.testing.assert_allclose(found.velocity, wanted.velocity, atol=2e-3 * float(jnp.abs(wanted.velocity).max()))
+
+
 def assert_slopes_are_differences(cost: Any, *given: Any) -> None:
     """Assert that the gradient of a jitted function by all its arguments is that of central differences."""
     found, _ = ravel_pytree(jax.jit(jax.grad(cost, argnums=tuple(range(len(given)))))(*given))

@@ -19,7 +19,7 @@ from osik_jax.cli import Retarget, View
 from osik_jax.robot._mujoco import mujoco_frame_pose, mujoco_poses
 from osik_jax.viewer import export_html
 from osik_jax.viewer.live._open import default_session
-from osik_jax.viewer.live._page import LiveView, serve_session
+from osik_jax.viewer.live._page import LiveView
 
 pytestmark = pytest.mark.slow
 ROBOT = osik.load_robot("nao")
@@ -60,7 +60,7 @@ def visit() -> Iterator[Visit]:
 def view() -> Iterator[LiveView]:
     polygon = osik.support_polygon(ROBOT, ROBOT.q0, FEET, margin=0.01)
     session = default_session(ROBOT, feet=FEET, polygon=polygon, source="nao")
-    with serve_session(session, host="127.0.0.1", port=0) as view:
+    with LiveView(session, host="127.0.0.1", port=0) as view:
         assert view.loop.wait_until_ready(120.0)
         yield view
 

@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 from refusals import refuses
+from scipy.spatial import ConvexHull
+from trimesh import Trimesh
 from waiting import until
 
 import osik_jax as osik
@@ -21,38 +23,21 @@ from osik_jax.retargeting._robot_motion import in_mujoco_order
 from osik_jax.viewer import export_html, serve
 from osik_jax.viewer._parts import Part, robot_parts
 from osik_jax.viewer.live._open import sole_polygon, standing
+from osik_jax.viewer.live._page import BalanceMarks
 from osik_jax.viewer.live._panel import error_text
 from osik_jax.viewer.live._playback import read_motion
+from osik_jax.viewer.live._server import close_server, open_server
 from osik_jax.viewer.live._surfaces import part_triangles
 
 ARM, NAO = osik.load_robot("arm7"), osik.load_robot("nao")
 _GEOM = mujoco.mjtGeom
 
 
-def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Of a closed surface [m^3]."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return float(np.sum(a * np.cross(b, c)) / 6.0)
-
-
-def part(kind: mujoco.mjtGeom, *size: float) -> Part:
-    return Part(0, kind, np.array([*size, 0.0, 0.0][:3]), np.ones(4))
-
-
-@pytest.mark.parametrize(
-    ("shape", "exact", "corners"),
-    [
-        (part(_GEOM.mjGEOM_SPHERE, 0.3), 4.0 / 3.0 * np.pi * 0.027, None),
-        (part(_GEOM.mjGEOM_CYLINDER, 0.2, 0.5), np.pi * 0.04, None),
-        (part(_GEOM.mjGEOM_BOX, 0.1, 0.2, 0.3), 8 * 0.006, 3),
-    ],
-)
-def test_surfaces_are_closed_and_sharp_at_edges(shape: Part, exact: float, corners: int | None) -> None:
-    vertices, faces = part_triangles(shape)
-    assert volume(vertices, faces) == pytest.approx(exact, rel=0.03)
-    if corners is not None:  # each corner of a box is there once for each side
-        extreme = np.all(np.isclose(np.abs(vertices), shape.size), axis=1)
-        assert extreme.sum() == 8 * corners
+def test_a_box_is_sharp_at_its_edges() -> None:
+    """Each corner is there once for each side."""
+    size = np.array([0.1, 0.2, 0.3])
+    vertices, _ = part_triangles(Part(_GEOM.mjGEOM_BOX, size, np.ones(4)))
+    assert np.all(np.isclose(np.abs(vertices), size), axis=1).sum() == 8 * 3
 
 
 def test_large_meshes_become_smaller_and_stay_where_they_were() -> None:
@@ -62,11 +47,11 @@ def test_large_meshes_become_smaller_and_stay_where_they_were() -> None:
     i, j = (k.ravel() for k in np.meshgrid(np.arange(fine - 1), np.arange(fine), indexing="ij"))
     a, b = i * fine + j, i * fine + (j + 1) % fine
     faces = np.concatenate([np.stack([a, b, b + fine], 1), np.stack([a, b + fine, a + fine], 1)])
-    big = Part(0, _GEOM.mjGEOM_MESH, np.zeros(3), np.ones(4), (points, faces))
+    big = Part(_GEOM.mjGEOM_MESH, np.zeros(3), np.ones(4), (points, faces))
     vertices, fewer = part_triangles(big)
     assert len(fewer) <= 4000 < len(faces)
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.5, atol=0.02)
-    assert volume(vertices, fewer) == pytest.approx(volume(points, faces), rel=0.03)
+    assert Trimesh(vertices, fewer, process=False).volume == pytest.approx(Trimesh(points, faces).volume, rel=0.03)
 
 
 def test_motions_are_read_as_the_demo_and_rollouts_write_them(tmp_path: Path) -> None:
@@ -155,8 +140,13 @@ def test_the_command_tells_what_is_wrong_in_one_line(tmp_path: Path, capsys: pyt
             assert told in error and error.count("\n") == 1 and error.startswith("osik: ")
 
 
-def test_what_a_controller_has_is_not_given_beside_it() -> None:
+def test_wrong_arguments_are_named() -> None:
     tasks = {"posture": osik.PostureTask(ARM)}
+    refuses(TypeError, r"serve\(robot, tasks\)", serve, "arm7", tasks, port=0)
+    refuses(TypeError, "tasks is a list; it is a dict from names to tasks", serve, ARM, list(tasks.values()), port=0)
+    refuses(ValueError, "there is no task", serve, ARM, port=0)
+    refuses(ValueError, "q0 has shape", serve, ARM, tasks, q0=np.zeros(3), port=0)
+    # what a controller has is not given beside it
     parts: dict[str, Any] = dict(tasks=tasks, scheme=osik.NullSpace(), limits=osik.no_limits, dt=0.005)
     for name, part in parts.items():
         refuses(ValueError, "a controller has its own", serve, osik.Controller(ARM, tasks), port=0, **{name: part})
@@ -175,21 +165,37 @@ def test_soles_without_named_corners_span_what_they_stand_on() -> None:
     drawn = sole_polygon(NAO, shapes, q, ("l_ankle", "r_ankle"))
     assert named is not None and drawn is not None
     assert bool(np.all(named.distance(drawn.vertices) > -0.01))
-    assert _area(drawn.vertices) > 0.6 * _area(named.vertices)
+    assert ConvexHull(drawn.vertices).volume > 0.6 * ConvexHull(named.vertices).volume  # areas
 
 
-def _area(vertices: Any) -> float:
-    """Of a polygon [m^2]."""
-    x, y = np.asarray(vertices).T
-    return 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
+def square(half: float) -> osik.SupportPolygon:
+    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    made: Any = osik.SupportPolygon
+    return made(*map(jnp.asarray, (normals, np.full(4, half), half * normals)))
+
+
+def test_balance_marks_follow_slow_motions_and_turn_red_outside() -> None:
+    server = open_server("127.0.0.1", 0, "test")
+    try:
+        marks = BalanceMarks(server.scene, 0.0, 1.0)
+        marks.show_polygon(square(0.1))
+        for x in np.linspace(0.0, 1e-3, 401):  # less in a picture than what is worth a message
+            marks.place(np.array([x, 0.0, 0.5]))
+        np.testing.assert_allclose(marks._ball.position, [1e-3, 0.0, 0.5], atol=1.1e-5)
+        inside = marks._ball.color
+        marks.place(np.array([0.2, 0.0, 0.5]))
+        assert marks._ball.color == marks._disc.color != inside
+        marks.show_polygon(None)
+        marks.place(np.array([0.2, 0.0, 0.5]))
+        assert marks._ball.color == marks._disc.color == inside
+    finally:
+        close_server(server)
 
 
 def test_readings() -> None:
     task = osik.FrameTask(ARM, "hand")
     assert error_text(task, np.array([3e-3, 4e-3, 0.0, np.pi / 180.0, 0.0, 0.0])) == "5.0 mm, 1.0°"
-    normals = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    polygon: Any = osik.SupportPolygon(*map(jnp.asarray, (normals, np.full(4, 0.1), 0.1 * normals)))
-    balance = osik.ComTask(ARM, polygon=polygon)
+    balance = osik.ComTask(ARM, polygon=square(0.1))
     assert error_text(balance, np.array([0.08, 0.0, -0.08, 0.0])) == "20 mm inside"
     assert error_text(balance, np.array([0.13, 0.0, -0.13, 0.0])) == "30.0 mm outside"
     height = osik.FrameTask(ARM, "hand", rows="position", lower=-0.1)

@@ -6,10 +6,12 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from frames_beside_mujoco import random_configurations
 from model_files import mjcf
 from mujoco_states import mujoco_at
 from PIL import Image
 from refusals import refuses
+from trimesh import Trimesh
 
 import osik_jax as osik
 from osik_jax import viewer
@@ -29,17 +31,6 @@ def shapes():
     return osik.Robot.from_mjcf(mjcf("one_geom_of_each_kind"))
 
 
-def random_configurations(robot, count, seed=0):
-    """Joints anywhere in their ranges; the base at home."""
-    rng = np.random.default_rng(seed)
-    q = np.tile(np.asarray(robot.q0), (count, 1))
-    for name in robot.joint_names:
-        dof, at = robot.joint_dof_index(name), robot.joint_qpos_index(name)
-        low, high = np.clip([robot.position_lower[dof], robot.position_upper[dof]], -3.0, 3.0)
-        q[:, at] = rng.uniform(low, high, count)
-    return q
-
-
 def surface_distance(kind, size, p):
     """How far points (k, 3) in a geom's frame are from its surface, negative inside; ellipsoids up to scale."""
     if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
@@ -54,18 +45,12 @@ def surface_distance(kind, size, p):
     return np.max(np.abs(p) - size, axis=-1)
 
 
-def signed_volume(triangles):
-    """Positive where faces run counter-clockwise seen from outside."""
-    a, b, c = np.moveaxis(triangles, 1, 0)
-    return np.sum(a * np.cross(b, c)) / 6.0
-
-
 def test_faces_lie_on_mujocos_geoms(shapes):
-    q = random_configurations(shapes, 1)[0]
+    q = random_configurations(shapes, count=1)[0]
     data = mujoco_at(shapes, q)
     model = shapes.mj_model
     for geom in range(model.ngeom):
-        points = robot_surface_of(shapes, data, geom).reshape(-1, 3)
+        points = robot_surface_of(shapes, data, geom).triangles.reshape(-1, 3)
         local = (points - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
         distance = surface_distance(model.geom_type[geom], model.geom_size[geom], local)
         assert len(distance)
@@ -76,7 +61,7 @@ def robot_surface_of(robot, data, geom):
     shape = robot_parts(robot)
     position, rotation = (each[geom] for each in shape.poses(data))
     vertices, faces = part_triangles(shape.parts[geom])
-    return vertices[faces] @ rotation.T + position
+    return Trimesh(vertices @ rotation.T + position, faces, process=False)
 
 
 @pytest.mark.parametrize(
@@ -91,11 +76,12 @@ def robot_surface_of(robot, data, geom):
 )
 def test_faces_close_and_point_outward(shapes, geom, volume):
     data = mujoco_at(shapes, shapes.q0)
-    assert signed_volume(robot_surface_of(shapes, data, geom)) == pytest.approx(volume, rel=0.04)
+    # positive where faces run counter-clockwise seen from outside
+    assert robot_surface_of(shapes, data, geom).volume == pytest.approx(volume, rel=0.03)
 
 
 def test_nao_com_and_frames_are_mujocos(nao):
-    configurations = random_configurations(nao, 3)
+    configurations = random_configurations(nao, count=3)
     forward = jax.jit(lambda q: osik.forward_kinematics(nao, q))
     for q, data in zip(configurations, _mujoco.mujoco_poses(nao, configurations), strict=True):
         reference = mujoco_at(nao, q)
@@ -146,15 +132,8 @@ def test_camera_is_mujocos_camera():
     same.type, same.lookat[:] = mujoco.mjtCamera.mjCAMERA_FREE, camera.center
     same.distance, same.azimuth, same.elevation = camera.distance, camera.azimuth + 180.0, -camera.elevation
     options = mujoco.MjvOption()
-    mujoco.mjv_updateScene(
-        nao.mj_model,
-        mujoco_at(nao, nao.q0),
-        options,
-        mujoco.MjvPerturb(),
-        same,
-        mujoco.mjtCatBit.mjCAT_STATIC,
-        scene,
-    )
+    still, data = mujoco.mjtCatBit.mjCAT_STATIC, mujoco_at(nao, nao.q0)
+    mujoco.mjv_updateScene(nao.mj_model, data, options, mujoco.MjvPerturb(), same, still, scene)
     eyes = [(np.asarray(c.pos), np.asarray(c.forward), np.asarray(c.up)) for c in scene.camera]
     position, forward, up = (np.mean(part, 0) for part in zip(*eyes, strict=True))
     np.testing.assert_allclose(position, camera.eye, atol=1e-6)
@@ -219,9 +198,11 @@ def test_gif_has_its_frames(tmp_path, nao):
         assert len(np.unique(np.asarray(film.convert("RGB")).reshape(-1, 3), axis=0)) > 30
 
 
-def test_film_of_another_kind_is_refused(tmp_path, nao, monkeypatch):
+def test_films_of_another_kind_or_of_nothing_are_refused(tmp_path, nao, monkeypatch):
     q = np.asarray(nao.q0)[None]
     refuses(ValueError, r"\.gif or \.mp4", viewer.animate, tmp_path / "m.avi", nao, q, dt=0.01)
+    for wrong in (q[:0], q[0], q[:, 1:]):
+        refuses(ValueError, r"q has shape .*\(T, 32\)", viewer.animate, tmp_path / "m.gif", nao, wrong, dt=0.01)
     monkeypatch.setattr(_animate.shutil, "which", lambda name: None)
     refuses(ValueError, "ffmpeg", viewer.animate, tmp_path / "m.mp4", nao, q, dt=0.01)
 

@@ -116,8 +116,8 @@ class Desk:
             if self._told[0] is now and self._told[1] is self._session:
                 return self._told[2]
             targets = {k: t for k, task in now.tasks.items() if (t := getattr(task, "target", None)) is not None}
-            kept = with_targets(Controller(dict(self._session.tasks), now.scheme, ()), targets)
-            self._told = now, self._session, dataclasses.replace(self._session, tasks=kept.tasks)
+            tasks = with_targets(self._session.tasks, targets)
+            self._told = now, self._session, dataclasses.replace(self._session, tasks=tasks)
             return self._told[2]
 
     def edit(self, **changes: Any) -> None:
@@ -135,8 +135,7 @@ class Desk:
                 return
             if on:
                 here = targets_here(session.robot, self.loop.snapshot.q, session.tasks, [name])
-                moved = with_targets(Controller({name: session.tasks[name]}, session.scheme, ()), here)
-                self._put(name, moved.tasks[name], off=session.off - {name})
+                self._put(name, with_targets(session.tasks, here)[name], off=session.off - {name})
             elif len(session.active_tasks) == 1:
                 raise OsikValueError("one task at least stays on")
             else:
@@ -161,7 +160,7 @@ class Desk:
             while name in session.tasks:
                 name += "'"
             task = FrameTask(session.robot, frame, rows="position", weight=1e2, priority=3)
-            self._put(name, task.at(session.robot, jnp.asarray(self.loop.snapshot.q)), off=session.off)
+            self._put(name, task.at(session.robot, jnp.asarray(self.loop.snapshot.q)))
             return name
 
     def remove(self, name: str) -> None:

@@ -147,9 +147,8 @@ class ControlLoop:
     def start(self) -> Self:
         """Start the thread.
 
-        While it runs, Python's threads change places every 0.05 ms, not every 5: the control thread would wait that
-        long for each of the others that computes. What was there when a step was laid out is left out of garbage
-        collection until the loop ends: going through all of JAX's objects takes up to 0.1 s.
+        While it runs, the GIL switch interval is 0.05 ms (default 5 ms): the control thread may wait that long for each
+        other thread that computes. Garbage collection skips the objects that exist when a step is laid out.
         """
         self._switch_interval = sys.getswitchinterval()
         sys.setswitchinterval(min(_SWITCH_INTERVAL, self._switch_interval))
@@ -228,7 +227,7 @@ class ControlLoop:
         new = task.replace(target=target).target
         with self._lock:
             self._owners[name] = owner
-            self._wanted = with_targets(self._wanted, {name: new})
+            self._wanted = self._aimed({name: new})
 
     def place(self, obstacle: str, position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"]) -> None:
         """Set position and rotation of an obstacle."""
@@ -349,7 +348,11 @@ class ControlLoop:
         here = targets_here(self.robot, self._snapshot.q, self._wanted.tasks, names)
         with self._lock:
             self._owners = {name: other for name, other in self._owners.items() if name not in names}
-            self._wanted = with_targets(self._wanted, here)
+            self._wanted = self._aimed(here)
+
+    def _aimed(self, targets: Mapping[str, Any]) -> Controller:
+        """Return the requested controller with some targets replaced."""
+        return replace(self._wanted, tasks=with_targets(self._wanted.tasks, targets))
 
 
 def _percentiles(values: Float[np.ndarray, " n"]) -> tuple[float, float, float]:

@@ -58,7 +58,7 @@ def _in_scene(limit: Limit) -> Iterator[Obstacle]:
     for name, body, shape in zip(scene.names, np.asarray(scene.body), table_shapes(scene.table), strict=False):
         if shape.kind in _KINDS and body < 0:
             mesh = _hull(np.asarray(shape.vertices, float).tobytes()) if shape.kind == ShapeKind.HULL else None
-            part = Part(0, _KINDS[shape.kind], shape.size, np.ones(4), mesh)
+            part = Part(_KINDS[shape.kind], shape.size, np.ones(4), mesh)
             yield Obstacle(name, part, shape.position, shape.rotation)
 
 

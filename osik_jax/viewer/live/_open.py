@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..._errors import warn
-from ...kinematics import forward_kinematics
 from ...limits import Limit
 from ...robot import Robot
 from ...robot._guesses import find_hands
@@ -20,21 +20,19 @@ from ...tasks._leaves import angle_scale
 from .._crouch import crouched
 from .._parts import RobotParts, lowest_points, robot_parts
 from ._desk import Session
-from ._page import LiveView, serve_session
+from ._page import LiveView
 from ._surfaces import part_triangles
 
-# gain of the default tasks [1/s]
 _GAIN = 15.0
+"""Gain of the default tasks [1/s]."""
 WEIGHTS = {"foot": 1e4, "balance": 1e3, "waist": 1e2, "com": 1e2, "hand": 1e2, "posture": 1e-2}
 """Weights of the default tasks in the weighted scheme; the other schemes use priorities."""
 _SOLE = 0.006
 """Height above a foot's lowest point up to which its points count as sole [m]."""
-# margin of the support polygon inside the soles' edge [m]
 _MARGIN = 0.01
+"""Margin of the support polygon inside the soles' edge [m]."""
 _CORNERS = 8
-"""Number of polygon corners for each sole; corners are points of the sole, so the polygon is never larger than the
-soles.
-"""
+"""Number of polygon corners for each sole: points of the sole, so the polygon is never larger than the soles."""
 
 
 def open_robot(
@@ -49,7 +47,7 @@ def open_robot(
     q = standing(robot, shapes, feet) if robot.floating_base else np.asarray(robot.q0)
     polygon = sole_polygon(robot, shapes, q, feet) if feet else None
     session = default_session(robot, q=jnp.asarray(q), feet=feet, polygon=polygon, limits=limits, source=source)
-    return serve_session(session, host=host, port=port)
+    return LiveView(session, host=host, port=port)
 
 
 def default_session(
@@ -67,23 +65,24 @@ def default_session(
     It starts at ``q`` (default: ``robot.q0``) with ``feet`` on the ground and its centre of mass over ``polygon``.
     """
     start = robot.q0 if q is None else q
-    poses = forward_kinematics(robot, start)
     flat = "pose" if len(feet) <= 2 else "position"
     tasks: dict[str, Task] = {
-        foot: FrameTask(robot, foot, target=pose, rows=flat, weight=WEIGHTS["foot"], orientation_weight=1.0)
-        for foot, pose in ((foot, poses.frame_pose(robot, foot)) for foot in feet)
+        foot: FrameTask(robot, foot, rows=flat, weight=WEIGHTS["foot"], orientation_weight=1.0).at(robot, start)
+        for foot in feet
     }
     if polygon is not None:
         tasks["balance"] = ComTask(robot, polygon=polygon, weight=WEIGHTS["balance"], gain=_GAIN, priority=2)
+    own: Any = dict(gain=_GAIN, priority=3)
     for name in find_hands(robot):
-        pose = poses.frame_pose(robot, name)
-        rows = "position" if feet else "pose"
-        tasks[name] = FrameTask(robot, name, target=pose, rows=rows, weight=WEIGHTS["hand"], gain=_GAIN, priority=3)
-    led: Mapping[str, Task] = _led_later(robot, start) if robot.floating_base else {}
-    tasks |= led
-    tasks["posture"] = PostureTask(
-        robot, target=start, weight=WEIGHTS["posture"] * angle_scale(robot), gain=1.0, priority=4
-    )
+        hand = FrameTask(robot, name, rows="position" if feet else "pose", weight=WEIGHTS["hand"], **own)
+        tasks[name] = hand.at(robot, start)
+    offered: dict[str, Task] = {}
+    if robot.floating_base:
+        waist = robot.tree.body_names[robot.tree.root]
+        offered[waist] = FrameTask(robot, waist, weight=WEIGHTS["waist"], **own).at(robot, start)
+        offered["centre of mass"] = ComTask(robot, weight=WEIGHTS["com"], **own).at(robot, start)
+    weight = WEIGHTS["posture"] * angle_scale(robot)
+    tasks |= offered | {"posture": PostureTask(robot, target=start, weight=weight, gain=1.0, priority=4)}
     return Session(
         robot=robot,
         tasks=tasks,
@@ -91,17 +90,9 @@ def default_session(
         limits=limits,
         dt=dt,
         q=np.asarray(start),
-        off=frozenset(led),
+        off=frozenset(offered),
         source=source,
     )
-
-
-def _led_later(robot: Robot, q: Float[Array, " nq"]) -> dict[str, Task]:
-    """Return the tasks offered (switched off) for a floating-base robot: waist pose and centre of mass."""
-    waist = robot.tree.body_names[robot.tree.root]
-    task = FrameTask(robot, waist, weight=WEIGHTS["waist"], gain=_GAIN, priority=3).at(robot, q)
-    com = ComTask(robot, weight=WEIGHTS["com"], gain=_GAIN, priority=3).at(robot, q)
-    return {waist: task, "centre of mass": com}
 
 
 def standing(robot: Robot, shapes: RobotParts, feet: Sequence[str]) -> Float[np.ndarray, " nq"]:

@@ -44,6 +44,8 @@ _LIFT = 0.002
 """Height of flat marks above the floor [m]."""
 _TOUCHING = 1e-3
 """Distance beyond a polygon's edge up to which a point counts as inside [m]."""
+_MOVED = 1e-5
+"""Motion of the centre of mass below which its marks stay where they are [m]."""
 
 
 class LiveView:
@@ -103,12 +105,7 @@ class LiveView:
         self.stop()
 
     def aim(self, task: str, target: Any) -> None:
-        """Set the target of a task.
-
-        Raises:
-            KeyError: no such task.
-            TypeError, ValueError: no such target.
-        """
+        """Set the target of a task; exceptions are those of ``loop.aim``."""
         self.loop.aim(task, target)
 
     def _run(self) -> None:
@@ -213,18 +210,14 @@ def serve(
         if any(part is not None for part in (tasks, scheme, limits, dt)):
             raise OsikValueError("a controller has its own tasks, scheme, limits and dt: leave out what is beside it")
         robot, tasks, scheme, limits, dt = robot.robot, robot.tasks, robot.scheme, robot.limits, robot.dt
-    tasks, given = dict(tasks or {}), checked_limits(robot, limits) or ()
-    start, period = robot.q0 if q0 is None else q0, 0.005 if dt is None else dt
-    robot.check_configuration(start, "q0")
+    tasks, period = {} if tasks is None else tasks, 0.005 if dt is None else dt
     check_setting("serve(robot, tasks)", robot, scheme, period)
+    given = checked_limits(robot, limits) or ()
     check_tasks(tasks, robot)
+    start = robot.q0 if q0 is None else q0
+    robot.check_configuration(start, "q0")
     used = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
-    session = Session(robot, tasks, used, given, period, np.asarray(start), source=source)
-    return serve_session(session, host=host, port=port, open_browser=open_browser)
-
-
-def serve_session(session: Session, *, host: str, port: int, open_browser: bool = False) -> LiveView:
-    """Return the page of a session."""
+    session = Session(robot, dict(tasks), used, given, period, np.asarray(start), source=source)
     view = LiveView(session, host=host, port=port)
     if open_browser:
         webbrowser.open(view.url)
@@ -251,14 +244,16 @@ class BalanceMarks:
 
     def __init__(self, scene: SceneApi, floor: float, size: float) -> None:
         """Take the height of the floor and the size of the robot [m]."""
-        self._scene, self._floor, self._size = scene, floor, size
+        self._scene, self._floor = scene, floor
         self._polygon: SupportPolygon | None = None
-        self._color: tuple[int, int, int] | None = None
-        self._at = np.full(3, np.inf)
+        self._color, self._at = _IN, np.full(3, np.inf)
+        look: Any = dict(radius=0.016 * size, color=_IN, cast_shadow=False)
+        self._ball = scene.add_icosphere("/balance/com", opacity=0.75, **look)
+        self._disc = scene.add_cylinder("/balance/below", height=_LIFT, **look)
 
     def show_polygon(self, polygon: SupportPolygon | None) -> None:
         """Draw the polygon; None removes it."""
-        self._polygon, self._color = polygon, None
+        self._polygon = polygon
         self._scene.remove_by_name("/balance/area")
         self._scene.remove_by_name("/balance/edge")
         if polygon is None:
@@ -276,24 +271,8 @@ class BalanceMarks:
         inside = self._polygon is None or float(self._polygon.distance(com[:2])) > -_TOUCHING
         color = _IN if inside else _OUT
         if color != self._color:
-            self._color = color
-            self._draw(com, color)
+            self._color = self._ball.color = self._disc.color = color
         # smaller motions are invisible and need no message to the page
-        elif np.abs(com - self._at).max() > 1e-5:
-            self._ball.position = com
+        if np.abs(com - self._at).max() > _MOVED:
+            self._ball.position = self._at = np.array(com)
             self._disc.position = (com[0], com[1], self._floor + 2.0 * _LIFT)
-        self._at = np.array(com)
-
-    def _draw(self, com: np.ndarray, color: tuple[int, int, int]) -> None:
-        radius = 0.016 * self._size
-        self._ball = self._scene.add_icosphere(
-            "/balance/com", radius=radius, color=color, opacity=0.75, cast_shadow=False, position=com
-        )
-        self._disc = self._scene.add_cylinder(
-            "/balance/below",
-            radius=radius,
-            height=_LIFT,
-            color=color,
-            cast_shadow=False,
-            position=(com[0], com[1], self._floor + 2.0 * _LIFT),
-        )

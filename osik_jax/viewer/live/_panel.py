@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,7 +39,8 @@ class Panel:
         with tabs.add_tab("Tasks"):
             self._add_tasks()
         with tabs.add_tab("Limits"):
-            self._add_limits()
+            self._near = gui.add_markdown("")
+            self._limits = gui.add_folder("On and off")
         with tabs.add_tab("File"):
             self._add_file()
         self.refill()
@@ -59,17 +61,21 @@ class Panel:
     def refill(self) -> None:
         """Show the session after tasks changed or another controller was loaded."""
         session = self._desk.session
-        for box in self._boxes.values():
+        for box in self._boxes:
             box.remove()
-        self._boxes = {}
+        self._boxes.clear()
         with self._switches:
             for name in session.tasks:
-                self._add_switch(name, name not in session.off)
+                self._add_switch(name, name not in session.off, partial(self._desk.switch, name))
+        with self._limits:
+            for number, limit in enumerate(session.limits):
+                if not isinstance(limit, NoLimits):
+                    switch = partial(self._desk.switch_limit, number)
+                    self._add_switch(type(limit).__name__, number not in session.limits_off, switch)
         self._chosen.options = tuple(session.tasks)
         title = next((t for t, make in SCHEMES.items() if type(make()) is type(session.scheme)), None)
         if title is not None:
             self._scheme.value = title
-        self._fill_limits()
         self._show_chosen()
 
     def _add_buttons(self) -> None:
@@ -88,7 +94,7 @@ class Panel:
         self._scheme = gui.add_dropdown("Scheme", tuple(SCHEMES), initial_value=next(iter(SCHEMES)))
         self._scheme.on_update(self._guarded(lambda event: self._desk.take_scheme(event.target.value)))
         self._switches = gui.add_folder("On and off")
-        self._boxes: dict[str, Any] = {}
+        self._boxes: list[Any] = []
         with gui.add_folder("Settings"):
             names = tuple(self._desk.session.tasks)
             self._chosen = gui.add_dropdown("Task", names, initial_value=names[0])
@@ -106,30 +112,6 @@ class Panel:
         add.on_click(self._guarded(lambda _: (self._desk.add_frame(frame.value), self.refill())))
         remove.on_click(self._guarded(lambda _: (self._desk.remove(self._name), self.refill())))
         self._errors = gui.add_markdown("")
-
-    def _add_limits(self) -> None:
-        gui = self._server.gui
-        self._near = gui.add_markdown("")
-        self._limits = gui.add_folder("On and off")
-        self._limit_boxes: list[Any] = []
-
-    def _fill_limits(self) -> None:
-        """Add a switch for each limit."""
-        session = self._desk.session
-        for box in self._limit_boxes:
-            box.remove()
-        self._limit_boxes.clear()
-        with self._limits:
-            for number, limit in enumerate(session.limits):
-                if isinstance(limit, NoLimits):
-                    continue
-                self._switch_limit(type(limit).__name__, number not in session.limits_off, number)
-
-    def _switch_limit(self, words: str, on: bool, number: int) -> None:
-        """Add a switch for a limit."""
-        box = self._server.gui.add_checkbox(words, initial_value=on)
-        box.on_update(self._guarded(lambda event: self._desk.switch_limit(number, event.target.value)))
-        self._limit_boxes.append(box)
 
     def _add_file(self) -> None:
         gui = self._server.gui
@@ -152,10 +134,10 @@ class Panel:
         """Return the name of the chosen task."""
         return self._chosen.value
 
-    def _add_switch(self, name: str, on: bool) -> None:
+    def _add_switch(self, name: str, on: bool, switch: Callable[[bool], None]) -> None:
         box = self._server.gui.add_checkbox(name, initial_value=on)
-        box.on_update(self._guarded(lambda event: self._desk.switch(name, event.target.value)))
-        self._boxes[name] = box
+        box.on_update(self._guarded(lambda event: switch(event.target.value)))
+        self._boxes.append(box)
 
     def _weigh(self, exponent: float) -> None:
         """Scale a task's weights so that the largest is the given power of ten."""

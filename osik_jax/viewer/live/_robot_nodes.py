@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ...robot import Robot
 from ...robot._mujoco import home_poses
@@ -31,23 +32,15 @@ class RobotNodes:
     """Scene nodes of one robot."""
 
     def __init__(
-        self,
-        scene: SceneApi,
-        robot: Robot,
-        *,
-        name: str = "robot",
-        offset: Float[np.ndarray, "3"] | None = None,
+        self, scene: SceneApi, robot: Robot, *, name: str = "robot", offset: ArrayLike = (0.0, 0.0, 0.0)
     ) -> None:
         """Add the robot at ``robot.q0``, moved by an offset [m], as a node of this name."""
-        shapes = robot_parts(robot)
-        data = home_poses(robot)
-        scene.add_frame(f"/{name}", show_axes=False, position=np.zeros(3) if offset is None else offset)
+        shapes, data = robot_parts(robot), home_poses(robot)
+        scene.add_frame(f"/{name}", show_axes=False, position=np.asarray(offset))
         self._frames: dict[int, FrameHandle] = {}
         for body, pieces in _by_body(shapes, data).items():
-            position, quaternion = data.xpos[body], data.xquat[body]
-            self._frames[body] = scene.add_frame(
-                f"/{name}/{body}", show_axes=False, position=position.copy(), wxyz=quaternion.copy()
-            )
+            place: Any = dict(position=data.xpos[body].copy(), wxyz=data.xquat[body].copy())
+            self._frames[body] = scene.add_frame(f"/{name}/{body}", show_axes=False, **place)
             for number, (color, surface) in enumerate(pieces.items()):
                 scene.add_mesh_simple(
                     f"/{name}/{body}/{number}",
@@ -68,12 +61,9 @@ class RobotNodes:
             frames[k].wxyz = self._quaternion[k] = quaternion[k]
 
 
-def side_by_side(span: Float[np.ndarray, "points 3"], count: int, least: float = 0.0) -> list[Float[np.ndarray, "3"]]:
-    """Return the offsets [m] that place ``count`` copies of a robot with these points side by side, from left to right.
-
-    ``least`` is the least distance of neighbours [m].
-    """
-    width = max(_APART * float(np.ptp(span[:, 1])), least)
+def side_by_side(span: Float[np.ndarray, "points 3"], count: int) -> list[Float[np.ndarray, "3"]]:
+    """Return the offsets [m] that place copies of a robot with these points side by side, from left to right."""
+    width = _APART * float(np.ptp(span[:, 1]))
     return [np.array([0.0, (k - 0.5 * (count - 1)) * width, 0.0]) for k in range(count)]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -42,10 +41,9 @@ class Controller(eqx.Module):
         return (tree, *((np.shape(leaf), jnp.result_type(leaf)) for leaf in leaves))
 
 
-def with_targets(controller: Controller, targets: Mapping[str, Any]) -> Controller:
-    """Return the controller with some targets replaced; unknown or unsuitable targets are ignored."""
-    aimed = {name: _aimed(task, targets[name]) for name, task in controller.tasks.items() if name in targets}
-    return dataclasses.replace(controller, tasks={**controller.tasks, **aimed}) if aimed else controller
+def with_targets(tasks: Mapping[str, Task], targets: Mapping[str, Any]) -> dict[str, Task]:
+    """Return the tasks with some targets replaced; unknown or unsuitable targets are ignored."""
+    return {name: _aimed(task, targets[name]) if name in targets else task for name, task in tasks.items()}
 
 
 def targets_here(
@@ -73,6 +71,5 @@ def laid_out(robot: Robot, controller: Controller, dt: float) -> control.Control
 
     Its warnings are left out: that a weighted scheme ignores priorities is no news in a page with a menu of schemes.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OsikWarning)
+    with warnings.catch_warnings(action="ignore", category=OsikWarning):
         return control.Controller(robot, controller.tasks, scheme=controller.scheme, limits=controller.limits, dt=dt)

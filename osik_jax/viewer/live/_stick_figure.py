@@ -65,7 +65,7 @@ class StickNodes:
         self._bones = []
         for k, length in enumerate(lengths):
             shape = np.array([_THICK * size, 0.5 * length, 0.0])
-            surface = part_triangles(Part(0, mujoco.mjtGeom.mjGEOM_CAPSULE, shape, np.ones(4), None))
+            surface = part_triangles(Part(mujoco.mjtGeom.mjGEOM_CAPSULE, shape, np.ones(4), None))
             self._bones.append(scene.add_mesh_simple(f"/person/{k}", surface.vertices, surface.faces, color=_BONE))
         self._standing = [
             scene.add_icosphere(f"/person/stands {k}", radius=_BALL * size, color=_STANDS, visible=False)
