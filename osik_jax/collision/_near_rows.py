@@ -27,8 +27,8 @@ from ._table import RobotShapes
 _GEOMETRY = 29
 """Numbers of a pair in ``NearRows::put_geometry``."""
 
-_MOST_THREADS = 1 << 16
-"""Threads that keep a GPU busy: with fewer robots, several find the rows of each."""
+_FEW, _MEMBERS = 4096, 32
+"""Robots on a GPU up to which several threads find the rows of each, and how many."""
 
 
 class KeptShapes:
@@ -186,8 +186,7 @@ def _by_core(
         shapes += [((lanes, most, _GEOMETRY), float), ((lanes, most), int)]
     count = kept.core.sizes[2]
     sizes = *kept.core.sizes, CoreScene(integers, numbers).rows(count), most
-    members = min(max(_MOST_THREADS // lanes, 1), 32)
-    members = 1 << (members.bit_length() - 1)
+    members = _MEMBERS if lanes <= _FEW else 1
     method = "near_geometry" if with_geometry else "near_rows"
     return NearRows(*call_here(method, shapes, *given, np.full(1, members), sizes=sizes, members=members))
 

@@ -79,16 +79,21 @@ template <class R> class LaneCollision {
     return best;
   }
   // f(pair, far) of a member's share of the pairs whose distance changes and is perhaps less than `far`; it returns what is
-  // far from then on. They are listed first, so that the threads of a warp find distances at the same time.
+  // far from then on. Several members list theirs first, so that they find distances at the same time; where each robot has
+  // one, those of a warp take the same pair at the same time.
   template <class F> void each_near_pair(Real far, int member, int members, Pair* list, F f) const {
     int number = 0, count = 0;
+    auto take = [&](Pair p) {
+      if (lower_bound(p) < far) far = f(p, far);
+    };
     any_pair([&](int i, int j) {
       const bool is_own = number++ % members == member;
-      if (is_own && group(i) != group(j) && !ball[i].is_out_of_reach(ball[j], far)) list[count++] = {i, j};
+      if (!is_own || group(i) == group(j) || ball[i].is_out_of_reach(ball[j], far)) return false;
+      if (members == 1) take({i, j});
+      else list[count++] = {i, j};
       return false;
     });
-    for (int k = 0; k < count; ++k)
-      if (lower_bound(list[k]) < far) far = f(list[k], far);
+    for (int k = 0; k < count; ++k) take(list[k]);
   }
   OSIK_CALL Real lower_bound(Pair p) const { return osik::lower_bound(shape(p.i), ball[p.i], shape(p.j), ball[p.j]); }
   template <class F> bool any_pair(F f) const { return any_pair_apart(robot, scene, f); }

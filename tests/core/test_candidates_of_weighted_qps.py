@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from core_checks import needs_core
 from recorded import QP_DAMPING, recorded_qps
+from weighted_families import contradicting
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.core import _library
@@ -20,7 +21,7 @@ from osik_jax.execution._lanes import FEW_ON_CPU, first_set, with_the_rest
 from osik_jax.numerics._constants import KKT_TOLERANCE
 from osik_jax.solvers import Status, solve_least_squares_qp
 from osik_jax.solvers.qp import _core, _dispatch, _search
-from osik_jax.solvers.qp._core import CERTIFIED, Candidate
+from osik_jax.solvers.qp._core import CERTIFIED, LEAST_VIOLATION, Candidate
 from osik_jax.solvers.qp._dispatch import kernel_candidates
 from osik_jax.solvers.qp._problem import QP, LeastSquares
 
@@ -287,3 +288,37 @@ def test_what_no_lane_needs_is_not_computed(lanes):
     assert (always, sometimes > 0) == (0, True)
     for done in (jnp.ones(lanes, bool), jnp.zeros(lanes, bool)):
         np.testing.assert_array_equal(program(matrices, done), matrices[:, 0] / jnp.where(done, 1.0, 2.0)[:, None])
+
+
+@needs_core
+def test_the_core_alone_finds_the_least_violation_of_contradicting_rows():
+    """In each third lane; the answer is that of the search, and its derivative that of differences, by the rows too."""
+    data = contradicting(np.random.default_rng(5), 90, every=3)
+    A, b, w, low, high, C, below, above = map(jnp.asarray, data)
+    n, p = A.shape[2], C.shape[1]
+    damping = jnp.full((90, n), 1e-3)
+    cost = LeastSquares(A, b, w, damping, jnp.zeros_like(damping))
+    bounds = jnp.concatenate([low, below], 1), jnp.concatenate([high, above], 1)
+    qp = QP(cost, C, jnp.zeros((90, p)), *bounds)
+    found = _core.solve(qp, jnp.zeros(bounds[0].shape, jnp.int32), jnp.full(90, 1e-12), CAP)
+    contradicts = np.arange(90) % 3 == 0
+    np.testing.assert_array_equal(found.converged, np.where(contradicts, LEAST_VIOLATION, CERTIFIED))
+
+    rng = np.random.default_rng(6)
+    turn, shift = rng.normal(size=C.shape), rng.normal(size=below.shape)
+
+    def solve(backend, way=0.0):
+        one = functools.partial(solve_least_squares_qp, damping=1e-3, backend=backend)
+        return jax.vmap(one)(A, b, w, low, high, C + way * turn, below + way * shift, above)
+
+    expected, h = jax.jit(functools.partial(solve, "jax"))(), 1e-6
+    np.testing.assert_array_equal(expected.status == Status.INFEASIBLE, contradicts)
+    np.testing.assert_allclose(found.x, expected.x, atol=1e-7)
+    for backend in ("core", "jax"):
+        moved = jax.jit(lambda way, backend=backend: solve(backend, way).x)
+        rate = jax.jit(lambda moved=moved: jax.jvp(moved, (0.0,), (1.0,))[1])()
+        far, near = ((np.asarray(moved(s)) - np.asarray(moved(-s))) / (2.0 * s) for s in (3.0 * h, h))
+        smooth = np.abs(far - near).max(1) < 1e-6 * np.abs(near).max(1)  # no bound becomes active on the way
+        assert (smooth & contradicts).sum() > 20
+        off = np.abs(rate - near).max(1) / np.abs(near).max(1)
+        assert off[smooth].max() < 1e-5, (backend, off)

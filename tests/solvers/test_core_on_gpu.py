@@ -15,7 +15,7 @@ from problem_families import WHOLE_BODY_DAMPING, whole_body
 from recorded import QP_DAMPING, check_recorded_saturated, recorded_qps, recorded_saturated
 from saturation_families import FAMILIES as SATURATED
 from saturation_families import N, as_levels, drawn, family, solve_full
-from weighted_families import soft_problems
+from weighted_families import contradicting, soft_problems
 
 from osik_jax.core import _cuda as core_cuda
 from osik_jax.execution import _backends
@@ -112,6 +112,18 @@ def test_hard_rows_go_the_other_way(rng):
         expected = jax.jit(solve)(*data)
     assert (s.status == Status.SOLVED).all()
     np.testing.assert_allclose(s.x, expected.x, atol=1e-4)
+
+
+def test_contradicting_rows_are_missed_as_little_as_possible(rng):
+    """In a third of the lanes; the kernel proves it, in double precision if need be."""
+    given = single(*contradicting(rng, 600, every=3))
+    solve = jax.jit(jax.vmap(lambda *a: solve_least_squares_qp(*a, damping=1e-3)))
+    s = solve(*given)
+    with jax.default_device(jax.devices("cpu")[0]):
+        expected = solve(*(np.asarray(a, float) for a in given))
+    np.testing.assert_array_equal(s.status, expected.status)
+    assert (s.status == Status.INFEASIBLE).sum() == 200
+    np.testing.assert_allclose(s.x, expected.x, atol=2e-3)
 
 
 def test_a_bad_lane_disturbs_no_other(rng):

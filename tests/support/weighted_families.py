@@ -49,6 +49,16 @@ def problems(count: int = 200, m: int = M, seed: int = 0, weakest: float = 1e-6)
     )
 
 
+def contradicting(rng, count, every, n=12, m=7, p=5):
+    """Hard rows in a box; in each ``every``-th lane two of them want opposite motions, by half to two units."""
+    A, b, C = rng.normal(size=(count, m, n)), rng.normal(size=(count, m)), rng.normal(size=(count, p, n))
+    lower = np.full((count, p), -1.0)
+    C[::every, 1] = 0.1 * rng.normal(size=C[::every, 1].shape) - C[::every, 0]
+    lower[::every, :2] = rng.uniform(2.0, 4.0, lower[::every, :2].shape)
+    box = np.full((count, n), 0.7)
+    return A, b, np.ones((count, m)), -box, box, C, lower, np.full((count, p), np.inf)
+
+
 def soft_problems(rng, count, n, m, p):
     """Rows that give way, some of them equalities, some without bounds; a box of which a part is pinned or open.
 

@@ -88,12 +88,16 @@ extern "C" __global__ void __launch_bounds__(32, BLOCKS) osik_kernel(
 """
 
 
-def fits(qp: QP) -> bool:
-    """Return whether the GPU kernel supports a problem: least squares that fit its shared memory."""
+def fits(qp: QP, *, single: bool | None = None) -> bool:
+    """Return whether the GPU kernel supports a problem: least squares that fit its shared memory.
+
+    ``single``: in single precision, or not; default: that of the data.
+    """
     if not isinstance(qp.cost, LeastSquares) or not _cuda.installed():
         return False
     m, n = qp.cost.matrix.shape[-2:]
-    return _bytes(m, n, qp.rows.shape[-2], qp.lower.dtype == jnp.float32) <= _cuda.shared_bytes()
+    own = qp.lower.dtype == jnp.float32 if single is None else single
+    return _bytes(m, n, qp.rows.shape[-2], bool(own)) <= _cuda.shared_bytes()
 
 
 def _bytes(m: int, n: int, p: int, single: bool) -> int:

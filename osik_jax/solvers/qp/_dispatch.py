@@ -1,7 +1,8 @@
 """Choice of backend for a QP: candidates of a kernel, certified, else the search.
 
 The kernel checks the optimality conditions at its end (``core/qp_certificate.hpp``), where the rows are at hand.
-Problems whose candidate fails are gathered into blocks, and the search goes on from the candidate's active set.
+Problems whose candidate fails are gathered into blocks, given to the kernel in double precision if it was in single,
+and the search goes on from the active set of the last candidate.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...execution._backends import Backend, on_platforms, takes
 from ...execution._candidates import Candidates, certified_or_searched
+from ...execution._double import in_double
 from ...execution._lanes import FEW_ON_CPU, in_lanes, with_a_few, with_the_rest
 from ...numerics._constants import EQUALITY, INACTIVE, SINGLE_TOL
 from . import _core
@@ -46,7 +48,8 @@ def _solve_on_platform(
 ) -> SearchResult:
     kernels = {}
     if takes(backend, "core-cuda", fits=_core.fits(qp)):
-        kernels["core-cuda"] = kernel_candidates(max_iterations, _core.solve_on_gpu)
+        twice = qp.lower.dtype == jnp.float32 and _core.fits(qp, single=False)
+        kernels["core-cuda"] = kernel_candidates(max_iterations, _core.solve_on_gpu, twice=twice)
     if takes(backend, "core", fits=isinstance(qp.cost, LeastSquares)):
         kernels["core"] = kernel_candidates(max_iterations, _core.solve, FEW_ON_CPU)
 
@@ -56,50 +59,70 @@ def _solve_on_platform(
     return certified_or_searched(kernels, search_all, qp, as_given, guess, tolerance)
 
 
-def kernel_candidates(max_iterations: int, solve: Callable[..., Candidate], block: int | None = None) -> Candidates:
+def kernel_candidates(
+    max_iterations: int, solve: Callable[..., Candidate], block: int | None = None, *, twice: bool = False
+) -> Candidates:
     """Return the function that uses a kernel, which certifies its candidates, and the search for the rest.
 
-    ``block``: how many problems are searched together; by default as on a GPU.
+    Args:
+        max_iterations: limit on the changes of the active set.
+        solve: the kernel.
+        block: how many problems are searched together; by default as on a GPU.
+        twice: whether problems whose candidate fails are given to the kernel again, in double precision.
     """
-
-    def certified(_: QP, as_given: AsGiven, guess: Int[Array, "B m"], tolerance: Float[Array, " B"]) -> SearchResult:
-        qp, is_valid = as_given
-        candidate = solve(qp, guess, tolerance, max_iterations)
-        within_limit = candidate.iterations <= max_iterations
-        certified = (candidate.converged == CERTIFIED) & within_limit & is_valid
-        infeasible = (candidate.converged == LEAST_VIOLATION) & is_valid
-        # nothing to search where numbers are not valid, and finite numbers for derivatives
-        numbers = candidate.x, candidate.row_multipliers, candidate.residual[:, None]
-        x, y, residual = (jnp.where(is_valid[:, None], a, 0.0) for a in numbers)
-        return SearchResult(
-            x=x,
-            row_multipliers=y,
-            # the search has the limit too: it may not begin where more changes than that have led
-            active=jnp.where((within_limit | infeasible)[:, None], candidate.active, guess),
-            iterations=candidate.iterations,
-            factorizations=candidate.factorizations,
-            done=certified | infeasible | ~is_valid,
-            optimal=certified,
-            infeasible=infeasible,
-            compliance=jnp.where(infeasible[:, None], _compliance_of(qp, x, y), qp.compliance),
-            residual=residual[:, 0],
-        )
+    by_kernel = partial(_certified, solve, max_iterations)
 
     def search_rest(
         result: SearchResult, _: QP, as_given: AsGiven, guess: Array, tolerance: Float[Array, " B"]
     ) -> SearchResult:
+        def again(data: tuple[QP, Array], result: SearchResult) -> SearchResult:
+            valid = jnp.ones(len(data[1]), bool)
+            return added(in_double(by_kernel)(data[0], (data[0], valid), result.active, data[1]), result)
+
         def search_block(data: tuple[QP, Array], result: SearchResult) -> SearchResult:
-            end = search(data[0], result.active, data[1], max_iterations=max_iterations)
-            return end._replace(factorizations=end.factorizations + result.factorizations)
+            return added(search(data[0], result.active, data[1], max_iterations=max_iterations), result)
 
-        size = block or _block(len(tolerance))
-        return with_a_few((as_given[0], tolerance), result, result.done, search_block, size)
+        def added(end: SearchResult, before: SearchResult) -> SearchResult:
+            return end._replace(factorizations=end.factorizations + before.factorizations)
 
-    return Candidates(certified, search_rest)
+        data, size = (as_given[0], tolerance), block or _block(len(tolerance))
+        if twice:
+            result = with_a_few(data, result, result.done, again, size)
+        return with_a_few(data, result, result.done, search_block, size)
+
+    return Candidates(by_kernel, search_rest)
 
 
-def _compliance_of(qp: QP, x: Float[Array, "B n"], y: Float[Array, "B p"]) -> Float[Array, "B p"]:
-    return jax.vmap(compliance_of)(qp, x, y) if y.shape[1] else qp.compliance
+def _certified(
+    solve: Callable[..., Candidate],
+    max_iterations: int,
+    _: QP,
+    as_given: AsGiven,
+    guess: Int[Array, "B m"],
+    tolerance: Float[Array, " B"],
+) -> SearchResult:
+    """Return what a kernel finds, done where it is certified or nothing is to be found."""
+    qp, is_valid = as_given
+    candidate = solve(qp, guess, tolerance, max_iterations)
+    within_limit = candidate.iterations <= max_iterations
+    certified = (candidate.converged == CERTIFIED) & within_limit & is_valid
+    infeasible = (candidate.converged == LEAST_VIOLATION) & is_valid
+    # nothing to search where numbers are not valid, and finite numbers for derivatives
+    numbers = candidate.x, candidate.row_multipliers, candidate.residual[:, None]
+    x, y, residual = (jnp.where(is_valid[:, None], a, 0.0) for a in numbers)
+    return SearchResult(
+        x=x,
+        row_multipliers=y,
+        # the search has the limit too: it may not begin where more changes than that have led
+        active=jnp.where((within_limit | infeasible)[:, None], candidate.active, guess),
+        iterations=candidate.iterations,
+        factorizations=candidate.factorizations,
+        done=certified | infeasible | ~is_valid,
+        optimal=certified,
+        infeasible=infeasible,
+        compliance=jnp.where(infeasible[:, None], jax.vmap(compliance_of)(qp, x, y), qp.compliance),
+        residual=residual[:, 0],
+    )
 
 
 def _block(batch: int) -> int:

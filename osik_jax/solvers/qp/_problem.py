@@ -228,9 +228,9 @@ def compliance_of(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float
     """Return the compliances of rows that miss their bounds by their multipliers: that of the hard ones is the same."""
     n = len(x)
     gap = jnp.where(qp.compliance > 0.0, 0.0, jnp.abs(violation(apply(qp.rows, x), qp.lower[n:], qp.upper[n:])))
-    worst = jnp.argmax(gap)
-    size = jnp.abs(y[worst])
-    return jnp.maximum(jnp.where(size > 0.0, gap[worst] / jnp.where(size > 0.0, size, 1.0), 0.0), qp.compliance)
+    largest = jnp.max(gap, initial=0.0)
+    size = jnp.max(jnp.where(gap == largest, jnp.abs(y), 0.0), initial=0.0)
+    return jnp.maximum(jnp.where(size > 0.0, largest / jnp.where(size > 0.0, size, 1.0), 0.0), qp.compliance)
 
 
 def gradient_scale(qp: QP, x: Float[Array, " n"], y: Float[Array, " p"]) -> Float[Array, " n"]:
