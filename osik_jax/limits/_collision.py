@@ -58,7 +58,7 @@ class CollisionAvoidanceLimit(Limit):
         robot: the robot.
         scene: obstacles, as of ``inverse_kinematics``. The ``max_pairs`` nearest pairs that are nearer than
             ``detection_distance`` then give the rows, by the exact distances of the convex shapes, and the core finds
-            them, on a CPU. The robot's own shapes are kept apart too; ``Scene({})`` for these alone. It goes without
+            them. The robot's own shapes are kept apart too; ``Scene({})`` for these alone. It goes without
             ``pairs``, ``exclude`` and ``shapes``.
         srdf: with a scene: pairs that may touch, as for ``inverse_kinematics``.
         pairs: pairs to keep apart: names or globs of geoms, shapes, links or bodies (``"world"``), such as

@@ -90,24 +90,26 @@ def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch, members)
     first = jax.tree.map(lambda a: a[0], scenes)
     limit = osik.CollisionAvoidanceLimit(panda, scene=first, detection_distance=0.1, q0_distance=-np.inf, max_pairs=5)
     q = np.random.default_rng(6).uniform(panda.position_lower, panda.position_upper, (9, panda.nq))
-    places, arrays = jax.vmap(partial(osik.forward_kinematics, panda))(q), core_scene(scenes, limit.kept.shapes)
+    kept = limit.kept
+    assert kept is not None
+    places, arrays = jax.vmap(partial(osik.forward_kinematics, panda))(q), core_scene(scenes, kept.shapes)
     numbers = jnp.asarray(limit.numbers(0.01))
     given = jax.tree.leaves(places), jnp.asarray(arrays.integers), jnp.asarray(arrays.numbers), numbers[None]
-    expected = [_near_rows._by_core(limit.kept, 5, with_geometry, *given) for with_geometry in (False, True)]
+    expected = [_near_rows._by_core(kept, 5, with_geometry, *given) for with_geometry in (False, True)]
     distance = np.asarray(expected[0].distance)
     assert (distance < 0).any() and np.isinf(distance).any() and np.isfinite(distance[:, 4]).any()
     monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
     monkeypatch.setattr(_near_rows, "call_here", call_by_threads)
     monkeypatch.setattr(_near_rows, "_MEMBERS", members)
-    found = [_near_rows._by_core(limit.kept, 5, with_geometry, *given) for with_geometry in (False, True)]
+    found = [_near_rows._by_core(kept, 5, with_geometry, *given) for with_geometry in (False, True)]
     monkeypatch.undo()
     for ours, rows in zip(found, expected, strict=True):
         for name in ("jacobian", "lower", "distance", "pair"):
             np.testing.assert_allclose(getattr(ours, name), getattr(rows, name), atol=1e-7)
     np.testing.assert_array_equal(found[1].carried, expected[1].carried)
     # points that a nearest point lies between are not unique on round shapes, but what follows from them is
-    poses = scenes.table.position, scenes.table.rotation
-    rows = jax.vmap(partial(_near_rows._rows_of, limit.kept), (0, 0, 0, 0, None))
+    poses = jnp.asarray(scenes.table.position), jnp.asarray(scenes.table.rotation)
+    rows = jax.vmap(partial(_near_rows._rows_of, kept), (0, 0, 0, 0, None))
     jacobian, lower = rows(found[1], scenes.body, places, poses, numbers)
     np.testing.assert_allclose(jacobian, expected[0].jacobian, atol=1e-6)
     np.testing.assert_allclose(lower, expected[0].lower, atol=1e-6)
