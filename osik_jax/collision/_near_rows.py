@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..execution._computed import in_shared_lanes
+from ..execution._platform import cuda_is_default, on_host
 from ..execution._rules import custom_jvp
 from ..kinematics import Kinematics
 from ..kinematics._forward import home_kinematics
@@ -54,7 +55,7 @@ def kept_shapes(robot: Robot, shapes: RobotShapes, *, least: float) -> KeptShape
     every = KeptShapes(robot, shapes, np.zeros((0, 2), np.int32))
     if not np.isfinite(least) or not len(shapes.pairs):
         return every
-    with jax.ensure_compile_time_eval():  # the limit may be made inside a program
+    with on_host(), jax.ensure_compile_time_eval():  # the limit may be made inside a program
         numbers, home = [least, least, 0.0, 0.0, 1.0], home_kinematics(robot)
         found = _nearest(every, home, Scene({}), numbers, len(shapes.pairs))
         near = np.asarray(found.pair)[np.isfinite(found.distance), 2:]
@@ -185,8 +186,8 @@ def _by_core(
     if with_geometry:
         shapes += [((lanes, most, _GEOMETRY), float), ((lanes, most), int)]
     count = kept.core.sizes[2]
-    sizes = *kept.core.sizes, CoreScene(integers, numbers).rows(count), most
-    members = _MEMBERS if lanes <= _FEW else 1
+    members = _MEMBERS if lanes <= _FEW and cuda_is_default() else 1
+    sizes = *kept.core.sizes, CoreScene(integers, numbers).rows(count), most, members
     method = "near_geometry" if with_geometry else "near_rows"
     return NearRows(*call_here(method, shapes, *given, np.full(1, members), sizes=sizes, members=members))
 

@@ -24,8 +24,9 @@ extern "C" {
 int osik_clearances_space(int bodies, int dofs, int shapes, int rows) {
   return LaneCollision<double>::space_of(bodies, dofs, shapes, rows);
 }
-int osik_near_rows_space(int bodies, int dofs, int shapes, int rows, int most) {
-  return NearRows<LaneCollision<float>>::space_of(most, most_pairs(shapes, rows)) +
+int osik_near_rows_space(int bodies, int dofs, int shapes, int rows, int most, int members) {
+  const int share = most_pairs(shapes, rows, members);
+  return NearRows<LaneCollision<float>>::space_of(most, share, members > 1) +
          osik_clearances_space(bodies, dofs, shapes, rows);
 }
 int osik_chain_find_space(int n, int frames, int joints, int nq) {

@@ -1,4 +1,4 @@
-// A call of kinematic_calls.hpp, collision_calls.hpp or chain_group.hpp on a GPU. A lane is one robot or target of the batch,
+// A call of kinematic_calls.hpp, collision_calls.hpp, near_rows.hpp or chain_group.hpp on a GPU. A lane is one robot or target of the batch,
 // and has one thread, or the few threads of a group, which are neighbours in a warp.
 //
 // The lanes are the fastest axis of matrices and of long results, so that the threads of a warp read and write neighbours. In

@@ -3,7 +3,7 @@
 //   bodies -> lower bounds on the distances of all pairs -> the nearest pairs, exactly -> their Jacobians and bounds
 //
 // On a GPU the members of a group (chain_group.hpp) share the pairs of a robot: each keeps the nearest of its own, which then
-// get their places among those of all.
+// get their places among those of all. Of pairs at the same distance, any may have the last row.
 #pragma once
 #include "freedom.hpp"
 
@@ -22,8 +22,10 @@ template <class Real> struct AvoidanceNumbers {
   Real least, detection, gain, recovery, dt;
 };
 
-// How many pairs there are at most.
-constexpr OSIK_HOST int most_pairs(int shapes, int rows) { return shapes * (shapes - 1) / 2 + rows * (shapes + rows); }
+// How many pairs each of some threads can have.
+constexpr OSIK_HOST int most_pairs(int shapes, int rows, int members) {
+  return (shapes * (shapes - 1) / 2 + rows * (shapes + rows) + members - 1) / members;
+}
 
 // Collision: collision.hpp, or on a GPU lane_collision.hpp.
 template <class Collision> class NearRows {
@@ -41,26 +43,27 @@ template <class Collision> class NearRows {
   int most, count = 0, first_free = 0, stride = 1;
 
  public:
-  // space: space_of numbers, then those of the collision
-  NearRows(const ShapedRobot<Real>& robot, int most, int pairs, Real* space)
-      : robot(robot), collision(robot, space + space_of(most, pairs)), near(reinterpret_cast<Near*>(space)),
-        list(reinterpret_cast<Pair*>(space + space_of(most, 0))), most(most) {}
-  // pairs: how many there can be on a GPU
-  static constexpr OSIK_HOST int space_of(int most, int pairs) {
-    return most * int(sizeof(Near) / sizeof(Real)) + pairs * int(sizeof(Pair) / sizeof(float));
+  // space: space_of numbers, then those of the collision. share: pairs that a thread can have
+  NearRows(const ShapedRobot<Real>& robot, int most, int share, bool lists, Real* space)
+      : robot(robot), collision(robot, space + space_of(most, share, lists)), near(reinterpret_cast<Near*>(space)),
+        list(reinterpret_cast<Pair*>(space + space_of(most, share, false))), most(most) {}
+  static constexpr OSIK_HOST int space_of(int most, int share, bool lists) {
+    return (most < share ? most : share) * int(sizeof(Near) / sizeof(Real)) +
+           (lists ? share : 0) * int(sizeof(Pair) / sizeof(float));
   }
   void set(const SceneRows<Real>& scene) { collision.set(scene); }
 
   // Write the rows of the nearest pairs: J [most, nv], lower bounds and distances [most], and the bodies of the two shapes
   // and their numbers [most, 4], -1 for no pair. Rows of no pair are zeros without bounds. group: the words member(),
-  // members and of_member of a call
-  template <class Group, class In, class Out, class Labels> void find(const Group& group, const Placed<In>& placed,
-                                                                      const AvoidanceNumbers<Real>& limit, Out J, Out lower,
-                                                                      Out distance, Labels pair) {
+  // members and of_member of a call; is_real: whether it has a robot
+  template <class Group, class In, class Out, class Labels>
+  void find(const Group& group, bool is_real, const Placed<In>& placed, const AvoidanceNumbers<Real>& limit, Out J,
+            Out lower, Out distance, Labels pair) {
     collision.place(placed.position, placed.rotation);
     find_nearest(limit.detection, group.member(), group.members);
     const Real gain = limit.gain * limit.dt > 1 ? 1 / limit.dt : limit.gain;
     first_free = take_places(group) + group.member(), stride = group.members;
+    if (!is_real) count = 0, first_free = most;  // others write these rows
     each_free_row([&](int row) {
       for (int e = 0; e < robot.nv; ++e) J[row * robot.nv + e] = 0;
       for (int e = 0; e < 4; ++e) pair[4 * row + e] = -1;
@@ -165,13 +168,13 @@ template <bool with_geometry, class Call> void find_near_pairs(const Call& call)
   const ShapedRobot<Real> robot(call.integers(5), call.numbers(6, 0));
   const int most = call.result_size(0, 1);
   auto space = call.space();
-  NearRows<typename Call::Collision> rows(robot, most, most_pairs(robot.shapes, scene_of(call, 7, robot.shapes, 0).rows),
-                                          space.data());
+  const int share = most_pairs(robot.shapes, scene_of(call, 7, robot.shapes, 0).rows, call.members);
+  NearRows<typename Call::Collision> rows(robot, most, share, call.members > 1, space.data());
   bool is_set = false;
-  call.each_group([&](int lane, bool) {  // threads without a lane write what others write
+  call.each_group([&](int lane, bool is_real) {
     if (!is_set || has_many_scenes(call, 7)) rows.set(scene_of(call, 7, robot.shapes, lane)), is_set = true;
     const auto n = call.in(9, lane);
-    rows.find(call, placed(call, lane), AvoidanceNumbers<Real>{n[0], n[1], n[2], n[3], n[4]}, call.out(0, lane),
+    rows.find(call, is_real, placed(call, lane), AvoidanceNumbers<Real>{n[0], n[1], n[2], n[3], n[4]}, call.out(0, lane),
               call.out(1, lane), call.out(2, lane), call.labels(3, lane));
     if constexpr (with_geometry) {
       const auto geometry = call.out(4, lane);

@@ -18,14 +18,14 @@ struct PlainRows {
   NearRows<Collision<double>> rows;
 
   PlainRows(const int* integers, const double* numbers, int most)
-      : robot(integers, numbers), near(rows.space_of(most, 0)), space(12 * robot.bodies + 9 * robot.dofs), distance(most),
-        pair(4 * most), rows(robot, most, 0, near.data()) {}
+      : robot(integers, numbers), near(rows.space_of(most, most, false)), space(12 * robot.bodies + 9 * robot.dofs),
+        distance(most), pair(4 * most), rows(robot, most, most, false, near.data()) {}
   void find(const double* q, const double* limit, double* J, double* lower) {
     double *position = space.data(), *turn = position + 3 * robot.bodies, *axes = turn + 9 * robot.bodies;
     const int dofs = 3 * robot.dofs;
     place_bodies(robot.tree(), Configuration<const double*>{q, robot.factor, robot.offset, robot.source},
                  Placed<double*>{position, turn, axes, axes + dofs, axes + 2 * dofs});
-    rows.find(Alone{}, Placed<const double*>{position, turn, axes, axes + dofs, axes + 2 * dofs},
+    rows.find(Alone{}, true, Placed<const double*>{position, turn, axes, axes + dofs, axes + 2 * dofs},
               AvoidanceNumbers<double>{limit[0], limit[1], limit[2], limit[3], limit[4]}, J, lower, distance.data(),
               pair.data());
   }

@@ -57,15 +57,19 @@ template <class Team> class QPCertificate {
     int outcome = method.solve(d, to) ? CANDIDATE : NOTHING;
     Certificate found{false, 0};
     if (outcome) found = judged(d.compliance), outcome += accepts(found);
+    const Certificate first = found;
     if (outcome < SOLUTION && method.search_softened(d, to)) {
       Real part = Method::LEAST_COMPLIANCE;
       auto is_solved = [&] { return method.solve_softened(d, to, part) && accepts(judged(method.COMPLIANCE + m)); };
       bool is_least = is_solved();
-      while (!is_least && part < Method::LARGEST_COMPLIANCE) part *= 10, is_least = is_solved();
-      if (is_least) method.extrapolate(d, to, part), found = judged(d.compliance);
+      while (!is_least && part < Method::LARGEST_COMPLIANCE / 2) part *= 10, is_least = is_solved();
+      if (is_least) {
+        method.extrapolate(d, to, part), found = judged(d.compliance);
+        if (!accepts(found)) method.put_back(to);
+      }
       if (is_least && accepts(found)) outcome = SOLUTION;
-      else if (is_least && (is_final || contradicts(d, to.x))) outcome = LEAST_VIOLATION;
-      else outcome = method.solve(d, to) ? CANDIDATE : NOTHING;  // from which a search goes on
+      else if (is_least && found.residual > kkt_tol && (is_final || contradicts(d, to.x))) outcome = LEAST_VIOLATION;
+      else outcome = method.solve(d, to) ? CANDIDATE : NOTHING, found = first;  // from which a search goes on
     }
     t.once([&] { to.report[0] = outcome; });
     return found;

@@ -164,7 +164,7 @@ class Step : StepRows {
                                              tolerances[1], true);
     contradicts = to.integers[0] == LEAST_VIOLATION;
     if (!found.holds && !contradicts) {
-      for (int i = soft; i < s.p; ++i) compliance[i] = qp[0].longest_row();
+      for (int i = soft; i < s.p; ++i) compliance[i] = qp[0].longest_row() > 0 ? qp[0].longest_row() : 1;
       move_downhill(data, to.numbers);
       for (int i = 0; i < N; ++i) active[i] = i < n && data.lower[i] == data.upper[i] ? EQUALITY : INACTIVE;
       found.residual = certificate[0].judge(data, to.numbers, zeros.data(), active, tolerances[1]).residual;

@@ -419,15 +419,26 @@ template <class Team> struct WeightedQP {
   // After that, on its active set, with another part, down to where the factors are regular.
   OSIK_CALL bool solve_softened(const Data& d, const Answer& to, Real part) {
     soften(d, part);
+    t.each(0, N, [&](int i) { LABEL[i] = LABEL[i] == REDUNDANT ? Int(INACTIVE) : LABEL[i]; });
     const bool found = solve_on_active_set();
     put(to, found);
     return found;
   }
-  // After that: bring x to where no compliance would have it. x is linear in the compliance, but for its square.
+  // After that: bring x and the multipliers to where no compliance would have them, if rows do not contradict each other.
+  // Both are linear in the compliance, but for its square.
   OSIK_CALL void extrapolate(const Data& d, const Answer& to, Real part) {
     soften(d, 2 * part);
-    if (!solve_on_active_set()) return;
-    t.each(0, n, [&](int j) { to.x[j] = X[j] = 2 * to.x[j] - X[j]; });
+    const Real by = solve_on_active_set() ? 1 : 0;
+    t.each(0, n, [&](int j) { to.x[j] = X[j] = to.x[j] + by * (to.x[j] - X[j]); });
+    t.each(0, p, [&](int i) {
+      const Real before = to.multipliers[i];
+      SMALL_PIVOT[i] = before;
+      to.multipliers[i] = Z[m + i] = before + by * (before - (LABEL[n + i] == INACTIVE ? Real(0) : Z[m + i]));
+    });
+  }
+  // The multipliers before that: those of rows that do contradict each other.
+  OSIK_FN void put_back(const Answer& to) const {
+    t.each(0, p, [&](int i) { to.multipliers[i] = SMALL_PIVOT[i]; });
   }
   static constexpr Real LARGEST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : SEARCHED_COMPLIANCE;
   static constexpr Real LEAST_COMPLIANCE = IS_SINGLE ? SINGLE_INFEASIBLE_COMPLIANCE : INFEASIBLE_COMPLIANCE;
@@ -442,12 +453,9 @@ template <class Team> struct WeightedQP {
 
  private:
   OSIK_CALL bool search_from(const int* guess, const Answer& to) {
-    const int before = changes;
-    changes = 0;
     first_labels(guess, LABEL);
     const bool found = search() && changes <= max_changes;
     if (!found) first_labels(guess, LABEL);
-    changes += before;
     put(to, found);
     return found;
   }

@@ -105,7 +105,9 @@ def find_free(
     if (how.near or how.every) and cuda_is_default():
         with nullcontext() if traced else on_host():
             if cuda_is_default():
-                where = "inside jit, call it under jax.default_device(jax.devices('cpu')[0])"
+                where = (
+                    "call jit under jax.default_device(jax.devices('cpu')[0])" if traced else "add cpu to JAX_PLATFORMS"
+                )
                 raise OsikError(f"nearest and all run on a CPU where there is a scene: {where}")
             return find_free(robot, goals, settings, most, steps, how, obstacles, single=single)
     route, scenes = obstacles.route, len(obstacles.around.scene.integers)

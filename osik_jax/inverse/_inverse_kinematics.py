@@ -149,7 +149,9 @@ def inverse_kinematics(
     check_count("restarts", restarts, least=0)
     for name, flag in (("nearest", nearest), ("all", all)):
         if not isinstance(flag, bool | np.bool_):
-            raise OsikTypeError(f"{name} is a {type(flag).__name__}; it is True or False, and q0 is what to be near to")
+            raise OsikTypeError(
+                f"{name} is of type {type(flag).__name__}; it is True or False: q0 is what to be near to"
+            )
     limits, dtype = checked_limits(robot, limits), robot.q0.dtype
     home = robot.q0 if q0 is None else _start(robot, q0, dtype)
     problem = read_problem(robot, tasks, targets, scheme, limits, home)

@@ -96,7 +96,9 @@ class LiveRetargeter(OnRobot):
         standing: frames of the person standing, with the joints and the rate of the stream; they give leg length, ankle
             height and floor.
         mapping: role to joint name of the stream. None: by common names.
-        profile, acceleration, balance: as in ``Retargeter``.
+        profile: as in ``Retargeter``.
+        acceleration: as in ``Retargeter``.
+        balance: as in ``Retargeter``.
         look_ahead: delay of the robot behind the person, one frame to 2 s [s].
         iterations: largest number of iterations per frame; fewer where the bounds hold and steps gain little.
 
@@ -123,7 +125,7 @@ class LiveRetargeter(OnRobot):
         super().__init__(robot, profile, acceleration, balance)
         self._dt = 1.0 / standing.fps
         self.frames_ahead = max(1, round(look_ahead * standing.fps))
-        self.iterations = iterations
+        self.iterations = int(iterations)
         self._history = max(_LEAST_HISTORY, round(_HISTORY * standing.fps))
         self._standing, self.roles = standing, self._roles(standing, mapping)
         self._measures = measure(standing, self.roles, self.profile.standing)

@@ -318,7 +318,11 @@ def retarget(
         motion: clip of a person, or of another robot (``SourceMotion``).
         mapping: role to joint name of a person's clip. None: by common names.
         fps: frame rate of the result [1/s]; None: that of the clip.
-        profile, acceleration, smoothness, balance, max_iterations: as in ``Retargeter``.
+        profile: as in ``Retargeter``.
+        acceleration: as in ``Retargeter``.
+        smoothness: as in ``Retargeter``.
+        balance: as in ``Retargeter``.
+        max_iterations: as in ``Retargeter``.
 
     Raises:
         ValueError: the clip has fewer than three frames or lacks a needed joint, the robot has no limbs of a person,

@@ -39,8 +39,12 @@ def load_robot(
 
     Args:
         name: of the robot.
-        floating_base, velocity_limits, position_limits, locked_joints, home, root: as in ``Robot.from_mjcf`` and, for
-            URDFs, ``Robot.from_urdf``.
+        floating_base: as in ``Robot.from_mjcf`` and, for URDFs, ``Robot.from_urdf``.
+        velocity_limits: likewise.
+        position_limits: likewise.
+        locked_joints: likewise.
+        home: likewise.
+        root: likewise.
 
     Raises:
         KeyError: no such robot; the message lists those with names like it, and of a path says what reads files. No

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -52,21 +52,27 @@ def _replaced(robot: RobotModel, field: str, value: Any) -> Array:
     new, rows = on_host(old), _rows_of(robot.tree, field)
     for pattern in value:
         _refuse_frame(robot.tree, field, pattern)
-    matched = _matched(field.split("_")[0].replace("dof", "joint"), value, field, tuple(rows))
-    one_number = {pattern for name, pattern in matched.items() if not isinstance(rows[name], slice)}
+    kind, several = field.split("_")[0].replace("dof", "joint"), {n for n in rows if isinstance(rows[n], slice)}
+    matched = _matched(kind, value, field, tuple(rows), several)
     for name, pattern in matched.items():
         row, what = rows[name], f"{field}[{pattern!r}]"
-        if isinstance(row, slice) and pattern in one_number and np.ndim(value[pattern]) == 0:
-            continue  # a number for many joints is meant for those that have one, not for a floating base
         new = replaced_at(new, row, _checked(field, value[pattern], old[row].shape, old.dtype, what))
     return to_jax(new)
 
 
-def _matched(kind: str, given: Mapping[str, Any], what: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Return each matched name with the pattern that matches it; raise ValueError if there are two."""
+def _matched(
+    kind: str, given: Mapping[str, Any], what: str, names: tuple[str, ...], several: Collection[str] = ()
+) -> dict[str, str]:
+    """Return each matched name with the pattern that matches it; raise ValueError if there are two.
+
+    A number for many joints is not for those with ``several`` numbers: a floating base, a ball.
+    """
     found: dict[str, str] = {}
-    for pattern in given:
-        for name in (names[number] for number in match_names(kind, pattern, names)):
+    for pattern, value in given.items():
+        matched = [names[number] for number in match_names(kind, pattern, names)]
+        if several and np.ndim(value) == 0:
+            matched = [name for name in matched if name not in several] or matched
+        for name in matched:
             if name in found:
                 raise OsikValueError(f"{what} gives {name!r} twice, by {found[name]!r} and by {pattern!r}")
             found[name] = pattern

@@ -147,7 +147,8 @@ class Robot(RobotModel):
                 one. ``False``: free joints are locked where the file has them.
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; MJCF has no field for it. A custom
                 numeric ``velocity_limit/JOINT`` in the file is read too.
-            position_limits, locked_joints: as in ``from_urdf``.
+            position_limits: as in ``from_urdf``.
+            locked_joints: as in ``from_urdf``.
             home: what ``q0`` is, see ``with_home``: a keyframe's name or number, for instance. Default: the first
                 keyframe, or ``qpos0`` where there is none, brought inside the joints' ranges.
             root: name of a body of the robot in a scene with other things that move, or names of several. The tree that
@@ -192,7 +193,9 @@ class Robot(RobotModel):
             velocity_limits: joint name (or glob) to greatest speed [rad/s or m/s]; wins over custom numerics
                 ``velocity_limit/JOINT`` of the model.
             locked_joints: as in ``from_urdf``; without a value, joints freeze at ``qpos0``.
-            position_limits, home, root: as in ``from_mjcf``.
+            position_limits: as in ``from_urdf``.
+            home: as in ``from_mjcf``.
+            root: as in ``from_mjcf``.
 
         Raises:
             TypeError: ``model`` is no ``mujoco.MjModel``.
@@ -286,7 +289,8 @@ class Robot(RobotModel):
             values: by array, one of those above. Each is either the whole array, or a mapping from names (or globs) to
                 rows. Names are those of ``body_names`` for ``body_*``, of ``frame_names`` for ``frame_*``, and of
                 joints for the other arrays, locked joints and followers included where the array has them. A hinge or
-                slide has one number in the arrays over joints. ``q0`` takes what ``with_home`` takes.
+                slide has one number in the arrays over joints; a number for many joints by a glob is for these, and
+                not for a floating base or a ball. ``q0`` takes what ``with_home`` takes.
                 Axes are brought to length 1, quaternions and rotations that were rounded are made exact.
 
         Raises:

@@ -101,6 +101,7 @@ def test_threads_find_the_rows_of_a_limit(panda, tmp_path, monkeypatch, members)
     monkeypatch.setattr(_cuda, "call", partial(one_warp.call_of_lanes, tmp_path))
     monkeypatch.setattr(_near_rows, "call_here", call_by_threads)
     monkeypatch.setattr(_near_rows, "_MEMBERS", members)
+    monkeypatch.setattr(_near_rows, "cuda_is_default", lambda: True)
     found = [_near_rows._by_core(kept, 5, with_geometry, *given) for with_geometry in (False, True)]
     monkeypatch.undo()
     for ours, rows in zip(found, expected, strict=True):

@@ -67,6 +67,8 @@ def test_a_number_for_many_joints_is_not_for_a_base_or_a_ball(robot: Robot):
     rest = np.setdiff1d(np.arange(robot.nv), starts)
     assert (np.asarray(slow)[starts] == 0.5).all() and len(rest) >= 9
     np.testing.assert_array_equal(slow[rest], robot.velocity_limit[rest])
+    both = robot.replace(velocity_limit={"*": 0.5, "fly": np.ones(6)}).velocity_limit
+    assert np.sum(np.asarray(both) == 1.0) == 6 and (np.asarray(both)[starts] == 0.5).all()
     with pytest.raises(ValueError, match=r"velocity_limit\['fl\*'\] has shape"):
         robot.replace(velocity_limit={"fl*": 0.5})
 
