@@ -218,9 +218,10 @@ class PlaneContacts(Measurement):
 
 
 class Pixels(Measurement):
-    """Pixels at which a camera sees a marker; lenses are undistorted before.
+    """Pixels at which a camera sees a marker, whose frame is ``frame``; lenses are undistorted before.
 
     Attributes:
+        sigma: standard deviation of each reading [pixels]. (n,)
         camera: name of the camera's frame, whose z axis looks forward, x to the right and y down (static).
         pixel: columns and rows [pixels]. (n, 2)
         intrinsics: focal lengths and principal point, fx, fy, cx, cy [pixels]. (4,)

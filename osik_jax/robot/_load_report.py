@@ -6,11 +6,17 @@ from typing import NamedTuple
 
 
 class LoadNote(NamedTuple):
-    """One element of a file that a robot does not keep as the file has it."""
+    """One element of a file that a robot does not keep as the file has it.
 
-    element: str  # its kind, in the words of the format: "tendon equality", "safety_controller"
-    name: str  # the element's name, or that of the joint, link or geom that it belongs to
-    done: str  # what the robot does instead
+    Attributes:
+        element: its kind, in the words of the format: ``"tendon equality"``, ``"safety_controller"``.
+        name: the element's name, or that of the joint, link or geom that it belongs to.
+        done: what the robot does instead.
+    """
+
+    element: str
+    name: str
+    done: str
 
     def __str__(self) -> str:
         return f"{self.element} {self.name!r}: {self.done}"

@@ -32,21 +32,35 @@ class Received(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Command: positions and velocities of joints."""
+    """Command: positions and velocities of joints.
 
-    names: tuple[str, ...]  # ROS names. (n,)
-    positions: np.ndarray  # [rad or m]. (n,)
-    velocities: np.ndarray  # [rad/s or m/s]. (n,)
+    Attributes:
+        names: ROS names. (n,)
+        positions: [rad or m]. (n,)
+        velocities: [rad/s or m/s]. (n,)
+    """
+
+    names: tuple[str, ...]
+    positions: np.ndarray
+    velocities: np.ndarray
 
 
 class Output(NamedTuple):
-    """Output of a period: a command, and the state of the controller."""
+    """Output of a period: a command, and the state of the controller.
 
-    command: Command | None  # None until every joint was measured
-    phase: Phase  # it waits for the first states, moves, or holds because states stopped
-    level: int  # 0 OK, 1 WARN, 2 ERROR, as in a DiagnosticStatus
-    message: str  # one sentence
-    values: dict[str, str]  # numbers and texts for diagnostics, by name
+    Attributes:
+        command: None until every joint was measured.
+        phase: whether it waits for the first states, moves, or holds because states stopped.
+        level: 0 OK, 1 WARN, 2 ERROR, as in a DiagnosticStatus.
+        message: one sentence.
+        values: numbers and texts for diagnostics, by name.
+    """
+
+    command: Command | None
+    phase: Phase
+    level: int
+    message: str
+    values: dict[str, str]
 
 
 @dataclasses.dataclass(frozen=True)
