@@ -21,8 +21,7 @@ constexpr int INACTIVE = 0, AT_LOWER = -1, AT_UPPER = 1, EQUALITY = 2, REDUNDANT
 // weighted QP; SINGLE_... in single precision
 constexpr double SINGLE_CORRECTION = 1e-6, SINGLE_RIDGE = 1.0, ZERO_TOL = 100.0, BOUND_MULTIPLIER = 1.0,
                  SINGLE_BOUND_MULTIPLIER = 0.03, INFEASIBLE_COMPLIANCE = 1e-11, SINGLE_INFEASIBLE_COMPLIANCE = 1e-6,
-                 SEARCHED_COMPLIANCE = 1e-7, FARKAS_RADIUS = 1e3, FARKAS_ROUNDOFF = 1e-14, SINGLE_FARKAS_ROUNDOFF = 2e-6,
-                 FARKAS_MARGIN = 1e-3;
+                 FARKAS_RADIUS = 1e3, FARKAS_ROUNDOFF = 1e-14, FARKAS_MARGIN = 1e-3;
 
 // certificates, and the point without one
 constexpr int GRADIENT_STEPS = 100;
@@ -73,6 +72,9 @@ constexpr double KERNEL_DEPENDENCE = 1e-14;
 // Hierarchy: largest intermediate x of a warm start, in units of the answer. Tolerances are relative to x, and HARD_ROW_TOL
 // of an x larger by this factor is still the residual of a SOLVED answer.
 constexpr double MAX_DETOUR = 100.0;
+// Compliance of contradicting rows while their active set is searched for, and roundoff of a sum in a Farkas certificate in
+// single precision.
+constexpr double SEARCHED_COMPLIANCE = 1e-7, SINGLE_FARKAS_ROUNDOFF = 2e-6;
 // Certificate of a weighted QP, in units of the tolerance: distance of a value from its bound or of a gradient from 0, and
 // size of a multiplier of the wrong sign. The second is smaller: a multiplier of the wrong sign means a wrong active set,
 // whose cost grows as the curvature left by the rows weakens.

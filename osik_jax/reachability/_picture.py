@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +16,6 @@ from matplotlib.figure import Figure
 
 from .._errors import OsikValueError
 
-if TYPE_CHECKING:
-    from ._map import ReachabilityMap
-
 NOTHING = "#e6e8eb"
 """Colour of cells where no orientation was found and none is proven out of reach."""
 _PALE = 0.15
@@ -27,8 +24,8 @@ _INK, _GREY = "#2b2f36", "#5b636d"
 _PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = None) -> Figure:
-    """Return three slices of a map, one across each axis.
+def draw_slices(found: Any, at: tuple[float, float, float] | None = None) -> Figure:
+    """Return three slices of a ``ReachabilityMap``, one across each axis.
 
     They go through ``at`` [m], by default where most is reached along each axis.
     """
@@ -49,7 +46,7 @@ def draw_slices(found: ReachabilityMap, at: tuple[float, float, float] | None = 
     return figure
 
 
-def _draw_slice(place: Axes, found: ReachabilityMap, spot: tuple[int, int, int], plane: tuple[int, int]) -> None:
+def _draw_slice(place: Axes, found: Any, spot: tuple[int, int, int], plane: tuple[int, int]) -> None:
     across, axes = 3 - sum(plane), found.axes
     values, beyond = (np.take(field, spot[across], across).T for field in (found.share, found.beyond_reach > 0.0))
     edges = [cell_edges(axes)[i] for i in plane]

@@ -318,7 +318,7 @@ def test_the_core_alone_finds_the_least_violation_of_contradicting_rows():
         moved = jax.jit(lambda way, backend=backend: solve(backend, way).x)
         rate = jax.jit(lambda moved=moved: jax.jvp(moved, (0.0,), (1.0,))[1])()
         far, near = ((np.asarray(moved(s)) - np.asarray(moved(-s))) / (2.0 * s) for s in (3.0 * h, h))
-        smooth = np.abs(far - near).max(1) < 1e-6 * np.abs(near).max(1)  # no bound becomes active on the way
+        size = np.abs(near).max(1)
+        smooth = np.abs(far - near).max(1) < 1e-6 * size  # no bound becomes active on the way
         assert (smooth & contradicts).sum() > 20
-        off = np.abs(rate - near).max(1) / np.abs(near).max(1)
-        assert off[smooth].max() < 1e-5, (backend, off)
+        assert (np.abs(rate - near).max(1) < 1e-5 * size)[smooth].all(), backend

@@ -37,6 +37,7 @@ def test_constants_are_those_of_python():
         SINGLE_CORRECTION="LAST_CORRECTION",
         SINGLE_RIDGE="KKT_RIDGE",
         SINGLE_BOUND_MULTIPLIER="BOUND_MULTIPLIER",
+        SINGLE_INFEASIBLE_COMPLIANCE="INFEASIBLE_COMPLIANCE",
     )
     for name, value in shared.items():
         there, kind = getattr(_constants, single.get(name) or name), "float32" if name in single else "float64"
