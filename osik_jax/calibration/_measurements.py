@@ -39,11 +39,16 @@ class Measurement(eqx.Module):
     q: Float[Array, "n nq"]
     sigma: Float[Array, " n"]
 
-    rows = 1  # of one reading
-    unit = "m"  # of the rows
-    shared = ()  # names of the arrays that all readings share
-    read: ClassVar[tuple[str, ...]] = ()  # names of the fields with what was read
-    also = ""  # name of the field that names a second frame
+    rows = 1
+    """Rows of one reading."""
+    unit = "m"
+    """Unit of the rows."""
+    shared = ()
+    """Names of the arrays that all readings share."""
+    read: ClassVar[tuple[str, ...]] = ()
+    """Names of the fields with what was read."""
+    also = ""
+    """Name of the field that names a second frame."""
 
     def _common(self, frame: str, q: Any, sigma: Any, readings: int) -> None:
         self.frame, self.q = frame, _array(q, "q", (readings, None))

@@ -43,10 +43,10 @@ def read_robot(source: str, base: str = "auto") -> Robot:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class HasBase:
-    """Whether the robot of a file has a floating base."""
+    """The option of commands that read a robot from a file: its base."""
 
     base: Literal["auto", "floating", "fixed"] = "auto"
-    """Whether its root moves freely. auto: as the file says; a URDF that does not say floats if it has feet."""
+    """The root; floating: it moves freely; auto: as the file says. A URDF that does not say floats if it has feet."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -49,7 +49,7 @@ class Place:
     out: Path = Path("osik-placement")
     """Folder for the files."""
     base: Literal["auto", "floating", "fixed"] = "fixed"
-    """Whether its root moves freely, as the file says with auto; a base that is placed does not."""
+    """The robot's root, as the file says with auto; a base that is placed does not move freely."""
 
     def run(self) -> int:
         """Run the command; return the exit code."""

@@ -164,7 +164,8 @@ class Step : StepRows {
                                              tolerances[1], true);
     contradicts = to.integers[0] == LEAST_VIOLATION;
     if (!found.holds && !contradicts) {
-      for (int i = soft; i < s.p; ++i) compliance[i] = qp[0].longest_row() > 0 ? qp[0].longest_row() : 1;
+      const double longest = limit_rows ? qp[0].longest_row() : 0;
+      for (int i = soft; i < s.p; ++i) compliance[i] = longest > 0 ? longest : 1;
       move_downhill(data, to.numbers);
       for (int i = 0; i < N; ++i) active[i] = i < n && data.lower[i] == data.upper[i] ? EQUALITY : INACTIVE;
       found.residual = certificate[0].judge(data, to.numbers, zeros.data(), active, tolerances[1]).residual;

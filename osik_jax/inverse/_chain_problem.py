@@ -88,7 +88,7 @@ class ChainRoute(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """What a search needs of a robot and its limits alone."""
+    """Numbers of a search that depend on the robot and its limits alone."""
 
     chain: Chain  # geometry
     lower: Float[Array, " n"]  # limits of the chain's coordinates, -inf where free
