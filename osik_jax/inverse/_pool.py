@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ def stepped(
     return jax.lax.fori_loop(0, steps, once, (x, x, Errors(*[jnp.zeros(lanes, x.dtype)] * 4)))
 
 
+@runtime_checkable
 class Search(Protocol):
     """Base class of a search: a pytree whose methods take arrays with a leading axis of lanes."""
 

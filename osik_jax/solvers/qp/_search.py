@@ -140,7 +140,7 @@ def _by_newton(
         compliance=jnp.where(infeasible[:, None], jax.vmap(infeasible_compliance)(qp), qp.compliance),
     )
     # the multipliers of the least violation are those of its compliance, for derivatives
-    softened = replace(qp, compliance=found.compliance)
+    softened = jax.vmap(lambda one, compliance: replace(one, compliance=compliance))(qp, found.compliance)
     factors = jax.vmap(factorize)(softened, jax.vmap(lambda one: one.cost.hessian())(qp), found.active)
     y = solve_on_active_set(softened, factors, found.active)[1]
     of_least = infeasible[:, None] & jnp.isfinite(y)
