@@ -11,7 +11,6 @@ from ..robot import Robot
 from ..robot._tree import BALL, FREE, KinematicTree
 from ._forward import Kinematics
 from ._joints import dof_kinds
-from ._rigid import cross
 
 
 def kinematics_rates(robot: Robot, kinematics: Kinematics) -> Kinematics:
@@ -43,12 +42,12 @@ def _rates_of(tree: KinematicTree, kinematics: Kinematics, dofs: Int[np.ndarray,
 
     def velocity(points: Float[Array, "k 3"], moved: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k 3 n"]:
         """Return the velocity of points at unit speed of each dof that moves them."""
-        found = linear.T + cross(angular.T, points[:, :, None] - anchor.T, along=-2)
+        found = linear.T + _cross(angular, points[:, :, None] - anchor.T)
         return jnp.where(moved[:, None, dofs], found, 0.0)
 
     def turning(vectors: Float[Array, "k 3 m"], turned: Bool[np.ndarray, "k nvfull"]) -> Float[Array, "k 3 m n"]:
         """Return the rate of column vectors at unit speed of each dof that rotates them."""
-        found = cross(angular.T[None, :, None, :], vectors[..., None], along=1)
+        found = _cross(angular, vectors[..., None])
         return jnp.where(turned[:, None, None, dofs], found, 0.0)
 
     return Kinematics(
@@ -58,6 +57,16 @@ def _rates_of(tree: KinematicTree, kinematics: Kinematics, dofs: Int[np.ndarray,
         turning(kinematics.dof_angular[..., None], axes)[:, :, 0],
         velocity(kinematics.dof_anchor, anchors),
     )
+
+
+def _cross(angular: Float[Array, "n 3"], vectors: Float[Array, "k 3 *m n"]) -> Float[Array, "k 3 *m n"]:
+    """Return w x r for each dof.
+
+    Its entries are chosen, not stacked: what XLA stacks it computes for all bodies.
+    """
+    (wx, wy, wz), (x, y, z) = angular.T, (vectors[:, i, None] for i in range(3))
+    entry = np.arange(3).reshape(3, *[1] * (vectors.ndim - 2))
+    return jnp.where(entry == 0, wy * z - wz * y, jnp.where(entry == 1, wz * x - wx * z, wx * y - wy * x))
 
 
 def _movers(tree: KinematicTree) -> tuple[Bool[np.ndarray, "nvfull nvfull"], Bool[np.ndarray, "nvfull nvfull"]]:

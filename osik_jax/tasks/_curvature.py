@@ -80,7 +80,7 @@ def jacobian_curvature(pull: Float[Array, " m"], jacobian: Float[Array, "k nv"])
 
     The Jacobian is that of the rows, or that of the quantities which the rows combine (such as a frame's position).
     """
-    return safe_norm(pull) * safe_norm(jacobian.ravel())
+    return safe_norm(pull) * positive_root(jnp.sum(jacobian**2))
 
 
 def share_of_far(distance: Float[Array, " k"]) -> Float[Array, " k"]:

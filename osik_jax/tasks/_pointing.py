@@ -280,21 +280,22 @@ class LookAtTask(PointingTask):
         del backend
         positions, rotations, jacobians = frames
         position, rotation, jacobian = positions[0], rotations[0], jacobians[0]
-        point, velocity, moves = self.target, self.target_velocity, jnp.zeros_like(jacobian[:3])
+        point, velocity = self.target, self.target_velocity
         if self.target_frame is not None:
             arm = dot(rotations[1], self.target)
             point, velocity = positions[1] + arm, dot(rotations[1], self.target_velocity)
-            moves = jacobians[1, :3] - dot(cross_matrix(arm), jacobians[1, 3:])
         line = point - position
         squared = jnp.sum(line**2)
         near = squared < _NEAREST**2
         distance = jnp.sqrt(jnp.where(near, 1.0, squared))
         sight = jnp.where(near, dot(rotation, unit(self.axis)), line / distance)
-        narrowing = (jnp.eye(3, dtype=sight.dtype) - jnp.outer(sight, sight)) / distance
         turn = jnp.where(near, 0.0, rotation.T)
+        narrowing = dot(turn, (jnp.eye(3, dtype=sight.dtype) - jnp.outer(sight, sight)) / distance)
         # the line follows the point and leaves the camera: minus its motion; seen from the turning camera, + sight x w
-        rate = dot(narrowing, moves - jacobian[:3]) + dot(cross_matrix(sight), jacobian[3:])
-        return self.pointing_rows(dot(rotation.T, sight), dot(turn, rate), dot(turn, dot(narrowing, velocity)))
+        rate = dot(jnp.concatenate([-narrowing, dot(turn, cross_matrix(sight))], 1), jacobian)
+        if self.target_frame is not None:
+            rate = rate + dot(jnp.concatenate([narrowing, -dot(narrowing, cross_matrix(arm))], 1), jacobians[1])
+        return self.pointing_rows(dot(rotation.T, sight), rate, dot(narrowing, velocity))
 
     def _ahead(self, robot: Robot, kinematics: Kinematics) -> Any:
         """Return the point 1 m along the axis [m]; with a target frame, its origin."""

@@ -188,6 +188,13 @@ class TestCompilation:
         error(second, configurations[0])
         assert len(traces) == 2
 
+    def test_rates_of_bodies_that_the_function_does_not_use_are_not_computed(self):
+        robot = osik.load_robot("g1")
+        task = osik.FunctionTask(robot, lambda robot, kinematics, q: kinematics.frame_pose(robot, "torso_link")[0])
+        step = jax.jit(lambda q: task.rows(robot, osik.forward_kinematics(robot, q), q)).lower(robot.q0).compile()
+        of_all = len(robot.body_names) * 9 * robot.nv * robot.q0.dtype.itemsize
+        assert step.memory_analysis().temp_size_in_bytes < of_all / 4
+
     def test_a_float32_robot_has_float32_tasks(self, robot):
         small = jax.tree.map(lambda x: x.astype(jnp.float32), robot)
         task = osik.FunctionTask(small, Apart(jnp.ones(2, jnp.float32), 0.1, 2, "left hand"), lower=0.0)
