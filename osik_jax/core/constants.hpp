@@ -29,7 +29,8 @@ constexpr double ROW_MULTIPLIER = 1e-3, BOX_TOLERANCE = 10.0, MAX_RESIDUAL = 10.
 
 // tasks of a step
 constexpr double DIAGONAL_RATIO = 30.0, BELOW_OTHERS = 2.0, LEVER_ROUNDOFF = 1e-6, UNHELD_PART = 0.04, NEAR_ERROR = 0.06,
-                 NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0;
+                 NEAR_PART = 0.4, FARTHEST_ERROR = 1e6, RANGE_ROUNDOFF = 8.0, POINTING_SINE_SQUARED = 1e-3, BEHIND = -0.5,
+                 LEAST_SINE = 0.1, NEAREST_SIGHT = 1e-3, CONE_TIP = 0.01;
 
 // rotations, collision
 constexpr double SMALL_SINE_SQUARED = 1e-6, SMALL_ANGLE_SQUARED = 1e-2, PARALLEL = 1e-6, TOUCH = 1e-6, SINGLE_TOUCH = 2e-5;

@@ -60,9 +60,9 @@ template <class R> struct Lanes {
   }
 };
 
+template <class R> OSIK_FN Vec3<R> lane_of(const Vec3<Lanes<R>>& v, int k) { return {v.x.v[k], v.y.v[k], v.z.v[k]}; }
 template <class R> OSIK_FN Mat3<R> lane_of(const Mat3<Lanes<R>>& m, int k) {
-  auto row = [&](const Vec3<Lanes<R>>& v) { return Vec3<R>{v.x.v[k], v.y.v[k], v.z.v[k]}; };
-  return {row(m.a), row(m.b), row(m.c)};
+  return {lane_of(m.a, k), lane_of(m.b, k), lane_of(m.c, k)};
 }
 // Sine and cosine to 1e-16. The angle less the next multiple k pi/2, of which pi/2 has three parts; the polynomials have the
 // coefficients of Sun's fdlibm (k_sin.c, k_cos.c). Large angles and those that are not finite: robot by robot.

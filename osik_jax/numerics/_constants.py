@@ -253,6 +253,16 @@ SINGLE_TOUCH = 2e-5
 
 POINTING_SINE_SQUARED = 1e-3
 """Squared sine of the angle to a direction, below which a series for angle over sine is exact to roundoff."""
+BEHIND = -0.5
+"""Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
+plus the cosine.
+"""
+LEAST_SINE = 0.1
+"""Least sine of the error's angle that is divided by; angle / sine has no bound near the opposite direction."""
+NEAREST_SIGHT = 1e-3
+"""Distance [m] below which there is no line of sight."""
+CONE_TIP = 0.01
+"""Angle [rad] below which a cone's angle is rounded off, so that its gradient is 0 at 0."""
 LEVER_ROUNDOFF = 1e-6
 """Lever arm relative to the longest one, below which it may be the roundoff of 0."""
 UNHELD_PART = 0.04

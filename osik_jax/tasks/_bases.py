@@ -50,6 +50,14 @@ class FramedTask(Task):
         del q
         return self.rows_at(Frames(*moving_frames(robot, kinematics, self.frames)), kinematics.backend)
 
+    def frame_options(self, robot: Robot) -> list[int]:
+        """Return the frames as ``FramedCard`` in ``core/tasks`` reads them."""
+        tree, options = robot.tree, [len(self.frames)]
+        for frame in map(tree.frame, self.frames):
+            carrier = tree.frame_bodies[frame]
+            options += [frame, carrier, *map(int, tree.moves[carrier])]
+        return options
+
 
 class MotionTask(Task):
     """Base of tasks on a motion: no error that could decay, and no gain.

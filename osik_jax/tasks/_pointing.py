@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from ..execution._backends import Backend
 from ..kinematics import Kinematics
-from ..numerics._constants import POINTING_SINE_SQUARED
+from ..numerics._constants import BEHIND, CONE_TIP, LEAST_SINE, NEAREST_SIGHT, POINTING_SINE_SQUARED
 from ..numerics._guarded import safe_norm
 from ..numerics._host import Numbers, module_of, on_host
 from ..robot import Robot
@@ -26,18 +26,7 @@ from ._curvature import jacobian_curvature
 from ._gain import AdaptiveGain
 from ._leaves import as_vector, concrete, home_kinematics
 from ._rotation import cross_matrix, dot
-from ._task import DEFAULT_GAIN, TaskRows
-
-_BEHIND = -0.5
-"""Cosine below which a direction counts as behind. The formulas for behind divide by the cosine, those for ahead by one
-plus the cosine.
-"""
-_LEAST_SINE = 0.1
-"""Least sine of the error's angle that is divided by; angle / sine has no bound near the opposite direction."""
-_NEAREST = 1e-3
-"""Distance [m] below which there is no line of sight."""
-_TIP = 0.01
-"""Angle [rad] below which a cone's angle is rounded off, so that its gradient is 0 at 0."""
+from ._task import DEFAULT_GAIN, POINTING, CoreCard, TaskRows
 
 
 class PointingTask(FramedTask):
@@ -115,6 +104,13 @@ class PointingTask(FramedTask):
         """Return whether the task is an inequality, which keeps the axis in a cone."""
         return self.half_angle is not None
 
+    def core_leaves(self) -> list[Any]:
+        """Return the leaves in the order of the card in ``core/tasks``."""
+        return [self.gain, self.weight, self.target_velocity, None, self.half_angle, self.axis, self.target, None, None]
+
+    def _card_of(self, robot: Robot, at_point: bool) -> CoreCard:
+        return CoreCard(POINTING, 1 if self.bounded else 2, [int(at_point), *self.frame_options(robot)])
+
     def pointing_rows(
         self, direction: Float[Array, "3"], jacobian: Float[Array, "3 nv"], drift: Float[Array, "3"]
     ) -> TaskRows:
@@ -126,7 +122,7 @@ class PointingTask(FramedTask):
         upper = None
         if self.half_angle is not None:
             # the angle is the norm of the error, so its rate is the error's rate along the error
-            derivative = dot(error, derivative)[None] / jnp.maximum(safe_norm(error), _TIP)
+            derivative = dot(error, derivative)[None] / jnp.maximum(safe_norm(error), CONE_TIP)
             error, upper = _rounded(jnp.sum(error**2))[None], _rounded(self.half_angle**2)[None]
         return TaskRows.of(
             error,
@@ -215,6 +211,9 @@ class AxisAlignTask(PointingTask):
         turned = dot(turn, cross_matrix(direction))
         return self.pointing_rows(dot(turn, direction), dot(turned, spin), -dot(turned, velocity))
 
+    def _card(self, robot: Robot) -> CoreCard:
+        return self._card_of(robot, at_point=False)
+
     def _ahead(self, robot: Robot, kinematics: Kinematics) -> Float[Numbers, "3"]:
         """Return the direction of the axis, in the world or in the target frame."""
         _, rotations = kinematics.frame_poses(robot, self.frames)
@@ -286,7 +285,7 @@ class LookAtTask(PointingTask):
             point, velocity = positions[1] + arm, dot(rotations[1], self.target_velocity)
         line = point - position
         squared = jnp.sum(line**2)
-        near = squared < _NEAREST**2
+        near = squared < NEAREST_SIGHT**2
         distance = jnp.sqrt(jnp.where(near, 1.0, squared))
         sight = jnp.where(near, dot(rotation, unit(self.axis)), line / distance)
         turn = jnp.where(near, 0.0, rotation.T)
@@ -296,6 +295,9 @@ class LookAtTask(PointingTask):
         if self.target_frame is not None:
             rate = rate + dot(jnp.concatenate([narrowing, -dot(narrowing, cross_matrix(arm))], 1), jacobians[1])
         return self.pointing_rows(dot(rotation.T, sight), rate, dot(narrowing, velocity))
+
+    def _card(self, robot: Robot) -> CoreCard:
+        return self._card_of(robot, at_point=True)
 
     def _ahead(self, robot: Robot, kinematics: Kinematics) -> Any:
         """Return the point 1 m along the axis [m]; with a target frame, its origin."""
@@ -331,7 +333,7 @@ def deviation(axis: Float[Array, "3"], direction: Float[Array, "3"]) -> tuple[Fl
     """Return the error e of ``PointingTask`` for two unit vectors, and D with ``e' = D d'`` for a rate d' across d."""
     basis = across(axis)
     cosine, beside = dot(axis, direction), dot(basis, direction)
-    behind = cosine < _BEHIND
+    behind = cosine < BEHIND
     front = _in_front(axis, basis, jnp.where(behind, 1.0, cosine), jnp.where(behind, 0.0, beside))
     back = _behind(basis, jnp.where(behind, cosine, -1.0), jnp.where(behind, beside, 0.0))
     return jnp.where(behind, back[0], front[0]), jnp.where(behind, back[1], front[1])
@@ -366,7 +368,7 @@ def _behind(
     way = jnp.where(clear, beside / sine, jnp.array([1.0, 0.0], beside.dtype))
     sine = jnp.where(clear, sine, 0.0)
     angle = jnp.arctan2(sine, cosine)
-    ratio = angle / jnp.maximum(sine, _LEAST_SINE)
+    ratio = angle / jnp.maximum(sine, LEAST_SINE)
     return -angle * way, -(ratio * basis + (1.0 / cosine - ratio) * jnp.outer(way, dot(way, basis)))
 
 
@@ -381,8 +383,8 @@ def across(axis: Float[Array, "3"]) -> Float[Array, "2 3"]:
 
 def _rounded(squared: Float[Array, ""]) -> Float[Array, ""]:
     """Return an angle from its square, rounded off near 0 [rad]."""
-    tip = squared < _TIP**2
-    return jnp.where(tip, squared / (2.0 * _TIP) + 0.5 * _TIP, jnp.sqrt(jnp.where(tip, 1.0, squared)))
+    tip = squared < CONE_TIP**2
+    return jnp.where(tip, squared / (2.0 * CONE_TIP) + 0.5 * CONE_TIP, jnp.sqrt(jnp.where(tip, 1.0, squared)))
 
 
 def _as_half_angle(value: Any, dtype: Any) -> Float[Array, ""]:

@@ -131,13 +131,8 @@ class PoseTask(FramedTask):
     def _card(self, robot: Robot) -> CoreCard | str:
         if self.coupled:
             return "has error='se3'"
-        tree = robot.tree
-        options: list[Any] = [self.axes == "frame", self.orientation_jacobian == "geometric", *self.kept]
-        options.append(len(self.frames))
-        for frame in map(tree.frame, self.frames):
-            carrier = tree.frame_bodies[frame]
-            options += [frame, carrier, *tree.moves[carrier]]
-        return CoreCard(POSE, sum(self.kept), [int(number) for number in options])
+        options = map(int, (self.axes == "frame", self.orientation_jacobian == "geometric", *self.kept))
+        return CoreCard(POSE, sum(self.kept), [*options, *self.frame_options(robot)])
 
     def pose_rows(
         self,

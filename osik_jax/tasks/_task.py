@@ -137,12 +137,12 @@ class TaskRows(eqx.Module):
 class CoreCard(NamedTuple):
     """Facts by which the compiled step computes the rows of a task (``core/tasks``)."""
 
-    kind: int  # ``POSE``, ``CENTER`` or ``POSTURE``: a place in ``TaskKinds`` (``core/tasks/kinds.hpp``)
+    kind: int  # ``POSE`` and so on: a place in ``TaskKinds`` (``core/tasks/kinds.hpp``)
     rows: int  # their number
     options: list[int]  # indices and flags of this kind
 
 
-POSE, CENTER, POSTURE, GIVEN = range(4)
+POSE, CENTER, POSTURE, GIVEN, POINTING = range(5)
 """Kinds of a step's rows; those of ``GIVEN`` are computed by JAX."""
 
 

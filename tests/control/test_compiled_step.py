@@ -71,6 +71,23 @@ def bounded(robot: osik.Robot) -> dict[str, osik.Task]:
     }
 
 
+def gazing(robot: osik.Robot) -> dict[str, osik.Task]:
+    """Axes that point at points and along directions, ahead and behind, in the world and on the robot, and cones."""
+    hand, root = frames_of(robot)
+    look, align, aside = osik.LookAtTask, osik.AxisAlignTask, (1.0, 0.2, -0.3)
+    behind = -np.asarray(align(robot, root, axis=aside).target)
+    moving = np.array([0.1, -0.2, 0.3])
+    return {
+        "eye": look(robot, hand, axis=(2.0, 0.0, 0.0), target=(0.4, 0.3, 0.2), target_velocity=moving, weight=2.0),
+        "carried": look(robot, root, target=(0.1, 0.3, 0.2), target_frame=hand, target_velocity=moving, priority=2),
+        "seen": look(robot, hand, axis=aside, target_frame=root, half_angle=0.5, priority=2, weight=0.1),
+        "behind": align(robot, root, axis=aside, target=behind + 0.1, target_velocity=moving, gain=0.2, priority=2),
+        "level": align(robot, hand, axis=(0.0, 0.0, -1.0), target=(0.1, 0.0, 1.0), half_angle=0.3, weight=0.1),
+        "along": align(robot, hand, axis=aside, target=aside, target_frame=root, target_velocity=moving, priority=2),
+        "all": osik.PostureTask(robot, weight=1e-2, priority=3),
+    }
+
+
 def standing(robot: osik.Robot) -> dict[str, osik.Task]:
     hand, root = frames_of(robot)
     return {
@@ -80,15 +97,16 @@ def standing(robot: osik.Robot) -> dict[str, osik.Task]:
     }
 
 
-SETS = {"mixed": mixed, "bounded": bounded, "standing": standing}
-CASES = [*((name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded")), ("nao", "standing")]
+SETS = {"mixed": mixed, "bounded": bounded, "gazing": gazing, "standing": standing}
+CASES = [(name, tasks) for name in ("arm7", "nao", "g1") for tasks in ("mixed", "bounded", "gazing")]
 
 
 @pytest.mark.variants(
-    ordinary=["arm7-bounded-weighted", "nao-mixed-hierarchy"], slow=["arm7-bounded-null-space", "nao-mixed-saturated"]
+    ordinary=["arm7-bounded-weighted", "arm7-gazing-hierarchy", "nao-mixed-hierarchy"],
+    slow=["arm7-bounded-null-space", "nao-mixed-saturated", "nao-gazing-weighted", "g1-gazing-null-space"],
 )
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize(("name", "tasks"), CASES)
+@pytest.mark.parametrize(("name", "tasks"), [*CASES, ("nao", "standing")])
 def test_the_core_answers_as_plain_jax_does(name, tasks, scheme):
     robot = osik.load_robot(name)
     given = arguments(robot, SETS[tasks](robot), SCHEMES[scheme]())
@@ -161,13 +179,41 @@ def test_robots_of_a_batch_turn_joints_by_any_angle_as_mujoco_does():
         np.testing.assert_allclose(found.error["tip"][lane, :3], place.xpos, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.variants(ordinary=[], slow=["mixed-weighted", "bounded-null-space"])
+@pytest.mark.variants(ordinary=[], slow=["mixed-weighted", "bounded-null-space", "gazing-hierarchy"])
 @pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("tasks", [mixed, bounded])
+@pytest.mark.parametrize("tasks", [mixed, bounded, gazing])
 def test_numbers_that_are_not_valid_are_answered_as_by_plain_jax(tasks, scheme):
     robot = osik.load_robot("arm7")
     given = robot, lanes_of(robot)[0], *arguments(robot, tasks(robot), SCHEMES[scheme]())
     assert_alike_where_numbers_are_not_valid(given, scheme)
+
+
+def test_gaze_at_the_edges_of_its_formulas_is_that_of_plain_jax():
+    """Right ahead, nearly, around 120 degrees, nearly behind, where D is bounded, and a point that is too near."""
+    robot, axis = osik.load_robot("arm7"), np.array([1.0, 0.0, 0.0])
+    hand, _ = frames_of(robot)
+    q = lanes_of(robot)[0]
+    place, turn = (np.asarray(a) for a in osik.forward_kinematics(robot, q).frame_pose(robot, hand))
+    angles = np.array([0.0, 1e-9, 1e-4, 0.0316, 0.0317, 1.0, 2.09, 2.1, 3.0, 3.05, 3.1415, np.pi - 1e-9])
+    ways = np.stack([np.cos(angles), 0.6 * np.sin(angles), 0.8 * np.sin(angles)], -1) @ turn.T
+    points = [*(place + 0.5 * ways), place + 0.9e-3 * ways[5], place + 1.1e-3 * ways[5], place]
+    rest = osik.PostureTask(robot, weight=0.1)
+
+    def answers(step: Any, task: osik.Task, targets: Any) -> osik.Solution:
+        def answer(target: Any) -> osik.Solution:
+            tasks = {"gaze": task.replace(target=target), "rest": rest}
+            return step(robot, q, *arguments(robot, tasks, osik.WeightedQP()))
+
+        return jax.jit(jax.vmap(answer))(jnp.stack(targets))
+
+    for half_angle in (None, 0.2):
+        look = osik.LookAtTask(robot, hand, axis=axis, target=points[0], half_angle=half_angle)
+        along = osik.AxisAlignTask(robot, hand, axis=axis, target=ways[0], half_angle=half_angle)
+        for task, targets in ((look, points), (along, ways)):
+            found, wanted = (answers(step, task, targets) for step in (_step._compiled_step, _step._plain_step))
+            np.testing.assert_array_equal(found.status, wanted.status)
+            largest = jnp.abs(wanted.velocity).max(1, keepdims=True)
+            assert (jnp.abs(found.velocity - wanted.velocity) <= 1e-11 * (1.0 + largest)).all()
 
 
 SMALL = """

@@ -75,13 +75,13 @@ def test_a_card_of_the_core_has_the_rows_of_its_task(arm):
     shapes = jax.eval_shape(lambda q: osik.build_problem(arm, q, tasks).rows, arm.q0)
     cards = {name: task.core(arm) for name, task in tasks.items()}
     known = {name: card for name, card in cards.items() if isinstance(card, CoreCard)}
-    assert known.keys() == {"bounds", "between", "com", "over", "posture", "place"}
+    assert known.keys() == {"bounds", "between", "look", "axis", "com", "over", "posture", "place"}
     for name, card in known.items():
         assert card.rows == len(shapes[name].error)
         leaves = tasks[name].core_leaves()
         assert len(leaves) == 9 and leaves[0] is tasks[name].gain and leaves[1] is tasks[name].weight
         assert (leaves[4] is None) == shapes[name].is_equality
-    assert cards["frame"] == "has error='se3'" and cards["look"] == "is of the class LookAtTask"
+    assert cards["frame"] == "has error='se3'" and cards["energy"] == "is of the class KineticEnergyTask"
 
 
 def test_a_class_of_ones_own_inherits_no_card(arm):

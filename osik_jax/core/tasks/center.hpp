@@ -23,7 +23,7 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& col
     if (goal.normals) return goal.normals[2 * i] * x + goal.normals[2 * i + 1] * y;
     return goal.axes[i] == 0 ? x : goal.axes[i] == 1 ? y : z;
   };
-  Real turning = 0, largest = 0, square = 0, xx = 0, xy = 0, yy = 0, zz = 0;
+  Real turning = 0, xx = 0, xy = 0, yy = 0, zz = 0;
   OSIK_UNROLL_4
   for (int j = 0; j < nv; ++j) {
     const auto [x, y, z] = columns[j];
@@ -40,20 +40,13 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& col
     const Real value = along(i, point[0], point[1], point[2]);
     ask(to, goal.bounds, i, goal.target ? value - goal.target[i] : value, goal.velocity ? goal.velocity[i] : Real(0),
         goal.gain[0]);
-    const Real pull = fabs(goal.weight[i] * to.pull[i]);
-    largest = select((pull > largest) | (pull != pull), pull, largest);
     if (!to.squares) continue;
     const Real length = goal.normals ? along(i, along(i, xx, xy, Real(0)), along(i, xy, yy, Real(0)), Real(0))
                                      : along(i, xx, yy, zz);
     to.squares[i] = select(length < Real(0), Real(0), length);  // which roundoff may make it
   }
-  // the length of the weighted pull times the Frobenius norm of the columns of dofs that turn something
-  const Real unit = select(largest > Real(0), Real(1) / largest, Real(0));
-  for (int i = 0; i < goal.m; ++i) {
-    const Real part = goal.weight[i] * to.pull[i] * unit;
-    square += part * part;
-  }
-  to.curvature[0] = largest * sqrt(square) * sqrt(turning);
+  // times the Frobenius norm of the columns of dofs that turn something
+  to.curvature[0] = pull_length(goal.weight, to.pull, goal.m) * sqrt(turning);
 }
 
 struct CenterTask : CommonCard {

@@ -11,7 +11,7 @@
 #pragma once
 #include "center.hpp"
 #include "given.hpp"
-#include "pose.hpp"
+#include "pointing.hpp"
 #include "posture.hpp"
 
 namespace osik {
@@ -25,5 +25,5 @@ template <class... Cards> struct KindsOf {
     ((k++ == kind ? f(Cards()) : void()), ...);
   }
 };
-using TaskKinds = KindsOf<PoseTask, CenterTask, PostureTask, GivenTask>;  // the order of tasks/_task.py
+using TaskKinds = KindsOf<PoseTask, CenterTask, PostureTask, GivenTask, PointingTask>;  // the order of tasks/_task.py
 }  // namespace osik

@@ -131,25 +131,55 @@ template <class Real> void see_from_root(Real* position, Real* rotation, Real* j
   (turn * apart).put(position), (turn * Mat3<Real>::of(rotation)).put(rotation);
 }
 
-struct PoseTask : CommonCard {
+// Cards of tasks on one or two frames. Options from FRAMES on: how many, and of each its number, its body, and whether each dof
+// moves it.
+template <int FRAMES> struct FramedCard : CommonCard {
   static constexpr bool MOVES = true;
+  static constexpr int FIRST = FRAMES + 1;
+  template <class File, class Task> static void check_frames(const File& file, const Task& task) {
+    const int *options = task.options, size = 2 + file.s.dofs;
+    file.require(task.count >= FIRST && (options[FRAMES] == 1 || options[FRAMES] == 2) &&
+                     task.count == FIRST + options[FRAMES] * size,
+                 "frames");
+    for (const int* frame = options + FIRST; frame < options + task.count; frame += size)
+      file.require_within(frame, 1, 0, file.frames(), "frames"),
+          file.require_within(frame + 1, 1, 0, file.s.bodies, "frames");
+  }
+  // Positions [2, 3], rotations [2, 9] and Jacobians [2, 6, nv] of the frames, where the robot's rows keep them (MovingRows).
+  template <class Own> struct Frames {
+    using Real = typename std::decay_t<decltype(Own::frames)>::value_type;
+    using In = typename Own::In;
+    Own& own;
+    const int* options;
+    Real *position = own.frames.data(), *rotation = position + 6, *jacobian = position + 24;
+
+    int count() const { return options[FRAMES]; }
+    const int* moved(int f) const { return options + FIRST + f * (2 + own.s.dofs) + 2; }
+    int body(int f) const { return moved(f)[-1]; }
+    In offset(int f) const { return own.robot(own.layout.FRAME_POSITION) + 3 * moved(f)[-2]; }
+    In turn(int f) const { return own.robot(own.layout.FRAME_ROTATION) + 9 * moved(f)[-2]; }
+    StoredColumns<const Real*> columns(int f) const { return {jacobian + 6 * own.s.nv * f, own.s.nv}; }
+    Vec3<Real> place() const { return place_frame(own.placed, body(0), offset(0), turn(0), position, rotation); }
+    void move() const {
+      for (int f = 0; f < count(); ++f)
+        move_frame(own.columns, own.placed, body(f), offset(f), turn(f), moved(f), position + 3 * f, rotation + 9 * f,
+                   jacobian + 6 * own.s.nv * f);
+    }
+  };
+};
+
+struct PoseTask : FramedCard<8> {
   enum { POSITION = OWN, ROTATION, POSITION_WEIGHT, ROTATION_WEIGHT };  // leaves; a weight of each row, or of all three
-  // options; of each frame its number, its body, and whether each dof moves it. The second one is what the first one is in.
-  enum { IN_FRAME, GEOMETRIC, KEPT, FRAMES = KEPT + 6, FIRST_FRAME };
+  enum { IN_FRAME, GEOMETRIC, KEPT };  // options, then the frames, of which the second one is what the first one is in
   static int velocities(int) { return 6; }
   template <class File, class Task> static void check(const File& file, const Task& task) {
-    const int *options = task.options, *leaves = task.leaves, size = 2 + file.s.dofs;
+    const int *options = task.options, *leaves = task.leaves;
     file.check_leaf(leaves[POSITION], 3), file.check_leaf(leaves[ROTATION], 9);
     file.check_leaf(leaves[POSITION_WEIGHT], 1, 3), file.check_leaf(leaves[ROTATION_WEIGHT], 1, 3);
-    file.require(task.count >= FIRST_FRAME && (options[FRAMES] == 1 || options[FRAMES] == 2) &&
-                     task.count == FIRST_FRAME + options[FRAMES] * size,
-                 "frames");
+    check_frames(file, task);
     int kept = 0;
     for (int i = 0; i < 6; ++i) kept += options[KEPT + i] != 0;
     file.require(kept == task.m, "rows");
-    for (const int* frame = options + FIRST_FRAME; frame < options + task.count; frame += size)
-      file.require_within(frame, 1, 0, file.frames(), "frames"),
-          file.require_within(frame + 1, 1, 0, file.s.bodies, "frames");
   }
   template <class Step, class Task> static bool is_valid(const Step& step, const Task& task) {
     auto finite = [&](int i) { return step.is_finite(task, i); };
@@ -159,8 +189,7 @@ struct PoseTask : CommonCard {
   template <class Own, class Task, class Interval, class Real, class To>
   static void add(Own& own, const Task& task, const Interval& interval, const Real* gain, const To& to) {
     using In = typename Own::In;
-    const auto& s = own.s;
-    const int *options = task.options, *leaves = task.leaves, nv = s.nv, count = options[FRAMES];
+    const int *options = task.options, *leaves = task.leaves, nv = own.s.nv;
     auto leaf = [&](int i) { return own.leaf(leaves[i]); };
     PoseGoal<In, const Real*> goal{};
     goal.position = leaf(POSITION).at, goal.rotation = leaf(ROTATION).at, goal.velocity = own.velocity(task);
@@ -168,20 +197,14 @@ struct PoseTask : CommonCard {
     goal.in_frame = options[IN_FRAME] != 0, goal.geometric = options[GEOMETRIC] != 0;
     for (int i = 0, row = 0; i < 6; ++i)
       if (goal.kept[i]) own.weights[row] = leaf(WEIGHT)[row] * leaf(POSITION_WEIGHT + i / 3)[i % 3], ++row;
-    Real *position = own.frames.data(), *turn = position + 6, *jacobian = position + 24;
-    auto frame = [&](int f) { return options + FIRST_FRAME + f * (2 + s.dofs); };
-    auto offset_of = [&](int f) { return own.robot(own.layout.FRAME_POSITION) + 3 * frame(f)[0]; };
-    auto turn_of = [&](int f) { return own.robot(own.layout.FRAME_ROTATION) + 9 * frame(f)[0]; };
-    if (count == 1 && own.columns.alone()) {
-      const auto point = place_frame(own.placed, frame(0)[1], offset_of(0), turn_of(0), position, turn);
-      const CarriedColumns<In, Real*> carried{own.placed, own.columns.factor, frame(0) + 2, point};
-      return pose_rows(goal, position, turn, carried, nv, to);
+    const Frames<Own> frames{own, options};
+    if (frames.count() == 1 && own.columns.alone()) {
+      const CarriedColumns<In, Real*> carried{own.placed, own.columns.factor, frames.moved(0), frames.place()};
+      return pose_rows(goal, frames.position, frames.rotation, carried, nv, to);
     }
-    for (int f = 0; f < count; ++f)
-      move_frame(own.columns, own.placed, frame(f)[1], offset_of(f), turn_of(f), frame(f) + 2, position + 3 * f,
-                 turn + 9 * f, jacobian + 6 * nv * f);
-    if (count == 2) see_from_root(position, turn, jacobian, nv);
-    pose_rows(goal, position, turn, StoredColumns<const Real*>{jacobian, nv}, nv, to);
+    frames.move();
+    if (frames.count() == 2) see_from_root(frames.position, frames.rotation, frames.jacobian, nv);
+    pose_rows(goal, frames.position, frames.rotation, frames.columns(0), nv, to);
   }
 };
 }  // namespace osik

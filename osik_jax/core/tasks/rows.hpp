@@ -29,6 +29,22 @@ OSIK_FN void ask(const Rows<Out>& to, const Bounds<In>& bounds, int i, Real erro
   to.lower[i] = approach(low), to.upper[i] = approach(high);
 }
 
+// The length of the weighted pulls of m rows, without overflow of squares.
+template <class Own, class Out> OSIK_FN auto pull_length(const Own& weight, const Out& pull, int m) {
+  using Real = NumberAt<Out>;
+  Real largest = 0, square = 0;
+  for (int i = 0; i < m; ++i) {
+    const Real size = fabs(weight[i] * pull[i]);
+    largest = select((size > largest) | (size != size), size, largest);
+  }
+  const Real unit = select(largest > Real(0), Real(1) / largest, Real(0));
+  for (int i = 0; i < m; ++i) {
+    const Real part = weight[i] * pull[i] * unit;
+    square += part * part;
+  }
+  return largest * sqrt(square);
+}
+
 // Leaves of a task: those that all kinds have, then its own. A task may have no target velocity (0), and no lower bounds.
 enum TaskLeaf { GAIN, WEIGHT, TARGET_VELOCITY, LOWER, UPPER, OWN };
 
