@@ -23,7 +23,7 @@ from ..numerics._arguments import concrete
 from ..numerics._host import float_now, is_traced
 from ..robot import Robot
 from ..robot._configuration import check_configuration
-from ..robot._made_for import check_made_for, check_robot
+from ..robot._made_for import check_made_for, check_robot, check_single
 from ..robot._ranges import warn_of_far_joints
 from ..schemes import Scheme, SchemeAnswer, VelocityProblem, WeightedQP
 from ..schemes._default import priorities
@@ -46,6 +46,8 @@ def check_setting(where: str, robot: Any, scheme: Any, dt: Any) -> None:
     _check_precision(robot)
     if scheme is not None and not isinstance(scheme, Scheme):
         raise OsikTypeError(f"scheme is {scheme!r}; it is a WeightedQP(), a NullSpace() or a HierarchicalQP()")
+    if scheme is not None:
+        check_single(scheme, "scheme")
     check_dt(dt)
 
 
@@ -84,6 +86,7 @@ def checked_limits(robot: Robot, limits: Any) -> tuple[Limit, ...] | None:
         if not isinstance(limit, Limit):
             raise OsikTypeError(f"limits[{place}] is {limit!r}, which is no limit; {wanted}")
         check_made_for(limit, robot, f"limits[{place}]")
+        check_single(limit, f"limits[{place}]")
     return limits
 
 
@@ -110,6 +113,7 @@ def check_tasks(tasks: Any, robot: Robot | None = None) -> None:
         if not isinstance(task, Task):
             shown = f"the class {task.__name__}" if isinstance(task, type) else f"a {type(task).__name__}"
             raise OsikTypeError(f"tasks[{name!r}] is {shown}, not a Task")
+        check_single(task, f"tasks[{name!r}]")
         if robot is not None:
             check_made_for(task, robot, f"tasks[{name!r}]")
 

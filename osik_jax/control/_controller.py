@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Float, Num
 from .._errors import OsikTypeError
 from ..kinematics import integrate
 from ..kinematics._manifold import plain_integration
-from ..limits import Limit, Limits
+from ..limits import Limits
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ..schemes import Scheme
@@ -32,6 +32,8 @@ from ._plain_step import Checked, plain_step
 from ._rollout import remembering
 from ._solution import Solution
 from ._step import Targets, Tasks, aim, in_type_of, step
+
+_TRACED = "a Controller is for numbers, not inside jit or vmap: there is osik_jax.solve"
 
 
 class Controller:
@@ -69,11 +71,12 @@ class Controller:
     ) -> None:
         check_setting("Controller(robot, tasks)", robot, scheme, dt)
         check_tasks(tasks, robot)
-        self.robot, self.tasks, self.dt = robot, dict(tasks), float(dt)
-        self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
-        self._chooses, self._started = scheme is None, False
+        self.robot, self.tasks, self.dt = robot, dict(tasks), dt if is_traced(dt) else float(dt)
+        self.limits: Limits = limits or ()
         self._velocity: Any = None
-        self.scheme = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+        self._started = False
+        self._chosen: Scheme | None = scheme_for(tasks, robot.q0.dtype) if scheme is None else None
+        self.scheme: Scheme = self._chosen or scheme  # pyright: ignore[reportAttributeAccessIssue]  # one is given
         self._lay_out()
 
     def __iter__(self) -> Iterator[Any]:
@@ -99,10 +102,10 @@ class Controller:
         Raises:
             KeyError, TypeError, ValueError: as in ``solve``; TypeError also inside ``jit``.
         """
-        if targets:
+        if targets is not None:
             check_target_names(self.tasks, targets)
         if isinstance(q, Tracer) or (targets and is_traced(targets)):
-            raise OsikTypeError("a Controller's step is for numbers, not inside jit or vmap: there is osik_jax.solve")
+            raise OsikTypeError(_TRACED)
         if not self._started:
             checked_start(self.robot, q)
             self._started = True
@@ -145,12 +148,15 @@ class Controller:
         """Check the tasks, and lay out the step for the core where their structure is new."""
         check_setting("Controller", self.robot, self.scheme, self.dt)
         check_tasks(self.tasks, self.robot)
-        if self._chooses:
+        self.limits = checked_limits(self.robot, self.limits) or ()
+        if is_traced((self.robot, dict(self.tasks), self.scheme, self.limits, self.dt)):
+            raise OsikTypeError(_TRACED)
+        if self.scheme is self._chosen:
             chosen = scheme_for(self.tasks, self.robot.q0.dtype)
-            self.scheme = self.scheme if type(chosen) is type(self.scheme) else chosen
+            self.scheme = self._chosen = self.scheme if type(chosen) is type(self.scheme) else chosen
         warn_of_tasks(self.robot, self.robot.q0, self.tasks, self.scheme, self.dt)
         plain = getattr(self, "_plain", None)
-        known = plain is not None and plain.is_of(self.tasks, self.scheme)
         given = self.robot, self.tasks, self.scheme, self.limits
+        known = plain is not None and plain.is_of(*given)
         self._plain = plain if known else plain_step(*given, self.dt)
         self._checked = Checked(*given)

@@ -127,7 +127,7 @@ class Checked:
 
     def has_checked(self, robot: Robot, tasks: Mapping[str, Task], limits: Any, dt: Any) -> bool:
         """Return whether nothing but targets and the scheme's numbers is new, and dt is ordinary."""
-        if tasks.keys() != self._seen.keys() or not self._has(robot, limits):
+        if not isinstance(tasks, dict) or tasks.keys() != self._seen.keys() or not self._has(robot, limits):
             return False
         same = all(self._seen[name] is task or _is_aimed(task, self._seen[name]) for name, task in tasks.items())
         return same and isinstance(dt, float) and 0.0 < dt <= self._longest
@@ -210,10 +210,12 @@ class PlainStep(Checked):
         if getattr(self, "_handle", None):
             self._free(self._handle)
 
-    def is_of(self, tasks: Mapping[str, Task], scheme: Scheme) -> bool:
-        """Return whether tasks and scheme have the structure that was laid out."""
-        same = {name: jax.tree.structure(task) for name, task in tasks.items()} == self._structures
-        return same and jax.tree.structure(scheme) == self._scheme_structure and self.fits(tasks)
+    def is_of(self, robot: Robot, tasks: Mapping[str, Task], scheme: Scheme, limits: Any) -> bool:
+        """Return whether the arguments have the structure that was laid out."""
+        structure = jax.tree.structure
+        same = {name: structure(task) for name, task in tasks.items()} == self._structures
+        same = same and structure((robot, with_own_limits(robot, _given(limits)))) == self._structure
+        return same and structure(scheme) == self._scheme_structure and self.fits(tasks)
 
     def fits(self, tasks: Mapping[str, Task]) -> bool:
         """Return whether tasks of the same structure have numbers of the sizes that were laid out."""

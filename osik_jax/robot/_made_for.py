@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import typing
 from functools import cache
 from typing import Any, Self
 
 import equinox as eqx
+import jax
+import numpy as np
 
 from .._errors import OsikTypeError, OsikValueError
 from ._robot import Robot
@@ -45,6 +48,38 @@ def check_robot(robot: Any, where: str) -> None:
             f"{where}: robot is a stack of robots (its q0 has shape {shape}, one robot's has ({robot.nq},)). "
             "Take it apart with jax.vmap, or osik_jax.batched"
         )
+
+
+def check_single(part: eqx.Module, what: str) -> None:
+    """Raise ValueError for a stack: a leaf with more axes than the annotation of its field says."""
+    for name, most in _most_axes(type(part)):
+        for leaf in jax.tree.leaves(getattr(part, name)):
+            if np.ndim(leaf) > most:
+                raise OsikValueError(
+                    f"{what} is a stack, or has too many axes: its {name} has shape {np.shape(leaf)}. "
+                    "Take stacks apart with jax.vmap, or osik_jax.batched"
+                )
+
+
+@cache
+def _most_axes(cls: type) -> list[tuple[str, int]]:
+    """Return the fields of a class whose annotations say how many axes their arrays have, with the largest number."""
+    try:
+        hints = typing.get_type_hints(cls)
+    except NameError:  # a name that only type checkers see
+        return []
+    found = []
+    for name, hint in hints.items():
+        arrays = [one for one in _parts(hint) if hasattr(one, "dims")]
+        if arrays and all(getattr(one, "index_variadic", 0) is None for one in arrays):
+            found.append((name, max(len(one.dims) for one in arrays)))
+    return found
+
+
+def _parts(hint: Any) -> list[Any]:
+    """Return the types that a union or a tuple is made of."""
+    inner = typing.get_args(hint)
+    return [part for one in inner for part in _parts(one)] if inner else [hint]
 
 
 def check_made_for(part: MadeForRobot, robot: Robot, what: str) -> None:

@@ -14,7 +14,7 @@ from .._errors import OsikKeyError, OsikTypeError, OsikValueError
 from ..batching._names import find_leaves, leaf_names, replace_named
 from ..batching._structure import is_number
 from ..control import Trajectory, rollout
-from ..control._checks import checked_limits
+from ..control._checks import check_setting, check_steps, check_tasks, checked_limits
 from ..control._step import Targets, Tasks
 from ..limits import Limit, Limits, with_own_limits
 from ..robot import Robot
@@ -41,7 +41,7 @@ class Loop(eqx.Module):
         steps: number of steps (static).
 
     Raises:
-        ValueError: a task has the name of another part of the loop.
+        TypeError, ValueError: as in ``rollout``; a task has the name of another part of the loop.
     """
 
     robot: Robot
@@ -61,6 +61,10 @@ class Loop(eqx.Module):
         dt: ArrayLike | Array = 0.005,
         steps: int,
     ):
+        check_setting("Loop(robot, tasks)", robot, scheme, dt)
+        check_steps(steps)
+        if not callable(tasks):
+            check_tasks(tasks, robot)
         self.robot, self.steps = robot, steps
         self.limits = with_own_limits(robot, checked_limits(robot, limits))
         self.tasks = tasks if callable(tasks) else dict(tasks)

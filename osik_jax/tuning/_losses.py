@@ -32,10 +32,12 @@ class Loss(eqx.Module):
         """Return the loss of one trajectory."""
 
     def __add__(self, other: LossFunction) -> Loss:
-        return WeightedSum((self, other), jnp.ones(2))
+        return WeightedSum((self, other), jnp.ones(2)) if callable(other) else NotImplemented
 
-    def __radd__(self, other: LossFunction) -> Loss:
-        return WeightedSum((other, self), jnp.ones(2))
+    def __radd__(self, other: LossFunction | int) -> Loss:
+        if callable(other):
+            return WeightedSum((other, self), jnp.ones(2))
+        return self if other == 0 else NotImplemented  # sum() begins with 0
 
     def __mul__(self, factor: ArrayLike | Array) -> Loss:
         return WeightedSum((self,), jnp.asarray(factor, float)[None])

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from .._errors import OsikTypeError, OsikValueError, missing_extra
 from .._progress import progress_bar
 from ..batching._structure import Static, put_together, taken_apart
+from ..numerics._arguments import check_count
 from ._evaluate import Evaluation, Problem, check_loss, chunk_size
 from ._history import History, State, load_state, save_state
 from ._loop import Loop, Scenarios
@@ -103,6 +104,7 @@ def tune(
         ValueError: parameters, bounds, scenarios or a saved state that do not fit; no training scenario can be kept.
     """
     check_loss(loss)
+    check_count("iterations", iterations, least=0)
     space = ParameterSpace(loop, parameters)
     overlap(space, loop, scenarios.values | (held_out.values if held_out is not None else {}))
     rule = _optimizer(optimizer)

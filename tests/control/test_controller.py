@@ -249,6 +249,13 @@ def test_exchanged_parts_of_a_controller_are_seen(arm: osik.Robot) -> None:
         controller.scheme = scheme
         assert_same(controller.step(q), compiled(arm, q, tasks, scheme=scheme))
     controller = osik.Controller(arm, tasks, dt=DT)
+    controller.scheme = osik.NullSpace()  # where none was given, too
+    slow = (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
+    for limits in ((), slow, osik.no_limits):
+        controller.limits = limits
+        assert_same(controller.step(q), compiled(arm, q, tasks, scheme=osik.NullSpace(), limits=limits))
+        assert controller._plain.is_of(*list(controller)[:4])  # pyright: ignore[reportOptionalMemberAccess]
+    controller = osik.Controller(arm, tasks, dt=DT)
     velocity = controller.step(q).velocity
     calm = osik.LowAccelerationTask(arm, weight=10.0)
     controller.tasks["calm"] = calm
@@ -284,9 +291,33 @@ def test_wrong_arguments_are_named(arm: osik.Robot) -> None:
     refuses(ValueError, "q has shape", controller.step, np.zeros(3))
     refuses(KeyError, "'hnad'", controller.step, arm.q0, {"hnad": np.zeros(3)})
     refuses(TypeError, "inside jit", jax.jit(lambda q: controller.step(q).velocity), arm.q0)
+    refuses(TypeError, "targets is a ndarray", controller.step, arm.q0, np.zeros(3))
     refuses(ValueError, "dt is -1", osik.Controller, arm, tasks, dt=-1.0)
+    refuses(TypeError, "inside jit", jax.jit(lambda dt: osik.Controller(arm, tasks, dt=dt).step(arm.q0).velocity), DT)
+    for part, wrong, message in (("limits", (3,), "which is no limit"), ("tasks", [tasks["hand"]], "tasks is a list")):
+        changed = osik.Controller(arm, tasks, dt=DT)
+        setattr(changed, part, wrong)
+        refuses(TypeError, message, changed.step, arm.q0)
     bounded = {**tasks, "hand": osik.FrameTask(arm, "hand", lower=-1.0, upper=1.0), "speed": osik.DampingTask(arm)}
     refuses(TypeError, "has no 'target'", osik.Controller(arm, bounded, dt=DT).step, arm.q0, {"speed": arm.q0})
+
+
+@pytest.mark.parametrize("part", ["tasks", "scheme", "limits"])
+def test_a_stack_without_vmap_is_named(arm: osik.Robot, part: str) -> None:
+    """The core would take the numbers of its first entry."""
+    tasks = {"posture": osik.PostureTask(arm)}
+    speeds = [osik.VelocityLimit(arm, velocity={"*": speed}) for speed in (0.1, 1.0)]
+    aimed = jax.vmap(lambda weight: tasks["posture"].replace(weight=weight))(np.ones(3))
+    stacks: dict[str, Any] = {
+        "tasks": {"posture": aimed},
+        "scheme": osik.stack([osik.WeightedQP(damping=damping) for damping in (1.0, 2.0)]),
+        "limits": (osik.stack(speeds),),
+    }
+    given = {"tasks": tasks, part: stacks[part]}
+    for call in (osik.Controller, lambda robot, **options: osik.solve(robot, robot.q0, **options)):
+        refuses(ValueError, f"{part}.* is a stack", call, arm, **given)
+    alone = jax.vmap(lambda own: osik.solve(arm, arm.q0, **{"tasks": tasks, part: own}).velocity)(stacks[part])
+    assert len(alone) == (3 if part == "tasks" else 2)
 
 
 def test_few_steps_are_kept(arm: osik.Robot, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import osik_jax as osik
 from osik_jax.interop.ros2 import Controller, Settings
 from osik_jax.interop.ros2._settings import dds_name, read_settings, topic_of_frame
+from osik_jax.interop.ros2._steps import Steps
 
 PERIOD = 5_000_000
 START = 1_800_000_000_000_000_000
@@ -206,6 +207,18 @@ class TestStart:
         assert (q >= np.asarray(arm.position_lower)).all() and (q <= np.asarray(arm.position_upper)).all()
         assert np.abs(np.diff(q, axis=0)).max() <= 0.01 + 1e-12
         assert np.abs(q[-1] - q[0]).max() > 0.5
+
+    def test_tasks_remember_the_last_velocity_too(self, arm, tmp_path):
+        tasks = {"tool": osik.FrameTask(arm, "hand", weight=1e-3), "calm": osik.LowAccelerationTask(arm, weight=10.0)}
+        osik.save_controller(tmp_path / "c.json", arm, tasks, dt=0.01, limits=osik.no_limits)
+        steps = Steps(None, Settings(controller=str(tmp_path / "c.json"), acceleration=1e3))
+        q, loaded, poses = steps.begin(steps.robot.q0)
+        velocity = np.full(arm.nv, 0.1)
+        found = steps.advance(q, velocity, steps.no_warm_start, loaded, {"hand": poses["hand"]}).velocity
+        own = {**loaded, "calm": loaded["calm"].after(velocity)}
+        wanted = osik.solve(arm, q, own, scheme=steps.scheme, limits=osik.no_limits, dt=0.01).velocity
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+        assert np.abs(found).max() > 0.05
 
 
 class TestHold:

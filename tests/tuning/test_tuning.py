@@ -107,6 +107,8 @@ class TestNames:
     def test_a_task_named_like_a_part(self, arm):
         tasks = {"scheme": osik.PostureTask(arm)}
         refuses(ValueError, "a task cannot be called 'scheme'", tuning.Loop, arm, tasks, steps=1)
+        refuses(TypeError, "tasks is a PostureTask; it is a dict", tuning.Loop, arm, tasks["scheme"], steps=1)
+        refuses(ValueError, "steps is -1", tuning.Loop, arm, {"posture": tasks["scheme"]}, steps=-1)
 
 
 BOUNDS = [
@@ -278,6 +280,9 @@ class TestLosses:
         total = 2.0 * (tuning.Effort() + (lambda trajectory, loop: jnp.sum(trajectory.q[0]))) + tuning.Smoothness()
         expected = 2.0 * (tuning.Effort()(*judged) + jnp.sum(judged[0].q[0])) + tuning.Smoothness()(*judged)
         assert float(total(*judged)) == pytest.approx(float(expected))
+        both = tuning.Effort(), tuning.Smoothness()
+        assert float(sum(both)(*judged)) == pytest.approx(float((both[0] + both[1])(*judged)))  # pyright: ignore
+        refuses(TypeError, "unsupported operand", lambda: both[0] + 1.0)  # pyright: ignore[reportOperatorIssue]
 
     @pytest.mark.parametrize("loss", [3.0, lambda trajectory: 0.0])
     def test_what_is_no_loss(self, loop, scenarios, loss):
@@ -368,6 +373,7 @@ class TestTune:
         tuned = run(loop, scenarios, optimizer=search, iterations=4)
         assert (np.diff(tuned.history.loss) < 0.0).all()
         refuses(TypeError, "it is an optax.GradientTransformation", run, loop, scenarios, optimizer="adam")
+        refuses(ValueError, "iterations is '3'", run, loop, scenarios, iterations="3")
 
     def test_other_numbers_compile_nothing(self, loop, scenarios):
         run(loop, scenarios)

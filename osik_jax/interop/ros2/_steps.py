@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from ..._errors import OsikValueError, unknown_name
 from ...control import solve
+from ...control._rollout import remembering
 from ...kinematics import Kinematics, forward_kinematics, integrate
 from ...kinematics._pose_forms import Pose
 from ...limits import AccelerationLimit, ConfigurationLimit, Limit, VelocityLimit, limit_box, with_own_limits
@@ -84,7 +85,7 @@ class Steps:
     def _advance(
         self, q: Array, velocity: Array, warm_start: Any, tasks: dict[str, Task], targets: Mapping[str, Pose]
     ) -> Advance:
-        limits = tuple(limit.after(velocity) for limit in self.limits)
+        tasks, limits = remembering((tasks, self.limits), velocity, True)
         aims = {self.task_names[frame]: target for frame, target in targets.items()}
         options: Any = dict(scheme=self.scheme, limits=limits, dt=self.dt, targets=aims, warm_start=warm_start)
         answer = solve(self.robot, q, tasks, **options)
