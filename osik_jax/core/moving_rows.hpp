@@ -22,6 +22,7 @@ template <class Out, class F> Rows<Out> rows_at(const RowPlaces& of, const StepL
 
 // The bodies, and the rows of tasks on frames and on the centre of mass. Real: double, or Lanes<double> for a pack.
 template <class Real> struct MovingRows {
+  using Number = Real;
   static constexpr bool ALONE = std::is_same_v<Real, double>;
   using In = std::conditional_t<ALONE, const double*, LaneNumbers<double>>;
   using Out = std::conditional_t<ALONE, double*, LaneResults<double>>;

@@ -147,7 +147,7 @@ template <int FRAMES> struct FramedCard : CommonCard {
   }
   // Positions [2, 3], rotations [2, 9] and Jacobians [2, 6, nv] of the frames, where the robot's rows keep them (MovingRows).
   template <class Own> struct Frames {
-    using Real = typename std::decay_t<decltype(Own::frames)>::value_type;
+    using Real = typename Own::Number;
     using In = typename Own::In;
     Own& own;
     const int* options;
