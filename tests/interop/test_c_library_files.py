@@ -77,6 +77,8 @@ def controllers() -> list[tuple[osik.Robot, dict[str, osik.Task], dict[str, Any]
         "hand": osik.FrameTask(arm, "hand", axes="frame"),
         "near": osik.FrameTask(arm, "hand", rows="position", lower=-half, upper=half, priority=2),
         "relative": osik.RelativeFrameTask(arm, "hand", root=arm.tree.frame_names[3], priority=3),
+        "eye": osik.LookAtTask(arm, "hand", target_frame=arm.tree.frame_names[3], half_angle=0.3, priority=2),
+        "level": osik.AxisAlignTask(arm, "hand", target=(0.0, 0.0, 1.0), priority=3),
         "bent": osik.PostureTask(arm, joints=("joint6", "joint7"), lower=[-0.2, -0.2], upper=[0.2, 0.2], priority=3),
         "rest": osik.PostureTask(arm, weight=np.linspace(0.1, 1.0, arm.nv), priority=4),
     }
