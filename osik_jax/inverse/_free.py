@@ -73,7 +73,7 @@ def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any
 
 @remembered
 def _known(robot: Robot, shapes: RobotShapes, *, route: ChainRoute) -> CoreRobot:
-    """Return what the core takes of a robot for a search; files of shapes may change, so they are no argument."""
+    """Return the core's arrays of a robot for a search; by its shapes, as an SRDF may change under its path."""
     posed = tuple(name if all(rows) else None for name, rows in zip(route.frames, route.rows, strict=True))
     return core_robot(robot, shapes, entries=tuple(route.entries(robot).tolist()), posed=posed)
 
