@@ -31,6 +31,22 @@ def _points(frame: str = "hand", **more: Any) -> cal.Points:
     return cal.Points(frame, given.pop("q"), given.pop("position"), **given)
 
 
+def _poses(rotation: np.ndarray) -> cal.Poses:
+    return cal.Poses("hand", np.zeros((4, 7)), np.zeros((4, 3)), np.tile(rotation, (4, 1, 1)))
+
+
+def _contacts(height: Any) -> cal.PlaneContacts:
+    return cal.PlaneContacts("hand", "table", np.zeros((4, 7)), height=height)
+
+
+def _pixels(point: Any) -> cal.Pixels:
+    return cal.Pixels("hand", "camera", np.zeros((4, 7)), np.zeros((4, 2)), (600, 600, 320, 240), point=point)
+
+
+def _candidates(candidates: Any) -> Any:
+    return cal.next_poses(arm(), _points(), [cal.Unknown("joint_offset", "joint2")], 1, candidates=candidates)
+
+
 def _file(text: str) -> Any:
     path = folder() / "measured.csv"
     path.write_text(text)
@@ -54,6 +70,7 @@ def placements(add: Add) -> None:
     add("bases: a number for the footprint", lambda: _place(scene=osik.Scene(), footprint=0.3), T, "CollisionShapes")
     add("bases: a negative number of refinements", lambda: _place(refine=-1), V, "refine")
     add("robots: one placement", lambda: place_robots({"left": _place()}), V, "two placements or more")
+    add("robots: a list of numbers", lambda: place_robots([1, 2]), T, "its Placement")
     add("robots: placements without a scene", lambda: place_robots(dict.fromkeys("ab", _place())), V, "no scene")
 
 
@@ -64,6 +81,15 @@ def calibrations(add: Add) -> None:
     add("calibration: a negative prior", lambda: cal.Unknown("joint_offset", prior=-1.0), V, "prior")
     add("calibration: nothing unknown", lambda: _calibrate([]), V, "unknown")
     add("calibration: no measurements", lambda: _calibrate(measured=[]), V, "measurement")
+    add("calibration: a number for the unknowns", lambda: _calibrate(3), T, "unknowns is a sequence")
+    add("calibration: a number for the measurements", lambda: _calibrate(measured=3), T, "a measurement is a int")
+    add("calibration: a rank tolerance of NaN", lambda: _calibrate(rank_tolerance=np.nan), V, "rank_tolerance")
+    add("calibration: no readings", lambda: _points(q=np.zeros((0, 7)), position=np.zeros((0, 3))), V, "readings is 0")
+    add("calibration: rotations of length 2", lambda: _poses(2.0 * np.eye(3)), V, "rotations that are none")
+    add("calibration: seven heights for 4 readings", lambda: _contacts([0.0] * 7), V, "(4,)")
+    add("calibration: an infinite height", lambda: _contacts(np.inf), V, "finite")
+    add("calibration: three points for 4 readings", lambda: _pixels(np.zeros((3, 3))), V, "(4, 3)")
+    add("calibration: candidates of 6 joints", lambda: _candidates(np.zeros((9, 6))), V, "(n, 7)")
     add("calibration: a misspelt frame", lambda: _calibrate(measured=_points("hnd")), K, "did you mean 'hand'")
     add("calibration: other numbers of readings", lambda: _points(position=np.zeros((3, 3))), V, "4")
     add("calibration: a NaN in a reading", lambda: _points(position=np.full((4, 3), np.nan)), V, "finite")

@@ -33,6 +33,8 @@ from ._given import (
     warm,
 )
 
+_TRANSPOSED = np.eye(4) + np.outer([0.0, 0.0, 0.0, 1.0], [0.3, 0.0, 0.4, 0.0])
+
 
 @cache
 def ur5() -> osik.Robot:
@@ -231,6 +233,9 @@ def limits(add: Add) -> None:
     add("a scene of another kind of file", lambda: osik.Scene.from_file("scene.stl"), V, ".yaml")
     for size in ("a radius of -1", -1.0), ("a radius of 0", 0.0), ("a radius of NaN", np.nan):
         add(f"a ball with {size[0]}", lambda size=size: osik.CollisionShape.sphere(size[1]), V, "positive")
+    add("a ball of a word", lambda: osik.CollisionShape.sphere("a"), T, "a size is 'a'")
+    add("a hull of nothing", lambda: osik.CollisionShape.convex(None), T, "points is None")
+    add("a mesh scaled by NaN", lambda: osik.CollisionShape.mesh((np.eye(4, 3), [[0, 1, 2]]), scale=np.nan), V, "scale")
     add("a box of 2 sizes", lambda: osik.CollisionShape.box([0.1, 0.1]), V, "half_sizes has shape (2,)")
     add("a cylinder without length", lambda: osik.CollisionShape.cylinder(0.1, np.zeros(3), np.zeros(3)), V, "length")
     add("a hull of one point", lambda: osik.CollisionShape.convex(np.zeros((1, 3))), V, "no convex hull")
@@ -244,11 +249,21 @@ def limits(add: Add) -> None:
     add("an object let go that nobody holds", lambda: _scene().detach("can", arm(), arm().q0), V, "cannot be detached")
     add("contacts that are no pairs", lambda: _scene().allow("can"), T, "pairs of names")
     add("contacts of an unknown object", lambda: _scene().allow(("cam", "hand")), K, "can")
+    add("an object held by no robot", lambda: _scene().attach("can", "arm", "hand"), T, "robot is 'arm'")
+    add("a stack of nothing", lambda: osik.Scene.stack([None]), T, "scene is a NoneType")
     add("a stack of no scenes", lambda: osik.Scene.stack([]), V, "no scene")
     add("a stack of stacks", lambda: osik.Scene.stack([osik.Scene.stack([_scene()])]), V, "stack")
     add("an object of a stack moved", lambda: osik.Scene.stack([_scene()]).moved("can", np.eye(4)), V, "before")
     add("shapes for a scene", lambda: _free({"can": ball}), T, "Scene({name: shape})")
     add("a negative clearance", lambda: _free(clearance=-0.01), V, "0 or more")
+    add("a clearance of a word", lambda: _free(clearance="a"), T, "clearance is 'a'")
+    add("a tolerance of a word", lambda: _free(position_tolerance="a"), T, "a tolerance is 'a'")
+    add("a key of 1.5", lambda: _free(key=1.5), T, "key is 1.5")
+    add("a check of freedom with -1 m", lambda: osik.is_free(ur5(), np.zeros(6), _scene(), -1.0), V, "0 or more")
+    add("a pose that is transposed", lambda: _free(poses={"tool0": _TRANSPOSED}), V, "is it transposed?")
+    add("poses that are transposed", lambda: _free(poses={"tool0": _TRANSPOSED[None]}), V, "is it transposed?")
+    add("positions of two numbers", lambda: _free(poses={"tool0": (np.zeros((2, 2)), np.zeros((2, 4)))}), V, "(n, 3)")
+    add("clearance of q of words", lambda: osik.clearance(ur5(), "x", _scene()), T, "q is 'x'")
     add("a clearance for each target", lambda: _free(clearance=[0.0, 0.1]), V, "one number")
     add("a clearance without a scene", _clearance_alone, V, "scene")
     add("two scenes for three targets", _scenes_for_targets, V, "2 scenes and 3 targets")

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._errors import OsikValueError
-from ..numerics._arguments import check_count
+from ..numerics._arguments import as_scalar, check_count
 from ..numerics._dense import full_precision
 from ..robot import Robot
 from ..robot._made_for import check_robot
@@ -81,12 +81,13 @@ def calibrate(
         if value not in known:
             raise OsikValueError(f"{what} is {value!r}; it is one of {', '.join(known)}")
     check_count("max_iterations", max_iterations)
+    least_ratio = as_scalar(rank_tolerance, "rank_tolerance")
     setup = make_setup(robot, frames or {}, base)
     given = check_measurements(setup, measurements)
     parameters, precision = parameters_of(setup, unknowns)
     weighting = Loss(loss, 1.0 if noise == "given" else LEAST_SCALE, len(parameters))
     estimated = loss != "squared" or noise == "estimated"
-    return _calibrated(setup, given, precision, rank_tolerance, parameters, weighting, estimated, max_iterations)
+    return _calibrated(setup, given, precision, least_ratio, parameters, weighting, estimated, max_iterations)
 
 
 def rows_at(

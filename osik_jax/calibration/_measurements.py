@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -14,7 +14,8 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._rigid import compose, rotate
-from ..numerics._arguments import as_array, check_finite, concrete
+from ..numerics._arguments import as_array, as_vector, check_count, check_finite, concrete
+from ..numerics._rotations import exact_rotation
 from ..tasks._rotation import rotation_log
 from ._setup import Setup, poses_at
 
@@ -32,7 +33,7 @@ class Measurement(eqx.Module):
         sigma: standard deviation of the noise of each reading. (n,)
 
     Raises:
-        ValueError: wrong shapes, not finite, a sigma that is not positive.
+        ValueError: no readings, wrong shapes, not finite, no rotations, a sigma that is not positive.
     """
 
     frame: str = eqx.field(static=True)
@@ -51,6 +52,7 @@ class Measurement(eqx.Module):
     """Name of the field that names a second frame."""
 
     def _common(self, frame: str, q: Any, sigma: Any, readings: int) -> None:
+        check_count("the number of readings", readings)
         self.frame, self.q = frame, _array(q, "q", (readings, None))
         self.sigma = _sigma(sigma, "sigma", readings)
 
@@ -137,7 +139,7 @@ class Poses(Measurement):
         sigma_rotation: Sigma = 1e-3,
     ):
         self.position = _array(position, "position", (None, 3))
-        self.rotation = _array(rotation, "rotation", (len(self.position), 3, 3))
+        self.rotation = exact_rotation(_array(rotation, "rotation", (len(self.position), 3, 3)), "rotation")
         self.sigma_rotation = _sigma(sigma_rotation, "sigma_rotation", len(self.position))
         self._common(frame, q, sigma, len(self.position))
 
@@ -213,7 +215,8 @@ class PlaneContacts(Measurement):
         sigma: Sigma = 1e-3,
     ):
         readings = len(_array(q, "q", (None, None)))
-        self.plane, self.height = plane, jnp.broadcast_to(as_array(height, "height", float), (readings,))
+        self.plane, self.height = plane, as_vector(height, (readings,), "height", float)
+        check_finite(self.height, "height")
         self._common(frame, q, sigma, readings)
 
     def predicted(self, setup: Setup) -> Array:
@@ -256,8 +259,9 @@ class Pixels(Measurement):
     ):
         self.camera, self.pixel = camera, _array(pixel, "pixel", (None, 2))
         self.intrinsics = _array(intrinsics, "intrinsics", (4,))
-        points = jnp.asarray(point, self.pixel.dtype)
-        self.point = _array(jnp.broadcast_to(points, (len(self.pixel), 3)), "point", (None, 3))
+        points = as_array(point, "point", self.pixel.dtype)
+        points = jnp.tile(points, (len(self.pixel), 1)) if points.size == 3 else points
+        self.point = _array(points, "point", (len(self.pixel), 3))
         self._common(frame, q, sigma, len(self.pixel))
 
     def predicted(self, setup: Setup) -> Array:
@@ -290,7 +294,7 @@ def _sigma(value: Any, what: str, readings: int) -> Float[Array, " n"]:
 
 def check_measurements(setup: Setup, measurements: Any) -> tuple[Measurement, ...]:
     """Return measurements as a tuple, checked."""
-    given = (measurements,) if isinstance(measurements, Measurement) else tuple(measurements)
+    given = tuple(measurements) if isinstance(measurements, Iterable) else (measurements,)
     if not given:
         raise OsikValueError("there are no measurements: give at least one, such as calibration.Points(...)")
     for one in given:

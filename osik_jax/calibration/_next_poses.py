@@ -16,7 +16,7 @@ from ..numerics._dense import full_precision
 from ..robot import Robot
 from ..robot._joint_selection import scalar_layout
 from ._calibration import Calibration
-from ._measurements import Measurement, check_measurements, reading_at
+from ._measurements import Measurement, _array, check_measurements, reading_at
 from ._setup import FixedFrame, Setup, make_setup
 from ._unknowns import Parameter, Unknown, apply, parameters_of
 
@@ -64,7 +64,10 @@ def next_poses(
     parameters, precision = parameters_of(setup, unknowns)
     if after is not None and after.parameters != parameters:
         raise OsikValueError(f"after has the unknowns {', '.join(after.names)}; give the same")
-    q = _drawn(robot, candidates, seed) if isinstance(candidates, int) else np.asarray(candidates, float)
+    if isinstance(candidates, int | np.integer):
+        q = _drawn(robot, candidates, seed)
+    else:
+        q = np.asarray(_array(candidates, "candidates", (None, robot.nq)))
     q = q if allowed is None else q[np.asarray(allowed(q), bool)]
     if not len(q):
         raise OsikValueError("no candidate is allowed: give more candidates, or another function allowed")

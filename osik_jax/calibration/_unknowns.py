@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from numbers import Real
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -69,7 +70,7 @@ class Unknown:
             self.quantity == "joint_offset" or not set(self.axes) <= set("xyz") or not self.axes
         ):
             raise OsikValueError(f"axes is {self.axes!r}; it is some of 'xyz', and nothing for a joint_offset")
-        if isinstance(self.prior, bool) or not isinstance(self.prior, int | float) or not self.prior > 0.0:
+        if isinstance(self.prior, bool) or not isinstance(self.prior, Real) or not self.prior > 0.0:
             raise OsikValueError(f"prior is {self.prior!r}; it is a standard deviation: a positive number, or inf")
 
 
@@ -97,11 +98,12 @@ def unit_of(setup: Setup, parameter: Parameter) -> str:
 
 def parameters_of(setup: Setup, unknowns: Sequence[Unknown]) -> tuple[tuple[Parameter, ...], Float[Array, " p"]]:
     """Return all numbers that are unknown, checked, and the precision of each prior, 1 / variance."""
-    if isinstance(unknowns, Unknown) or not all(isinstance(unknown, Unknown) for unknown in unknowns):
+    given: tuple[Any, ...] = tuple(unknowns) if isinstance(unknowns, Iterable) else (None,)
+    if not all(isinstance(unknown, Unknown) for unknown in given):
         raise OsikTypeError("unknowns is a sequence of calibration.Unknown, such as [Unknown('joint_offset', '*')]")
     found = [
         (Parameter(unknown.quantity, name, axis), 1.0 / unknown.prior**2)
-        for unknown in unknowns
+        for unknown in given
         for name in _names(setup, unknown)
         for axis in _axes(setup.robot, unknown, name)
     ]

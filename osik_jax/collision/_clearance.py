@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from .._errors import OsikTypeError, OsikValueError
 from ..execution._computed import in_shared_lanes
 from ..kinematics import Kinematics, forward_kinematics
+from ..numerics._arguments import as_array, as_host_numbers, concrete
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ._core import (
@@ -22,14 +23,13 @@ from ._core import (
     Gaps,
     are_free,
     check_length,
-    check_scene,
     core_robot,
     core_scene,
     gaps_at,
     require_core,
 )
 from ._robot_shapes import Given, robot_shapes
-from ._scene import Scene
+from ._scene import Scene, check_scene
 from ._table import RobotShapes
 
 
@@ -61,9 +61,10 @@ class Clearance(eqx.Module):
 def clearance(robot: Robot, q: Float[ArrayLike, "*n nq"], scene: Scene, *, srdf: Given = None) -> Clearance:
     """Return the signed distance of the nearest pair of shapes, of the robot with itself and with a scene.
 
-    The derivative of ``distance`` is that of the nearest points, with respect to q and to the scene's poses. A depth of
-    shapes that overlap is the length of a translation that separates them. Distances are exact for the convex shapes;
-    a mesh counts as its convex hull.
+    The derivative of ``distance`` is that of the nearest points, with respect to q and to the scene's poses. Second
+    derivatives are wrong: they leave out that nearest points slide along the surfaces. Take differences of the first
+    ones. A depth of shapes that overlap is the length of a translation that separates them. Distances are exact for the
+    convex shapes; a mesh counts as its convex hull.
 
     Args:
         robot: the robot; its numbers are known, not traced.
@@ -73,6 +74,7 @@ def clearance(robot: Robot, q: Float[ArrayLike, "*n nq"], scene: Scene, *, srdf:
 
     Raises:
         OsikError: no compiled core for this device.
+        TypeError: no scene, or q is not numbers.
         ValueError: numbers of scenes and configurations that do not go together; q of another length.
     """
     shapes, q, lead = _prepared(robot, q, scene, srdf, "clearance")
@@ -91,12 +93,22 @@ def is_free(
 ) -> Bool[Array, "*n"]:
     """Return whether all pairs of shapes keep ``clearance`` [m] at each configuration.
 
-    Arguments and errors as in ``osik_jax.clearance``. The result has the leading axes of q.
+    Arguments and errors as in ``osik_jax.clearance``; a ``clearance`` below 0 is a ValueError. The result has the
+    leading axes of q.
     """
     shapes, q, lead = _prepared(robot, q, scene, srdf, "is_free")
-    least = jnp.reshape(jnp.asarray(clearance, q.dtype), (1,))
+    least = jnp.asarray(checked_clearance(clearance), q.dtype)
     own, arrays = core_robot(robot, shapes), core_scene(scene, shapes)
     return _free(own, jax.lax.stop_gradient((q, arrays, least))).reshape(lead)
+
+
+def checked_clearance(value: Any) -> Any:
+    """Return a clearance as an array (1,); raise ValueError unless it is one number, 0 or more."""
+    out = as_host_numbers(value, "clearance").astype(float)
+    seen = concrete(out)
+    if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen >= 0.0)):
+        raise OsikValueError(f"clearance is {value!r}; it is one number, 0 or more, in metres")
+    return out.reshape(1)
 
 
 @jax.jit
@@ -116,7 +128,7 @@ def _prepared(robot: Robot, q: Any, scene: Scene, srdf: Given, what: str) -> tup
     """Return the robot's shapes, the configurations as (lanes, nq), and their leading axes."""
     require_core(what, on_gpu=True)
     check_scene(scene)
-    q = jnp.asarray(q, robot.q0.dtype)
+    q = as_array(q, "q", robot.q0.dtype)
     if q.ndim == 0 or q.shape[-1] != robot.nq:
         raise OsikValueError(f"q has shape {q.shape}; the last axis has the robot's {robot.nq} entries")
     shapes, lead, q = robot_shapes(robot, srdf), q.shape[:-1], q.reshape(-1, robot.nq)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Bool, Float, Int
 
-from .._errors import OsikError, OsikTypeError, OsikValueError
+from .._errors import OsikError, OsikValueError
 from ..core import _cuda, _library
 from ..execution._backends import core_is_here
 from ..execution._platform import cuda_is_default
@@ -221,12 +221,6 @@ def _moves(tree: KinematicTree, entries: Sequence[int], posed: Sequence[str | No
                 carried.add(body)
         moves[[body for body in carried if moves[body]]] = 2 + f
     return moves, groups
-
-
-def check_scene(scene: Any) -> None:
-    """Raise TypeError unless this is a ``Scene``."""
-    if not isinstance(scene, Scene):
-        raise OsikTypeError(f"scene is a {type(scene).__name__}; make an osik_jax.Scene of it: Scene({{name: shape}})")
 
 
 @remembered

@@ -10,8 +10,7 @@ import jax
 import numpy as np
 
 from .._errors import OsikTypeError, OsikValueError, warn
-from ..numerics._host import is_traced
-from ..numerics._remembered import remembered
+from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
 from ..robot._made_for import check_robot
 from ..robot._ranges import first_of
@@ -51,7 +50,7 @@ def robot_shapes(robot: Robot, srdf: Given = None) -> RobotShapes:
         OsikWarning: pairs touch in every configuration, or the SRDF names links that the robot lacks.
     """
     check_robot(robot, "robot_shapes(robot)")
-    if is_traced(robot):
+    if not hold_numbers(robot):
         raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)

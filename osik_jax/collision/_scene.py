@@ -21,12 +21,21 @@ from ..kinematics._rigid import compose, compose_poses, rotate
 from ..numerics._arguments import check_count
 from ..numerics._host import Numbers, is_traced, replaced_at, to_jax, tree_to_jax
 from ..robot import Robot
+from ..robot._made_for import check_robot
 from ._geometry import Kind
 from ._pairs import members
 from ._shape import CollisionShape
 from ._table import ConvexShape, RobotShapes, ShapeKind, ShapeTable, shape_table, table_shapes
 
 _Shape = CollisionShape | ConvexShape
+
+
+def check_scene(scene: Any, *, single: bool = False) -> None:
+    """Raise TypeError unless this is a ``Scene``; with ``single``, ValueError for a stack of scenes."""
+    if not isinstance(scene, Scene):
+        raise OsikTypeError(f"scene is a {type(scene).__name__}; make an osik_jax.Scene of it: Scene({{name: shape}})")
+    if single and scene.is_stack:
+        raise OsikValueError("scene is a stack of scenes; give one scene, in world axes")
 
 
 class Labels:
@@ -141,6 +150,7 @@ class Scene(eqx.Module):
         if not scenes:
             raise OsikValueError("there is no scene to stack")
         for scene in scenes:
+            check_scene(scene)
             scene._check_single("Scene.stack")
         room = max(scene.capacity for scene in scenes)
         vertices = max(len(scene.table.vertices) for scene in scenes)
@@ -198,7 +208,13 @@ class Scene(eqx.Module):
         return self._placed(rows, (wanted[0] + rotate(turn, position - position[0]), compose(turn, rotation)))
 
     def attach(
-        self, name: str, robot: Robot, frame: str, *, q: ArrayLike | Array | None = None, touch: Sequence[str] = ()
+        self,
+        name: str,
+        robot: Robot,
+        frame: str,
+        *,
+        q: ArrayLike | Array | None = None,
+        touch: str | Sequence[str] = (),
     ) -> Scene:
         """Return the scene with an object held by a frame of the robot, so that it moves with the frame.
 
@@ -208,15 +224,16 @@ class Scene(eqx.Module):
             frame: of the robot, such as its hand.
             q: configuration of the robot at which the object is where the scene has it. (nq,) None: the object's pose
                 is in the axes of the frame.
-            touch: names or globs of links that it may touch, such as fingers. What is on the frame's own body may
-                always be touched.
+            touch: a name or glob, or several, of links that it may touch, such as fingers. What is on the frame's own
+                body may always be touched.
 
         Raises:
             KeyError: no such name or frame.
-            TypeError: the scene is traced.
+            TypeError: the scene is traced, or the robot is no ``Robot``.
             ValueError: a body holds the object already; or not a configuration.
         """
-        rows = self._rows(name, "attach")
+        check_robot(robot, "Scene.attach(name, robot, frame)")
+        rows, touch = self._rows(name, "attach"), (touch,) if isinstance(touch, str) else touch
         if (np.asarray(self.body)[rows] >= 0).any():
             raise OsikValueError(f"{name!r} is held already; detach it first")
         body = robot.tree.frame_bodies[robot.tree.frame(frame)]
@@ -237,6 +254,7 @@ class Scene(eqx.Module):
             TypeError: the scene is traced.
             ValueError: no body holds the object, or not a configuration.
         """
+        check_robot(robot, "Scene.detach(name, robot, q)")
         rows = self._rows(name, "detach")
         body = int(np.asarray(self.body)[rows[0]])
         if body < 0:
@@ -250,7 +268,7 @@ class Scene(eqx.Module):
         Args:
             pairs: name or glob of objects or shapes, and one of the robot's links or shapes, or of other objects:
                 ``scene.allow(("can1", "panda_*finger"), ("can1", "table"))``. What matches no object is looked for
-                among the robot's names when the scene is used.
+                among the robot's names when the scene is used. A name that exists stands for itself, not for a glob.
 
         Raises:
             KeyError: the first name of a pair matches nothing.
@@ -274,7 +292,7 @@ class Scene(eqx.Module):
         if not self.partners:
             return np.zeros((*self.contact.shape[:-1], len(shapes.names)), bool)
         own = [*zip(shapes.names, shapes.links, strict=True)]
-        found = [[any(_matches(name, partner) for name in names) for names in own] for partner in self.partners]
+        found = [_matches(own, partner) for partner in self.partners]
         matches = np.array(found, bool).reshape(len(self.partners), len(own))
         numbers = jnp if is_traced(self) else np
         return (numbers.asarray(self.contact)[..., None] & matches).any(-2)
@@ -286,8 +304,7 @@ class Scene(eqx.Module):
             raise OsikValueError(f"{what}: this is a stack of scenes; change its scenes before they are stacked")
 
     def _matching(self, pattern: str) -> np.ndarray:
-        pairs = enumerate(zip(self.labels.names, self.labels.objects, strict=True))
-        return np.array([k for k, names in pairs if any(_matches(name, pattern) for name in names)], int)
+        return np.flatnonzero(_matches([*zip(self.labels.names, self.labels.objects, strict=True)], pattern))
 
     def _rows(self, pattern: str, what: str) -> np.ndarray:
         self._check_single(what)
@@ -401,8 +418,10 @@ def _padded(table: ShapeTable, room: int, vertices: int) -> ShapeTable:
     return ShapeTable(**padded)
 
 
-def _matches(name: str, pattern: str) -> bool:
-    return name == pattern or fnmatch.fnmatchcase(name, pattern)
+def _matches(named: Sequence[tuple[str, ...]], pattern: str) -> list[bool]:
+    """Return which things have the pattern as a name; if none has it, which have a name that matches it as a glob."""
+    exact = [pattern in names for names in named]
+    return exact if any(exact) else [any(fnmatch.fnmatchcase(name, pattern) for name in names) for names in named]
 
 
 def _quoted(name: str) -> str:

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from .._errors import OsikTypeError, OsikValueError
+from .._errors import OsikValueError
 from ..kinematics._rigid import rotation_matrix
-from ..numerics._arguments import as_floats, concrete
-from ..numerics._host import Numbers, is_traced, module_of, to_host, tree_to_jax
+from ..numerics._arguments import as_host_numbers, check_finite, concrete
+from ..numerics._host import Numbers, module_of, tree_to_jax
 from ..numerics._rotations import exact_quaternion, exact_rotation
 from ._geometry import Kind, UnitCore, convex_hull
 from ._mesh_parts import convex_parts, triangles
@@ -141,7 +141,7 @@ class CollisionShape(eqx.Module):
         Raises:
             ValueError: as in ``box``; the points lie in a plane.
         """
-        hull = convex_hull(np.asarray(points, float))
+        hull = convex_hull(as_host_numbers(points, "points"))
         return cls._made(Kind.HULL, frame, _vector(position, "position"), _rotation(rotation), np.ones(3), hull=hull)
 
     @classmethod
@@ -174,7 +174,9 @@ class CollisionShape(eqx.Module):
             OsikWarning: the mesh is not convex, and its hull is taken.
         """
         vertices, faces = triangles(source)
-        parts = convex_parts(vertices * scale, faces)
+        factor = as_host_numbers(scale, "scale")
+        check_finite(factor, "scale")
+        parts = convex_parts(vertices * factor, faces)
         return tuple(cls.convex(part, position, rotation, frame=frame) for part in parts)
 
 
@@ -186,26 +188,16 @@ def _along(radius: Any, start: Any, end: Any, what: str) -> tuple[Numbers, Numbe
 
 
 def _vector(value: Any, what: str) -> Float[Numbers, "3"]:
-    out = _numbers(value, what)
+    out = as_host_numbers(value, what)
     if out.shape != (3,):
         raise OsikValueError(f"{what} has shape {out.shape}, expected (3,)")
     return out
 
 
-def _numbers(value: Any, what: str) -> Numbers:
-    """Return an array; numbers that are not traced are the host's, for which nothing is compiled."""
-    if is_traced(value):
-        return as_floats(value)
-    try:
-        return to_host(value, float)
-    except (TypeError, ValueError):
-        raise OsikTypeError(f"{what} is {repr(value)[:80]}; it is an array of numbers") from None
-
-
 def _sizes(*sizes: Any) -> Float[Numbers, "3"]:
     """Return MuJoCo's sizes: the given ones, which have to be positive, then zeros."""
     for size in sizes:
-        _check_positive(size, "a size")
+        _check_positive(as_host_numbers(size, "a size"), "a size")
     return _vector([*sizes, 0.0, 0.0][:3], "sizes")
 
 
@@ -224,7 +216,7 @@ def _check_positive(value: Any, what: str) -> None:
 def _rotation(value: Any) -> Float[Numbers, "3 3"]:
     if value is None:
         return np.eye(3)
-    out = _numbers(value, "rotation")
+    out = as_host_numbers(value, "rotation")
     if out.shape == (4,):
         return rotation_matrix(exact_quaternion(out, "rotation"))
     if out.shape != (3, 3):

@@ -14,24 +14,22 @@ from jax.custom_batching import custom_vmap, sequential_vmap
 from jaxtyping import Array, Int
 
 from .._errors import OsikError, OsikValueError
-from ..collision._clearance import differentiable, distances, shape_names
+from ..collision._clearance import checked_clearance, differentiable, distances, shape_names
 from ..collision._core import (
     CoreRobot,
     CoreScene,
     check_length,
-    check_scene,
     core_robot,
     core_scene,
     read_gaps,
     require_core,
 )
 from ..collision._robot_shapes import Given, robot_shapes
-from ..collision._scene import Scene
+from ..collision._scene import Scene, check_scene
 from ..collision._table import RobotShapes
 from ..execution._blocks import first_axes_as_one
 from ..execution._platform import cuda_is_default, on_host
 from ..limits import CollisionAvoidanceLimit, Limit
-from ..numerics._arguments import concrete
 from ..numerics._host import is_traced
 from ..numerics._remembered import remembered
 from ..robot import Robot
@@ -68,25 +66,16 @@ def read_obstacles(robot: Robot, route: ChainRoute, scene: Scene, clearance: Any
     """Return the obstacles of a search, checked."""
     require_core("inverse_kinematics with a scene", on_gpu=True)
     check_scene(scene)
-    shapes, own = _known(robot, srdf, route=route)
+    shapes = robot_shapes(robot, srdf)
+    own = _known(robot, shapes, route=route)
     return Obstacles(route, shapes, scene, Around(own, core_scene(scene, shapes), checked_clearance(clearance)))
 
 
 @remembered
-def _known(robot: Robot, srdf: Given, *, route: ChainRoute) -> tuple[RobotShapes, CoreRobot]:
-    """Return the robot's shapes, and what the core takes of it for a search."""
-    shapes = robot_shapes(robot, srdf)
+def _known(robot: Robot, shapes: RobotShapes, *, route: ChainRoute) -> CoreRobot:
+    """Return the core's arrays of a robot for a search; by its shapes, as an SRDF may change under its path."""
     posed = tuple(name if all(rows) else None for name, rows in zip(route.frames, route.rows, strict=True))
-    return shapes, core_robot(robot, shapes, entries=tuple(route.entries(robot).tolist()), posed=posed)
-
-
-def checked_clearance(value: Any) -> Any:
-    """Return a clearance as an array (1,); raise ValueError unless it is one number, 0 or more."""
-    out = (jnp if is_traced(value) else np).asarray(value, float)
-    seen = concrete(out)
-    if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen >= 0.0)):
-        raise OsikValueError(f"clearance is {value!r}; it is one number, 0 or more, in metres")
-    return out.reshape(1)
+    return core_robot(robot, shapes, entries=tuple(route.entries(robot).tolist()), posed=posed)
 
 
 def find_free(

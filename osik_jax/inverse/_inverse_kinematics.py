@@ -19,7 +19,7 @@ from ..collision._robot_shapes import Given
 from ..control._checks import check_setting, checked_limits, checked_start
 from ..kinematics._pose_forms import PoseLike
 from ..limits import ConfigurationLimit, Limit, Limits, keeps_own
-from ..numerics._arguments import check_count, concrete
+from ..numerics._arguments import as_host_numbers, check_count, concrete
 from ..numerics._host import is_traced, untraced
 from ..numerics._remembered import hold_numbers, remembered
 from ..robot import Robot
@@ -294,7 +294,7 @@ def checked_tolerances(position: Any, orientation: Any, dtype: Any) -> Any:
 
 
 def _checked_tolerance(value: Any, dtype: Any) -> Any:
-    out = (jnp if is_traced(value) else np).asarray(value, dtype)
+    out = as_host_numbers(value, "a tolerance").astype(dtype)
     seen = concrete(out)
     if out.shape != () or (seen is not None and not (np.isfinite(seen) and seen > 0.0)):
         raise OsikValueError(f"a tolerance is {value!r}; it is one positive number, in metres or radians")

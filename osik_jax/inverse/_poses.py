@@ -14,7 +14,7 @@ from jaxtyping import Array
 
 from .._errors import OsikValueError
 from ..execution._platform import on_host
-from ..kinematics._pose_forms import as_pose, pose_array, pose_parts
+from ..kinematics._pose_forms import as_pose, check_last_row, pose_array, pose_parts
 from ..kinematics._rigid import rotation_matrix
 from ..numerics._arguments import concrete
 from ..numerics._host import Numbers
@@ -75,17 +75,19 @@ def read_poses(robot: Robot, targets: Mapping[str, Any]) -> tuple[Goal, tuple[tu
 def _one(value: Any, dtype: Any, numbers: Any) -> tuple[Numbers, Numbers, tuple[bool, ...]]:
     """Return position, rotation and rows of one pose or of n. (3,) or (n, 3), likewise the rotation."""
     pose = pose_parts(value, dtype, _ACCEPTED, numbers)
-    if pose is None:
-        array = pose_array(value, dtype, _ACCEPTED, numbers)
+    two = isinstance(value, list) and pose is not None and pose[0].shape == pose[1].shape in ((3,), (4, 4))
+    if pose is None or two:
+        array = numbers.stack(pose) if two else pose_array(value, dtype, _ACCEPTED, numbers)
         if array.shape[-1:] == (3,) and array.ndim <= 2:
             _check_finite(array)
             return array, numbers.broadcast_to(numbers.eye(3, dtype=dtype), (*array.shape[:-1], 3, 3)), _POSITION
         if array.shape[-2:] != (4, 4) or array.ndim > 3:
             raise OsikValueError(f"got an array of shape {array.shape}; a pose is a (4, 4) matrix, a position is (3,)")
+        check_last_row(array)
         pose = array[..., :3, 3], array[..., :3, :3]
     if pose[0].ndim == 1:
         return *as_pose(pose, dtype, numbers=numbers), _POSE
-    if pose[0].ndim != 2 or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
+    if pose[0].shape[1:] != (3,) or pose[1].ndim not in (2, 3) or len(pose[0]) != len(pose[1]):
         raise OsikValueError(
             f"got positions of shape {pose[0].shape} and rotations of shape {pose[1].shape}; many poses are positions "
             "(n, 3) with rotation matrices (n, 3, 3) or quaternions w x y z (n, 4), or matrices (n, 4, 4)"

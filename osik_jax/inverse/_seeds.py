@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt
 
+from .._errors import OsikTypeError
 from ..numerics._arguments import numbers_for
 
 _BITS = 32
@@ -16,8 +17,11 @@ _UNLIMITED = 100.0
 
 def shift_of(key: int | Array, dimensions: int) -> UInt[Array, " n"]:
     """Return the shift of the sequence in each dimension, from an integer or a key of ``jax.random``."""
-    made = jax.random.key(key) if jnp.issubdtype(jnp.result_type(key), jnp.integer) and jnp.ndim(key) == 0 else key
-    return jax.random.bits(made, (dimensions,), jnp.uint32)
+    try:
+        made = jax.random.key(key) if jnp.issubdtype(jnp.result_type(key), jnp.integer) and jnp.ndim(key) == 0 else key
+        return jax.random.bits(made, (dimensions,), jnp.uint32)
+    except (TypeError, ValueError):
+        raise OsikTypeError(f"key is {key!r}; it is an integer or a key of jax.random") from None
 
 
 def starting_box(lower: Float[Array, " n"], upper: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

@@ -47,7 +47,7 @@ def as_pose(
         array = pose_array(value, dtype, numbers=own)
         if array.shape == (4, 4):
             parts = array[:3, 3], array[:3, :3]
-            _check_last_row(array)
+            check_last_row(array)
         elif array.shape == (3,) and rest[1] is not None:
             check_finite(array, f"{what}'s position")
             return _made(numbers, array, rest[1])
@@ -101,7 +101,9 @@ def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"], what: str) -> 
     return exact_rotation(given, f"{what}'s rotation")
 
 
-def _check_last_row(matrix: Float[Array, "4 4"]) -> None:
+def check_last_row(matrix: Float[Numbers, "*B 4 4"]) -> None:
+    """Raise ValueError unless the last row of each matrix is 0 0 0 1; traced values are not checked."""
     seen = concrete(matrix)
-    if seen is not None and not np.abs(seen[3] - [0.0, 0.0, 0.0, 1.0]).max() < _LAST_ROW:
-        raise OsikValueError(f"the last row of a pose's matrix is 0 0 0 1, got {seen[3]}; is it transposed?")
+    for row in () if seen is None else seen[..., 3, :].reshape(-1, 4):
+        if not np.abs(row - [0.0, 0.0, 0.0, 1.0]).max() < _LAST_ROW:
+            raise OsikValueError(f"the last row of a pose's matrix is 0 0 0 1, got {row}; is it transposed?")

@@ -13,14 +13,14 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
-from ..collision._core import check_scene, require_core
+from ..collision._core import require_core
 from ..collision._distance import Nearest
 from ..collision._geometry import Kind, UnitCore, padded
 from ..collision._near_rows import KeptShapes, all_distances, kept_shapes, near_rows, pair_names
 from ..collision._pair_layout import Hulls, PairLayout, Placed, grouped, nearest, place, read_hulls, separation_jacobian
 from ..collision._pairs import Member, Patterns, candidate_pairs, exact_pairs, members
 from ..collision._robot_shapes import Given, robot_shapes
-from ..collision._scene import Scene
+from ..collision._scene import Scene, check_scene
 from ..collision._shape import CollisionShape
 from ..kinematics import Kinematics
 from ..kinematics._forward import home_kinematics

@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..collision import Scene, robot_shapes
+from ..collision._clearance import checked_clearance
 from ..collision._clearance import clearance as clearance_at
-from ..collision._core import CoreRobot, CoreScene, are_free_curves, check_scene, core_robot, core_scene, require_core
+from ..collision._core import CoreRobot, CoreScene, are_free_curves, core_robot, core_scene, require_core
 from ..collision._robot_shapes import Given
+from ..collision._scene import check_scene
 from ..collision._table import RobotShapes
-from ..inverse._free import checked_clearance
 from ..robot import Robot
 
 _CURVES = jax.jit(are_free_curves)

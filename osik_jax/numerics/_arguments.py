@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, DTypeLike, Float
 
 from .._errors import OsikTypeError, OsikValueError
-from ._host import repeated, to_jax
+from ._host import is_traced, repeated, to_host, to_jax
 
 
 def float_dtype(dtype: DTypeLike, what: str) -> np.dtype:
@@ -117,6 +117,16 @@ def as_array(value: Any, what: str, dtype: Any) -> Array:
     except (TypeError, ValueError):
         shown = repr(value)
         raise OsikTypeError(f"{what} is {shown[:80]}; it is a number, or an array of numbers") from None
+
+
+def as_host_numbers(value: Any, what: str) -> Any:
+    """Return floats of NumPy, for which nothing is compiled; traced numbers as floats of JAX."""
+    if isinstance(value, int | float):  # the checks of arrays take as long as a short search
+        return np.asarray(value, float)
+    try:
+        return as_floats(value) if is_traced(value) else to_host(value, float)
+    except (TypeError, ValueError):
+        raise OsikTypeError(f"{what} is {repr(value)[:80]}; it is a number, or an array of numbers") from None
 
 
 def as_floats(value: Any, *beside: Any) -> Array:

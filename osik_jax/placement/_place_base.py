@@ -13,13 +13,12 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikValueError
 from ..collision import CollisionShape, Scene
-from ..collision._core import check_scene
+from ..collision._clearance import checked_clearance
 from ..collision._robot_shapes import Given
-from ..collision._scene import _convex_shapes
+from ..collision._scene import _convex_shapes, check_scene
 from ..control._checks import check_setting, checked_start
 from ..inverse._chain_problem import ChainRoute, search_of
 from ..inverse._chain_search import Goal
-from ..inverse._free import checked_clearance
 from ..inverse._inverse_kinematics import checked_tolerances, joint_box
 from ..inverse._poses import read_poses
 from ..inverse._seeds import shift_of
@@ -108,9 +107,7 @@ def place_base(
     settings = dict(q0=q0, seeds=seeds, key=key, restarts=0, closest=False)
     settings |= dict(position_tolerance=position_tolerance, orientation_tolerance=orientation_tolerance)
     if scene is not None:
-        check_scene(scene)
-        if scene.is_stack:
-            raise OsikValueError("scene is a stack of scenes; give one scene, in world axes")
+        check_scene(scene, single=True)
         settings |= dict(clearance=clearance, srdf=srdf)
     task = _read_task(robot, poses, scene, settings, key)
     solid = _convex_shapes("footprint", footprint)

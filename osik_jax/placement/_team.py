@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .._errors import OsikValueError, unknown_name
+from .._errors import OsikTypeError, OsikValueError, unknown_name
 from ..collision import Scene
 from ..collision._robot_shapes import robot_shapes
 from ..collision._scene import with_objects
@@ -106,12 +106,15 @@ def place_robots(found: Mapping[str, Placement]) -> Team:
     obstacles: one robot works while the others stand at home.
 
     Args:
-        found: by name, the placement of each robot, for the same poses in the same order. One placement twice is two
-            robots of a kind.
+        found: by name, the placement of each robot, for the same poses in the same order: only their number is checked,
+            as robots may reach the same thing with other frames. One placement twice is two robots of a kind.
 
     Raises:
+        TypeError: something else than placements by name.
         ValueError: fewer than two placements, ones without a scene, or with different numbers of poses.
     """
+    if not isinstance(found, Mapping) or not all(isinstance(part, Placement) for part in found.values()):
+        raise OsikTypeError(f"found is {repr(found)[:80]}; it is a dictionary, name of a robot to its Placement")
     parts = list(found.values())
     counts = {name: len(part.q) for name, part in found.items()}
     if len(parts) < 2 or len(set(counts.values())) > 1:

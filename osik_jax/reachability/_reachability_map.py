@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from .._errors import OsikValueError
 from .._progress import Progress
 from ..collision import Scene
-from ..collision._core import check_scene
 from ..collision._robot_shapes import Given, robot_shapes
+from ..collision._scene import check_scene
 from ..control._checks import check_setting, checked_limits
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import checked_tolerances
@@ -106,7 +106,7 @@ def reachability_map(
     check_count("key", key, least=0)
     checked_tolerances(position_tolerance, orientation_tolerance, robot.q0.dtype)
     if scene is not None:
-        check_scene(scene)
+        check_scene(scene, single=True)
     limits = checked_limits(robot, limits)
     own = read_frame(robot, frame, limits, key)
     axes = around(own, grid) if isinstance(grid, int | np.integer) else checked_grid(grid)

@@ -195,7 +195,7 @@ def test_next_poses_tell_more_than_random_ones(ur5: osik.Robot):
     others = [determinant(drawn[drawn[:, 0] > 0.0][4 * k : 4 * k + 4]) for k in range(10)]
     assert determinant(best) > max(others)
     first = cal.calibrate(ur5, cal.Points("tool0", best, tips_of(ur5, best)[0]), unknowns)
-    assert cal.next_poses(ur5, reading, unknowns, 2, after=first, candidates=50).shape == (2, 6)
+    assert cal.next_poses(ur5, reading, unknowns, 2, after=first, candidates=np.int64(50)).shape == (2, 6)  # pyright: ignore[reportArgumentType]
 
 
 def test_vmap_derivatives_and_no_compilation(ur5: osik.Robot):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 import osik_jax as osik
@@ -60,6 +61,20 @@ def test_readings_are_those_of_pinocchio_and_matrices():
     rows = poses.differences(poses.predicted(setup), poses.readings)
     np.testing.assert_allclose(rows[:, :3], np.array(wanted["poses"])[:, :3, 3], atol=1e-9)
     np.testing.assert_allclose(rows[:, 3:], np.tile([0.1, 0.2, -0.3], (4, 1)), atol=1e-9)
+
+
+def test_rounded_rotations_become_the_nearest_ones():
+    """Beside SciPy's polar decomposition."""
+    rounded = np.round(Rotation.random(5, rng=np.random.default_rng(2)).as_matrix(), 3)
+    found = cal.Poses("tool0", np.zeros((5, 6)), np.zeros((5, 3)), rounded).rotation
+    np.testing.assert_allclose(found, [polar(matrix)[0] for matrix in rounded], atol=1e-12)
+
+
+def test_unknowns_of_a_generator_and_a_prior_of_numpy():
+    setup = make_setup(osik.load_robot("ur5"), {}, None)
+    unknown = cal.Unknown("joint_offset", "elbow_joint", prior=np.float32(0.5))  # pyright: ignore[reportArgumentType]
+    parameters, precision = parameters_of(setup, (one for one in [unknown]))  # pyright: ignore[reportArgumentType]
+    assert [part.name for part in parameters] == ["elbow_joint"] and precision.tolist() == [4.0]
 
 
 @pytest.mark.parametrize(

@@ -292,6 +292,19 @@ def test_overlap_of_parts_that_no_joint_of_the_frames_moves():
     assert "crate overlap by" in found.explain() and "where q0 puts them" in found.explain()
 
 
+def test_an_srdf_that_is_edited_is_read_anew(tmp_path):
+    robot, path = osik.load_robot("panda"), tmp_path / "rules.srdf"
+    pose = {"panda_hand": (np.array([0.5, 0.0, 0.4]), DOWN)}
+
+    def reason(rules: str) -> int:
+        path.write_text(f'<robot name="panda">{rules}</robot>')
+        found = osik.inverse_kinematics(robot, pose, scene=osik.Scene(), srdf=str(path))
+        return int(found.obstruction)
+
+    assert reason("") == 1  # the fingers are closed
+    assert reason('<disable_collisions link1="panda_leftfinger" link2="panda_rightfinger"/>') == 0
+
+
 def test_overlap_of_closed_fingers_is_told_at_once(problems):
     """The frame carries both, so that the search moves them, but not apart."""
     robot, (scene, place, turn) = osik.load_robot("panda"), problems[0]

@@ -163,6 +163,7 @@ def test_what_a_hand_holds_moves_with_it(panda):
     touched = {shapes.links[k] for k in np.flatnonzero(held.contacts(shapes)[1])}
     assert touched == {"panda_hand", "panda_link7", "panda_leftfinger", "panda_rightfinger"}
     assert not held.contacts(shapes)[[0, 2, 3, 4, 5]].any()
+    assert scene.attach("can1", panda, "panda_hand", touch="panda_*finger").partners == held.partners
     in_hand = scene.moved("can1", ([0, 0, 0.1], TURN)).attach("can1", panda, "panda_hand").detach("can1", panda, later)
     wanted = hand(later) * pin.SE3(pin.Quaternion(*TURN), np.array([0, 0, 0.1]))
     np.testing.assert_allclose(in_hand.table.position[1], wanted.translation, atol=1e-6)
@@ -177,6 +178,9 @@ def test_allowed_pairs_by_name_and_glob(panda):
     assert np.argwhere(np.asarray(scene.among)).tolist() == [[0, 1], [1, 0]]
     allowed = [(scene.names[i], shapes.names[j]) for i, j in np.argwhere(scene.contacts(shapes))]
     assert allowed == [("ball", "panda_leftfinger:2")]
+    alike = osik.Scene({"can[1]": SHAPE.sphere(0.1), "can1": SHAPE.sphere(0.1)})
+    assert alike.moved("can[1]", ([5, 0, 0], TURN)).table.position[:, 0].tolist() == [5, 0]
+    assert alike.moved("can[0-9]", ([5, 0, 0], TURN)).table.position[:, 0].tolist() == [0, 5]
     refuses(TypeError, "names of a traced scene are unknown", jax.jit(lambda s: s.allow(("can1", "panda_hand"))), scene)
 
 

@@ -14,6 +14,7 @@ from mujoco_states import mujoco_at
 from refusals import refuses
 
 import osik_jax as osik
+from osik_jax.inverse._poses import read_poses
 from osik_jax.inverse._problem import read_problem
 from osik_jax.limits import LimitRows
 
@@ -387,6 +388,17 @@ def test_one_target_of_tasks_is_one_answer(arm):
     assert both.many and both.goals.targets["tool"][1].shape == (4, 3, 3)
     message = r"targets\['tool'\]: got an array of shape \(2, 2\).*many have one more axis in front"
     refuses(ValueError, message, read_problem, arm, tasks, {"tool": np.zeros((2, 2))}, None, None, arm.q0)
+
+
+def test_a_list_of_two_is_a_batch_of_two(arm):
+    """Of matrices or positions; a tuple of two is a position and a rotation."""
+    for one in (np.eye(4), np.array([0.4, 0.1, 0.4])):
+        (found, rows, count), wanted = (
+            read_poses(arm, {"hand": given}) for given in ([one, one], np.stack([one, one]))
+        )
+        assert (rows, count) == wanted[1:] and count == 2
+        np.testing.assert_array_equal(found.position, wanted[0].position)
+    refuses(ValueError, "a pair of shapes", read_poses, arm, {"hand": (np.zeros(3), np.zeros(3))})
 
 
 class TestMistakes:

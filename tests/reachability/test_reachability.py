@@ -245,6 +245,8 @@ def test_mistakes(planar, tmp_path):
     refuses(ValueError, "orientations is 0", mapped, planar, orientations=0)
     refuses(ValueError, r"orientations have shape \(5,\)", mapped, planar, orientations=TURNS)
     refuses(ValueError, "rotations that are none", mapped, planar, orientations=2.0 * about_z(TURNS))
+    stack = osik.Scene.stack([osik.Scene()])
+    refuses(ValueError, "scene is a stack of scenes; give one scene", mapped, planar, scene=stack)
     refuses(ValueError, "seeds is 0", mapped, planar, seeds=0)
     refuses(ValueError, "a tolerance is 0", mapped, planar, position_tolerance=0, out=tmp_path / "none")
     assert not (tmp_path / "none").exists()
