@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 
 from .._errors import OsikTypeError, OsikValueError
 from ..kinematics._forward import body_masses
-from ..numerics._arguments import check_finite
 from ..robot import Robot
 from ..robot._guesses import with_corners
 from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose
@@ -99,9 +98,9 @@ def build_world(
             (ball), a locked joint that is free or ball, a robot without masses, or with other numbers than
             ``robot.mj_model``, or a number out of range.
     """
-    if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf):
+    if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf and math.isfinite(floor or 0.0)):
         raise OsikValueError(
-            f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
+            f"timestep is {timestep}, friction {friction}, floor {floor}; the first has to be positive, all finite"
         )
     body_masses(robot)  # raises if there is no mass
     _check_unedited(robot)
@@ -111,7 +110,6 @@ def build_world(
     poses = {foot: mujoco_frame_pose(robot, home, foot) for foot in points}
     lowest = [float((p + points[foot] @ R.T)[:, 2].min()) for foot, (p, R) in poses.items()]
     height = (min(lowest) if lowest else 0.0) if floor is None else float(floor)
-    check_finite(height, "floor")
     spec = mujoco.MjSpec()
     _set_options(spec, timestep, robot.mj_model)
     bodies = _add_bodies(spec, robot.mj_model)
@@ -131,8 +129,8 @@ def _check_unedited(robot: Robot) -> None:
         own = np.asarray(values)
         if not np.allclose(getattr(robot, field), own, rtol=1e-5, atol=1e-6 * np.abs(own).max()):
             raise OsikValueError(
-                f"{field} of the robot is not that of robot.mj_model, which is simulated: make the edited robot's model "
-                "by Robot.from_mjcf(robot.to_mjcf()), which keeps no actuators, and give servos="
+                f"{field} of the robot is not that of robot.mj_model, which is what is simulated: take "
+                "Robot.from_mjcf(robot.to_mjcf()), and give servos=, for that keeps no actuators"
             )
 
 

@@ -219,7 +219,7 @@ def test_mistakes_are_told(nao, arm, arm_world):
     refuses(ValueError, "stiffness has to be positive", physics.Servo, 0.0, 1.0)
     refuses(ValueError, "effort has to be positive", physics.Servo, 1.0, 1.0, 0.0)
     refuses(ValueError, "timestep", physics.build_world, arm, timestep=0.0)
-    refuses(ValueError, "floor is nan", physics.build_world, arm, floor=np.nan)
+    refuses(ValueError, "floor nan", physics.build_world, arm, floor=np.nan)
     refuses(TypeError, r"a servo is \(600, 5\)", physics.build_world, arm, servos={"*": (600, 5)})
     refuses(ValueError, "body_mass of the robot is not", physics.build_world, arm.scaled(mass=2.0))
     refuses(ValueError, "joint_axis .*to_mjcf", physics.build_world, arm.replace(joint_axis={"joint2": (1, 0, 0)}))
@@ -232,7 +232,7 @@ def test_mistakes_are_told(nao, arm, arm_world):
 
 
 def test_geared_actuators_are_those_of_the_model():
-    """A weight that hangs on a geared servo, beside MuJoCo's own simulation; MuJoCo takes its target behind the gear."""
+    """A weight on a geared servo, beside MuJoCo's own simulation, which takes its target behind the gear."""
     text = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".05" pos=".3 0 0" mass="1"/></body>
     </worldbody><actuator><position joint="j" kp="10" kv="1" gear="-5" forcerange="-2 2"/></actuator></mujoco>"""
     robot = osik.Robot.from_mjcf(text)
