@@ -214,7 +214,7 @@ def _from_parquet(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[st
 
 def _rows(lists: np.ndarray) -> np.ndarray:
     """Return lists of one length as the rows of an array, others as they are."""
-    return np.stack(lists) if len({np.shape(one) for one in lists}) == 1 else lists
+    return np.stack(list(lists)) if len({np.shape(one) for one in lists}) == 1 else lists
 
 
 def _pyarrow(part: str | None = None) -> Any:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..batching._names import leaf_names
@@ -28,7 +29,7 @@ def identifier(manifest: Mapping[str, Any]) -> str:
 
 def _described(leaf: Any) -> str:
     kind = getattr(leaf, "dtype", None)
-    keys = kind is not None and jax.dtypes.issubdtype(kind, jax.dtypes.prng_key)
+    keys = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
     array = np.asarray(jax.random.key_data(leaf) if keys else leaf)
     shape = "x".join(str(n) for n in array.shape) or "scalar"
     return f"{kind if keys else array.dtype} {shape} {_digest(np.ascontiguousarray(array).reshape(-1).view(np.uint8))}"
