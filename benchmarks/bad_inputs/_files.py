@@ -38,6 +38,8 @@ def files(add: Add) -> None:
     add("broken XML", lambda: read("<robot><link name='a'>"), V, "line 1, column 23", foreign=True)
     add("a xacro", lambda: read('<robot xmlns:xacro="http://ros.org/wiki/xacro"><xacro:arm/></robot>'), V, "run xacro")
     add("masses of 0, and their centre", lambda: osik.ComTask(arm().scaled(mass=0.0)), V, "has no mass")
+    add("a list for values by joint", lambda: arm().configuration([0.0] * 7), T, "maps names of joints to values")
+    add("a NaN for a joint's value", lambda: arm().configuration({"joint1": np.nan}), V, "'joint1' is nan")
     add("a text for a joint's value", lambda: arm().configuration({"joint1": "x"}), T, "'joint1' is 'x'")
     add(
         "a negative mass",

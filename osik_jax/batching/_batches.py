@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -57,6 +57,7 @@ def batched(tree: T, values: Mapping[str, Any]) -> T:
         KeyError: no such name; the message lists the arrays.
         ValueError: a wrong shape, different lengths, or an array that is given twice.
     """
+    values = {name: _as_array(value) for name, value in values.items()}
     lengths = {name: {jnp.shape(leaf)[:1] for leaf in jax.tree.leaves(value)} for name, value in values.items()}
     if len(set().union(*lengths.values())) > 1:
         shown = "; ".join(f"{k}: {', '.join(str(n[0]) if n else 'none' for n in v)}" for k, v in lengths.items())
@@ -64,7 +65,14 @@ def batched(tree: T, values: Mapping[str, Any]) -> T:
     return replace_named(tree, leaf_names(tree), values, batched=True)
 
 
-def stack(items: Sequence[T]) -> T:
+def _as_array(value: Any) -> Any:
+    """Return a list of numbers as one array; other pytrees as they are."""
+    leaves = jax.tree.leaves(value)
+    numbers = isinstance(value, list | tuple) and leaves and not any(jnp.ndim(leaf) for leaf in leaves)
+    return jnp.asarray(value) if numbers else value
+
+
+def stack(items: Iterable[T]) -> T:
     """Return one pytree of stacked arrays from several of the same structure: robots, tasks, limits; ``vmap`` over it.
 
     A stack of robots of different files has no ``mj_model``, and what is read from it is to be made robot by robot.
@@ -72,6 +80,7 @@ def stack(items: Sequence[T]) -> T:
     Raises:
         ValueError: there is nothing to stack, or structure differs: the message says what, and why it cannot.
     """
+    items = list(items)
     if not items:
         raise OsikValueError("there is nothing to stack")
     for place, item in enumerate(items[1:], 1):

@@ -69,8 +69,11 @@ def _paired(names: Sequence[str], name: str, value: Any) -> list[tuple[int, Any]
 
 
 def _fitting(value: Any, leaf: Any, name: str, batched: bool) -> Array:
-    """Return a new value in the precision of the old leaf; a scalar is repeated."""
-    new, shape = jnp.asarray(value, jnp.result_type(leaf)), jnp.shape(leaf)
+    """Return a new value in the precision of the old leaf, floats for an integer as they are; a scalar is repeated."""
+    kind, shape = jnp.result_type(leaf), jnp.shape(leaf)
+    new = jnp.asarray(value)
+    if not (jnp.issubdtype(kind, jnp.integer) and jnp.issubdtype(new.dtype, jnp.floating)):
+        new = jnp.asarray(new, kind)
     lanes = new.shape[:1] if batched else ()
     if batched and new.ndim == 0:
         raise OsikValueError(f"{name} is one number; it needs an axis in front, the batch")

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from ._inputs import HasBase, InScene, read_robot
-from ._messages import told
+from ._messages import CommandError, told
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Ik(HasBase, InScene):
         from ..inverse._report import print_found
         from ..kinematics._forward import home_kinematics
 
+        if self.frame in self.hold:
+            raise CommandError(f"--frame and --hold both name {self.frame!r}: a frame is moved or held")
         robot = read_robot(self.robot, self.base)
         with told():
             home = home_kinematics(robot)

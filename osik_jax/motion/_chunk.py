@@ -20,14 +20,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from .._errors import OsikValueError, warn
 from ..inverse import inverse_kinematics
 from ..inverse._inverse_kinematics import joint_box
-from ..numerics._arguments import as_floats, check_count, concrete
+from ..numerics._arguments import as_floats, as_scalar, check_count, check_positive, concrete
 from ..numerics._dense import full_precision
 from ..numerics._guarded import positive_root
 from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..solvers import Status, solve_least_squares_qp
 from ._jerk import CUBIC
-from ._motion import Motion, at_rest_outside, sample_times
+from ._motion import Motion, at_rest_outside, one_axis, sample_times
 from ._pose_path import read_poses
 from ._retime import Limit, checked_limits
 from ._spline import cubic_derivatives
@@ -76,7 +76,7 @@ class Chunk(eqx.Module):
 
     def at(self, time: Float[ArrayLike, " T"]) -> Float[Array, "4 T n"]:
         """Return positions, velocities, accelerations and jerks at times [s]; at rest outside of the motion."""
-        return _at(self, as_floats(time))
+        return _at(self, as_floats(one_axis(time)))
 
     def state(self, time: Float[ArrayLike, ""]) -> tuple[Array, Array, Array]:
         """Return position, velocity and acceleration at one time: the ``start`` of the chunk that goes on there."""
@@ -143,8 +143,8 @@ def chunk(
 
     Raises:
         KeyError: no such frame or joint.
-        ValueError: one waypoint; times that do not increase; a start outside its limits; limits that are not positive;
-            poses that cannot be reached, or that lie on different branches.
+        ValueError: one waypoint; times that do not increase; a start outside its limits; limits or a smoothing that
+            are not positive; poses that cannot be reached, or that lie on different branches.
 
     Warns:
         OsikWarning: the start cannot be stopped within the limits.
@@ -172,7 +172,7 @@ def chunk(
         time[0] if begin is None else begin,
         bounds,
         limits,
-        jnp.asarray(smoothing, points.dtype),
+        as_smoothing(smoothing, points.dtype),
     )
     found = Chunk(*_fitted(*given, cells=count, rest=rest), joints=tuple(dof_names(robot)))
     _warn_unless(found)
@@ -196,6 +196,13 @@ def _checked_times(time: Array, begin: Array | None) -> Float[Array, " N"]:
     if seen is not None and first is not None and not first < seen[-1]:
         raise OsikValueError(f"begin is {first:g}; it is before the last waypoint, which is at {seen[-1]:g}")
     return time
+
+
+def as_smoothing(weight: Float[ArrayLike, ""], dtype: Any = None) -> Float[Array, ""]:
+    """Return the weight of the third differences; raise ValueError unless it is positive."""
+    found = as_scalar(weight, "smoothing", dtype)
+    check_positive("weights of smoothing", found[None])
+    return found
 
 
 def _points(robot: Robot, waypoints: Any, near: Array | None) -> Float[Array, "N n"]:

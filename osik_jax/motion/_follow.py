@@ -21,7 +21,7 @@ from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
 from ..tasks._pose import RADIAN
 from ._joint_path import Free, PathSearch
-from ._motion import Motion, sample_times
+from ._motion import Motion, one_axis, sample_times
 from ._obstacles import Obstacles, spline_curves
 from ._pose_path import Poses, corners, interpolated, lengths, read_poses
 from ._retime import Limit, checked_limits, checked_speed, frame_speeds, resampled, retimed_pieces
@@ -58,7 +58,7 @@ class Followed(NamedTuple):
 
     def at(self, time: Float[ArrayLike, " T"]) -> Float[np.ndarray, "4 T n"]:
         """Return positions, velocities, accelerations and jerks at times [s] (outside jit)."""
-        time = np.clip(np.asarray(time, float), 0.0, self.duration)
+        time = np.clip(np.asarray(one_axis(time), float), 0.0, self.duration)
         piece = np.clip(np.searchsorted(self.starts, time, side="right") - 1, 0, len(self.timings) - 1)
         found = np.zeros((4, len(time), self.robot.nv))
         for i in np.unique(piece):

@@ -17,6 +17,8 @@ from .._errors import OsikValueError, missing_extra
 from .._npz import open_npz
 from .._whole_file import whole_file, write_text
 from ..control import Trajectory
+from ..numerics._arguments import as_array
+from ..numerics._columns import read_columns
 from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
 
@@ -116,13 +118,21 @@ def at_rest_outside(
     return jnp.where(moves | (jnp.arange(len(states)) == 0)[:, None, None], states, 0.0)
 
 
+def one_axis(time: Any) -> Any:
+    """Return times as they are; raise ValueError unless they are one array or list of numbers."""
+    if np.ndim(time) != 1:
+        raise OsikValueError(f"time has shape {np.shape(time)}; it is an array of times (T,) [s], as [0.1] for one")
+    return time
+
+
 def sample_times(duration: float, dt: float) -> Float[np.ndarray, " T"]:
     """Return times from 0 that are ``dt`` apart [s], the last of which is the end or just after it.
 
     Raises:
-        ValueError: ``dt`` is not positive.
+        TypeError: ``dt`` is no number.
+        ValueError: ``dt`` is not positive and finite.
     """
-    if not dt > 0.0:
+    if not 0.0 < as_array(dt, "dt", float) < np.inf:
         raise OsikValueError(f"dt is {dt!r}; it is the positive time between two samples [s]")
     return np.arange(int(np.ceil(duration / dt - 1e-9)) + 1) * dt
 
@@ -134,10 +144,18 @@ def load_motion(path: str | os.PathLike[str]) -> Motion:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: another kind of file, columns missing, or times that do not increase.
+        ValueError: another kind of file, columns that are missing, do not fit or are not finite, or times
+            that do not increase.
         ModuleNotFoundError: ``.parquet`` without pyarrow.
     """
     time, arrays, joints = {".npz": _from_npz, ".csv": _from_csv, ".parquet": _from_parquet}[_kind(path)](path)
+    every = (np.size(time), *([len(joints)] if joints else np.shape(arrays["position"])[-1:]))
+    for kind, values in {"time": time, **arrays}.items():
+        shape = every[:1] if kind == "time" else every
+        if values.shape != shape or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+            raise OsikValueError(
+                f"{os.fspath(path)}: {kind} has shape {values.shape}; expected {shape}, finite numbers"
+            )
     if len(time) < 2 or not (np.diff(time) > 0.0).all():
         back = int(np.argmax(np.diff(time) <= 0.0)) + 1 if len(time) > 1 else 0
         raise OsikValueError(f"{os.fspath(path)}: times have to increase, two or more; sample {back} does not")
@@ -163,35 +181,40 @@ def _from_npz(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
         for name in ("time", "position", "joints"):
             if name not in file:
                 raise _missing(path, name)
-        return file["time"], {kind: file[kind] for kind in _KINDS if kind in file}, [str(n) for n in file["joints"]]
+        joints = [str(name) for name in np.atleast_1d(file["joints"])]
+        return file["time"], {kind: file[kind] for kind in _KINDS if kind in file}, joints
 
 
 def _from_csv(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
-    with open(path, encoding="utf-8", newline="") as file:
-        head, *rows = list(csv.reader(file))
-    if "time" not in head:
+    table = read_columns(path)
+    if "time" not in table:
         raise _missing(path, "column time")
-    try:
-        values = np.array(rows, float)
-    except ValueError as error:
-        raise OsikValueError(f"{os.fspath(path)} cannot be read as a table of numbers: {error}") from error
-    joints = [name.partition(".")[2] for name in head if name.startswith("position.")]
+    joints = [name.removeprefix("position.") for name in table if name.startswith("position.")]
     if not joints:
         raise _missing(path, "columns position.JOINT")
-    columns = {kind: [head.index(f"{kind}.{name}") for name in joints if f"{kind}.{name}" in head] for kind in _KINDS}
-    arrays = {kind: values[:, own] for kind, own in columns.items() if len(own) == len(joints)}
-    return values[:, head.index("time")], arrays, joints
+    columns = {kind: [table[f"{kind}.{name}"] for name in joints if f"{kind}.{name}" in table] for kind in _KINDS}
+    arrays = {kind: np.column_stack(own) for kind, own in columns.items() if len(own) == len(joints)}
+    return table["time"], arrays, joints
 
 
 def _from_parquet(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
-    table = _pyarrow("parquet").read_table(path)
+    parquet = _pyarrow("parquet")
+    try:
+        table = parquet.read_table(path)
+    except ValueError as error:  # pyarrow's ArrowInvalid is one
+        raise OsikValueError(f"{os.fspath(path)} cannot be read as a Parquet file: {error}") from error
     for column in (_LEROBOT[0], _LEROBOT[2]):
         if column not in table.column_names:
             raise _missing(path, f"column {column}")
     given = {"position": _LEROBOT[0], "velocity": "velocity", "acceleration": "acceleration"}
-    arrays = {k: np.stack(table[name].to_numpy()) for k, name in given.items() if name in table.column_names}
+    arrays = {k: _rows(table[name].to_numpy()) for k, name in given.items() if name in table.column_names}
     names = (table.schema.metadata or {}).get(b"joints", b"").decode()
     return table[_LEROBOT[2]].to_numpy(), arrays, names.split("\n") if names else []
+
+
+def _rows(lists: np.ndarray) -> np.ndarray:
+    """Return lists of one length as the rows of an array, others as they are."""
+    return np.stack(list(lists)) if len({np.shape(one) for one in lists}) == 1 else lists
 
 
 def _pyarrow(part: str | None = None) -> Any:

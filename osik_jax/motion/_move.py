@@ -15,7 +15,7 @@ from ..inverse._inverse_kinematics import joint_box
 from ..numerics._arguments import as_floats, concrete
 from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
-from ._motion import Motion, at_rest_outside, sample_times
+from ._motion import Motion, at_rest_outside, one_axis, sample_times
 from ._retime import Limit, checked_limits
 from ._start import State, checked_state, rounding
 
@@ -40,7 +40,7 @@ class Move(eqx.Module):
 
     def at(self, time: Float[ArrayLike, " T"]) -> Float[Array, "4 T n"]:
         """Return positions, velocities, accelerations and jerks at times [s]; at rest outside of the motion."""
-        return _at(self, as_floats(time))
+        return _at(self, as_floats(one_axis(time)))
 
     def state(self, time: Float[ArrayLike, ""]) -> tuple[Array, Array, Array]:
         """Return position, velocity and acceleration at one time: the ``start`` of a move that goes on there."""

@@ -16,7 +16,8 @@ from ..control._checks import checked_start
 from ..numerics._arguments import as_floats, check_count, concrete
 from ..robot import Robot
 from ..robot._joint_selection import check_scalar_joints, dof_names
-from ._chunk import FEWEST, Chunk, chunk
+from ._chunk import FEWEST, Chunk, as_smoothing, chunk
+from ._motion import one_axis
 from ._retime import Limit, checked_limits
 
 
@@ -42,7 +43,7 @@ class Stream(eqx.Module):
 
     Raises:
         KeyError: no such joint.
-        ValueError: a latency or limits that are not positive, a configuration that is none.
+        ValueError: a latency, limits or a smoothing that are not positive, a configuration that is none.
 
     Attributes:
         running: the motion until ``after`` begins.
@@ -72,7 +73,7 @@ class Stream(eqx.Module):
     ):
         check_scalar_joints(robot, "a stream")
         self.robot, self.limits = robot, checked_limits(robot, velocity, acceleration, jerk, least_time=False)
-        self.latency, self.smoothing = as_floats(latency), as_floats(smoothing)
+        self.latency, self.smoothing = as_floats(latency), as_smoothing(smoothing)
         if (seen := concrete(self.latency)) is not None and not (seen.shape == () and seen > 0.0):
             raise OsikValueError(f"latency is {latency!r}; it is the positive time until a chunk takes over [s]")
         check_count("waypoints", waypoints, least=2)
@@ -117,7 +118,7 @@ class Stream(eqx.Module):
 
     def at(self, time: Float[ArrayLike, " T"]) -> Float[Array, "4 T n"]:
         """Return positions, velocities, accelerations and jerks at times [s], from the last push on."""
-        return _at(self.running, self.after, as_floats(time))
+        return _at(self.running, self.after, as_floats(one_axis(time)))
 
 
 @jax.jit

@@ -8,12 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from .._errors import OsikValueError
+from ..numerics._arguments import as_floats
 from ..numerics._dense import full_precision
 from ._cells import Cells
-from ._motion import Motion, at_rest_outside, sample_times
+from ._motion import Motion, at_rest_outside, one_axis, sample_times
 from ._spline import Spline
 
 _KINDS = "speed", "acceleration", "jerk"
@@ -57,9 +58,9 @@ class Timing(eqx.Module):
     wanted: Float[Array, ""] | None = None
     joints: tuple[str, ...] = eqx.field(default=(), static=True)
 
-    def at(self, time: Float[Array, " T"]) -> Float[Array, "4 T n"]:
+    def at(self, time: Float[ArrayLike, " T"]) -> Float[Array, "4 T n"]:
         """Return positions, velocities, accelerations and jerks at times [s]; at rest before 0 and after the end."""
-        return _at(self.path, self.progress, time)
+        return _at(self.path, self.progress, as_floats(one_axis(time)))
 
     def sample(self, dt: float) -> Motion:
         """Return the motion at times ``dt`` apart [s], the last of which is the end or just after it (outside jit)."""

@@ -59,11 +59,11 @@ def check_finite(value: Array, what: str) -> None:
         raise OsikValueError(f"{what} is {seen}; it has to be finite")
 
 
-def check_not_negative(value: Array, what: str) -> None:
-    """Raise ValueError unless a value is finite and not negative; traced values are not checked."""
+def check_not_negative(value: Array, what: str, *, finite: bool = True) -> None:
+    """Raise ValueError unless a value is not negative, and finite if wanted; traced values are not checked."""
     seen = concrete(value)
-    if seen is not None and not (np.isfinite(seen).all() and (seen >= 0.0).all()):
-        raise OsikValueError(f"{what} is {seen}; it has to be finite and not negative")
+    if seen is not None and not ((not finite or np.isfinite(seen).all()) and (seen >= 0.0).all()):
+        raise OsikValueError(f"{what} is {seen}; it has to be {'finite and ' if finite else ''}not negative")
 
 
 def as_bounds(lower: Any, upper: Any, rows: int, dtype: Any) -> tuple[Array | None, Array | None]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import mujoco
 import numpy as np
 
-from .._errors import OsikValueError
+from .._errors import OsikTypeError, OsikValueError
 from ..robot import Robot
 from ..robot._joint_selection import select_joints
 from ..robot._tree import BALL, FREE
@@ -38,6 +38,9 @@ class Servo:
 
 def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
     """Return a servo, effort filled in, for each independent joint but the free one, in the order of q."""
+    wrong = [servo for servo in given.values() if not isinstance(servo, Servo)]
+    if wrong:
+        raise OsikTypeError(f"a servo is {wrong[0]!r}; it is a Servo(stiffness, damping, effort)")
     chosen = {joint: servo for pattern, servo in given.items() for joint in select_joints(robot, pattern)}
     own, limits = _own_servos(robot.mj_model), _efforts(robot.mj_model)
     out: dict[str, Servo] = {}
@@ -57,12 +60,13 @@ def choose_servos(robot: Robot, given: Mapping[str, Servo]) -> dict[str, Servo]:
 
 
 def _own_servos(model: mujoco.MjModel) -> dict[int, Servo]:
-    """Return the position actuators of a model, by joint."""
+    """Return the position actuators of a model, by joint, as seen from the joint's side of their gears."""
     out = {}
     for joint, a in _actuators(model).items():
         gain, bias = float(model.actuator_gainprm[a][0]), model.actuator_biasprm[a]
-        if gain > 0.0 and bias[1] == -gain:
-            out[joint] = Servo(gain, -float(bias[2]))
+        if gain > 0.0 and bias[1] == -gain and model.actuator_gear[a, 0]:
+            squared = float(model.actuator_gear[a, 0]) ** 2  # the gear is in the position and in the effort
+            out[joint] = Servo(squared * gain, -squared * float(bias[2]))
     return out
 
 
@@ -79,7 +83,7 @@ def _efforts(model: mujoco.MjModel) -> list[float]:
     for j in range(model.njnt):
         ranges = [model.jnt_actfrcrange[j]] if model.jnt_actfrclimited[j] else []
         if j in actuators and model.actuator_forcelimited[actuators[j]]:
-            ranges.append(model.actuator_forcerange[actuators[j]])
+            ranges.append(model.actuator_forcerange[actuators[j]] * model.actuator_gear[actuators[j], 0])
         out.append(min((float(np.abs(r).min()) for r in ranges), default=math.inf))
     return out
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from .._errors import OsikValueError, unknown_name
 from ..robot._mujoco import mujoco_frame_pose, robot_com
-from ..robot._tree import FREE
 from ._world import World
 
 FALL_TILT, FALL_HEIGHT = math.radians(45.0), 0.6
@@ -63,12 +62,12 @@ class Simulation:
         self._upright = self._base()
 
     def _base(self) -> tuple[float, np.ndarray]:
-        """Return the height of the base over the floor [m], and the world's vertical in its axes.
+        """Return the height of the robot's base over the floor [m], and the world's vertical in its axes.
 
         Of a fixed base: 1 and up.
         """
-        free = np.flatnonzero(self.model.jnt_type == FREE)
-        if not len(free):
+        free = self.world.robot.tree.free_bases
+        if not free:
             return 1.0, np.array([0.0, 0.0, 1.0])
         body = self.model.jnt_bodyid[free[0]]
         return float(self.data.xpos[body, 2]) - self.world.floor, self.data.xmat[body].reshape(3, 3)[2].copy()

@@ -18,7 +18,8 @@ from ..robot import Robot
 from ..robot._guesses import with_corners
 from ..robot._mujoco import home_poses, model_bodies, mujoco_frame_pose
 from ..robot._tree import BALL, FREE
-from ..robot.loading._mjmodel import element_names
+from ..robot.loading._equalities import KINDS, is_in_tree
+from ..robot.loading._mjmodel import element_names, moving_arrays
 from ._servo import Servo, add_servo, choose_servos
 
 Feet = Mapping[str, ArrayLike] | Sequence[str]
@@ -67,7 +68,8 @@ def build_world(
     """Return a world with the robot on a floor.
 
     Masses, inertias, joint damping, armature and friction are those of ``robot.mj_model``, as MuJoCo compiled them; no
-    geometry of it collides. A follower of a mimic joint is geared to its leader, a locked joint held where it is.
+    geometry of it collides. A follower of a mimic joint is geared to its leader, a locked joint held where it is, and
+    closed loops are kept. Tendons are not.
 
     Args:
         robot: the robot.
@@ -75,7 +77,7 @@ def build_world(
             corners of the boxes that collide on the frame's body, else the sites ``NAME_corner_0``, ``NAME_corner_1``
             and so on. Default: all frames that have such sites. A robot that is bolted down needs none.
         servos: joint name or glob to its servo. Joints that are left out keep the position actuator of
-            ``robot.mj_model``: the embedded robots have one on every joint.
+            ``robot.mj_model``, its gear included: the embedded robots have one on every joint.
         friction: sliding friction between feet and floor.
         floor: its height [m]; default: that of the lowest contact point at ``robot.q0``.
         timestep: of the simulation [s].
@@ -93,13 +95,15 @@ def build_world(
     Raises:
         KeyError: no such frame or joint; the message lists those that exist.
         ValueError: a floating robot without contact points, a joint without a servo, a joint that no servo can turn
-            (ball), a locked joint that is free or ball, a robot without masses, or a number out of range.
+            (ball), a locked joint that is free or ball, a robot without masses, or with other numbers than
+            ``robot.mj_model``, or a number out of range.
     """
-    if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf):
+    if not (0.0 < timestep < math.inf and 0.0 <= friction < math.inf and math.isfinite(floor or 0.0)):
         raise OsikValueError(
-            f"timestep is {timestep} and friction {friction}; the one has to be positive, neither infinite"
+            f"timestep is {timestep}, friction {friction}, floor {floor}; the first has to be positive, all finite"
         )
     body_masses(robot)  # raises if there is no mass
+    _check_unedited(robot)
     points = _contact_points(robot, feet)
     drives = choose_servos(robot, servos or {})
     home = home_poses(robot)
@@ -113,9 +117,21 @@ def build_world(
     for foot, (_, rotation) in poses.items():
         _add_contacts(spec, bodies, robot, foot, points[foot], rotation, friction)
     _add_ties(spec, robot)
+    _add_constraints(spec, bodies, robot.mj_model)
     for joint, servo in drives.items():
         add_servo(spec, joint, servo)
     return World(robot, _compiled(spec, robot.mj_model), drives, points, height)
+
+
+def _check_unedited(robot: Robot) -> None:
+    """Raise ValueError for a robot whose bodies or joints are not those of its model."""
+    for field, values in moving_arrays(robot.mj_model).items():
+        own = np.asarray(values)
+        if not np.allclose(getattr(robot, field), own, rtol=1e-5, atol=1e-6 * np.abs(own).max()):
+            raise OsikValueError(
+                f"{field} of the robot is not that of robot.mj_model, which is what is simulated: take "
+                "Robot.from_mjcf(robot.to_mjcf()), and give servos=, for that keeps no actuators"
+            )
 
 
 def _contact_points(robot: Robot, feet: Feet | None) -> dict[str, Float[np.ndarray, "k 3"]]:
@@ -287,6 +303,24 @@ def _tie(spec: mujoco.MjSpec, joint: str, leader: str, constant: float, multipli
     tie = spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, name1=joint, name2=leader, **_GEARED)
     tie.objtype = mujoco.mjtObj.mjOBJ_JOINT
     tie.data[:5] = (constant, multiplier, 0.0, 0.0, 0.0)
+
+
+def _add_constraints(spec: mujoco.MjSpec, bodies: Sequence[mujoco.MjsBody], model: mujoco.MjModel) -> None:
+    """Add the model's equalities that are not in the robot's tree: closed loops, and joints coupled by polynomials."""
+    names = {kind: element_names(model, kind) for kind in ("body", "joint", "equality")}
+    kept = [e for e in range(model.neq) if int(model.eq_type[e]) in KINDS and not is_in_tree(model, e)]
+    on_sites = [e for e in kept if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE]
+    for s in {int(s) for e in on_sites for s in (model.eq_obj1id[e], model.eq_obj2id[e])}:
+        bodies[model.site_bodyid[s]].add_site(name=f"site{s}", pos=model.site_pos[s], quat=model.site_quat[s])
+    for e in kept:
+        kind, of = mujoco.mjtEq(int(model.eq_type[e])), mujoco.mjtObj(int(model.eq_objtype[e]))
+        ends = [int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e])]
+        on = names["joint" if KINDS[int(kind)] == "joint" else "body"]
+        first, second = (f"site{i}" if e in on_sites else on[i] if i >= 0 else "" for i in ends)
+        equality = spec.add_equality(name=names["equality"][e], type=kind, name1=first, name2=second)
+        equality.objtype, equality.active = of, bool(model.eq_active0[e])
+        equality.data[:], equality.solref[:] = model.eq_data[e], model.eq_solref[e]
+        equality.solimp[:] = model.eq_solimp[e]
 
 
 def _compiled(spec: mujoco.MjSpec, source: mujoco.MjModel) -> mujoco.MjModel:

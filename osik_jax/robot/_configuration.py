@@ -11,6 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from .._errors import OsikTypeError, OsikValueError, unknown_name, warn
+from ..numerics._arguments import check_finite
 from ..numerics._host import Numbers, module_of, on_host, replaced_at, to_jax
 from ._model import RobotModel
 from ._ranges import first_of, inside, joints_outside
@@ -30,6 +31,8 @@ def with_joints(robot: RobotModel, joints: Mapping[str, Any], base: Num[ArrayLik
     """Return ``q0`` (or ``base``) with the named joints set, unchecked."""
     q = on_host(robot.q0 if base is None else to_jax(base, robot.q0.dtype))
     offset, coefficient = on_host(robot.qpos_offset), robot.tree.qpos_source[1]
+    if not isinstance(joints, Mapping):
+        raise OsikTypeError(f"joints is {joints!r}; it maps names of joints to values, in radians or metres")
     for name, value in joints.items():
         joint = robot.tree.joint(name)
         if robot.tree.joint_types[joint] in (FREE, BALL):
@@ -38,6 +41,7 @@ def with_joints(robot: RobotModel, joints: Mapping[str, Any], base: Num[ArrayLik
             )
         if not isinstance(value, Tracer) and not _is_number(value):
             raise OsikTypeError(f"the value of joint {name!r} is {value!r}; it is one number, in radians or metres")
+        check_finite(value, f"the value of joint {name!r}")
         full, value = robot.tree.full_qpos_address[joint], on_host(value)
         index = robot.joint_qpos_index(name)
         q = replaced_at(q, index, (value - offset[full]) / coefficient[full])

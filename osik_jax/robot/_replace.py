@@ -22,8 +22,10 @@ from .loading._followers import match_names
 Rows = dict[str, int | slice]
 """Place of each name in an array: a row, or the entries of a joint."""
 
-_NOT_NEGATIVE = ("body_mass", "dof_armature")
-_MAY_BE_INFINITE = ("position_lower", "position_upper", "velocity_limit", "acceleration_limit")
+_LIMITS = "position_lower", "position_upper"
+_RATES = "velocity_limit", "acceleration_limit"
+_ROUNDING = 1e-6
+"""Fraction of a body's greatest moment of inertia by which rounding may break symmetry, or make a moment negative."""
 Factors = Mapping[str, Float[Array, ""] | float] | Float[Array, ""] | float
 
 
@@ -38,7 +40,10 @@ def replaced_leaves(robot: RobotModel, values: Mapping[str, Any]) -> dict[str, A
         if field not in fields:
             raise unknown_name("field", field, fields)
     found = {field: _replaced(robot, field, value) for field, value in values.items()}
-    check_bounds(*(found.get(field, getattr(robot, field)) for field in _MAY_BE_INFINITE[:2]))
+    check_bounds(*(found.get(field, getattr(robot, field)) for field in _LIMITS))
+    offset = concrete(found.get("qpos_offset", np.zeros(robot.qpos_offset.shape)))
+    if offset is not None and offset[robot.tree.own_qpos].any():
+        raise OsikValueError(f"qpos_offset is of locked joints and followers; it is 0 for {robot.tree.dof_owners}")
     return found
 
 
@@ -117,10 +122,7 @@ def _checked(field: str, value: Any, shape: tuple[int, ...], dtype: Any, what: s
     new = as_array(value, what, dtype)
     if new.shape != shape:
         raise OsikValueError(f"{what} has shape {new.shape}, expected {shape}. Batch with jax.vmap.")
-    check = (
-        check_not_negative if field in _NOT_NEGATIVE else check_not_nan if field in _MAY_BE_INFINITE else check_finite
-    )
-    check(new, what)
+    _CHECKS.get(field, check_finite)(new, what)
     exact = _EXACT.get(field)
     return on_host(exact(new, what) if exact else new)
 
@@ -134,6 +136,30 @@ def _unit(axes: Numbers, what: str) -> Numbers:
         raise OsikValueError(f"{what} is an axis of length 0; it is a direction, of any other length")
     return axes / xp.sqrt(squared)
 
+
+def _check_rate(rate: Array, what: str) -> None:
+    check_not_negative(rate, what, finite=False)
+
+
+def _check_inertia(inertia: Array, what: str) -> None:
+    """Raise ValueError unless concrete tensors are finite, symmetric, and have no negative moment."""
+    check_finite(inertia, what)
+    seen = concrete(inertia)
+    if seen is None:
+        return
+    rounding = _ROUNDING * np.abs(seen).max(axis=(-1, -2), keepdims=True)
+    moments = np.linalg.eigvalsh(seen)[..., None]
+    if (np.abs(seen - seen.swapaxes(-1, -2)) > rounding).any() or (moments < -rounding).any():
+        raise OsikValueError(f"{what} is {seen}; it has to be symmetric, without negative moments of inertia")
+
+
+_CHECKS = {
+    **dict.fromkeys(("body_mass", "dof_armature"), check_not_negative),
+    **dict.fromkeys(_LIMITS, check_not_nan),
+    **dict.fromkeys(_RATES, _check_rate),
+    "body_inertia": _check_inertia,
+}
+"""Checks of numbers; those of other arrays have to be finite."""
 
 _EXACT = {
     "body_quaternion": exact_quaternion,

@@ -296,8 +296,8 @@ class Robot(RobotModel):
         Raises:
             KeyError: no such array or name; the message lists those that exist.
             TypeError: no numbers.
-            ValueError: a wrong shape; a name given twice; not finite, a negative mass, a lower limit above the upper
-                one, no rotation; a stack of robots.
+            ValueError: a wrong shape; a name given twice; not finite, a negative mass or rate, a lower limit above the
+                upper one, no inertia, no rotation; an offset of a joint of q; a stack of robots.
         """
         return dataclasses.replace(self, **replaced_leaves(self, values))
 
@@ -348,7 +348,8 @@ class Robot(RobotModel):
         loops and the robot's effort limits, written as 0. An infinite limit of a slide is written as 1e9.
 
         Raises:
-            ValueError: a stack of robots, or a ball joint, which URDF does not have.
+            ValueError: a stack of robots, or what URDF does not have: a ball joint, or a greatest speed or acceleration
+                of 0.
         """
         return _written(loading.to_urdf(self), path)
 

@@ -124,10 +124,8 @@ class _Job:
 
     def inputs(self, k: int) -> Any:
         """Return the inputs of a chunk, padded."""
-        missing = self.chunk - self.size(k)
-        return jax.tree.map(
-            lambda a: np.concatenate([a, np.repeat(a[-1:], missing, 0)]) if missing else a, self.lanes(k)
-        )
+        places = np.minimum(np.arange(self.chunk), self.size(k) - 1)
+        return jax.tree.map(lambda a: a[places] if self.size(k) < self.chunk else a, self.lanes(k))
 
     def run(self, k: int) -> Any:
         """Return the results of a chunk, perhaps still being computed."""
@@ -139,7 +137,7 @@ class _Job:
         return {
             "format": FORMAT,
             "osik_jax": version("osik-jax"),
-            "label": label,
+            "label": str(label),
             "count": self.count,
             "chunk": self.chunk,
             "x64": bool(jax.config.read("jax_enable_x64")),

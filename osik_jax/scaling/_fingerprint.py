@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ..batching._names import leaf_names
@@ -16,10 +17,7 @@ from ..batching._names import leaf_names
 
 def fingerprint(tree: Any) -> dict[str, str]:
     """Return kind, shape and a hash of each array of a pytree, by name; and of its structure, under "structure"."""
-    found = {
-        name or "it": _described(np.asarray(leaf))
-        for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True)
-    }
+    found = {name or "it": _described(leaf) for name, leaf in zip(leaf_names(tree), jax.tree.leaves(tree), strict=True)}
     structure = re.sub(r"0x[0-9a-f]+", "", str(jax.tree.structure(tree)))  # less addresses of objects
     return found | {"structure": _digest(structure.encode())}
 
@@ -29,9 +27,12 @@ def identifier(manifest: Mapping[str, Any]) -> str:
     return _digest(json.dumps(manifest, sort_keys=True).encode())
 
 
-def _described(array: np.ndarray) -> str:
+def _described(leaf: Any) -> str:
+    kind = getattr(leaf, "dtype", None)
+    keys = kind is not None and jnp.issubdtype(kind, jax.dtypes.prng_key)
+    array = np.asarray(jax.random.key_data(leaf) if keys else leaf)
     shape = "x".join(str(n) for n in array.shape) or "scalar"
-    return f"{array.dtype} {shape} {_digest(np.ascontiguousarray(array).reshape(-1).view(np.uint8))}"
+    return f"{kind if keys else array.dtype} {shape} {_digest(np.ascontiguousarray(array).reshape(-1).view(np.uint8))}"
 
 
 def _digest(data: Any) -> str:

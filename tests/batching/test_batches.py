@@ -192,6 +192,15 @@ class TestNames:
         refuses(ValueError, message, osik.batched, tasks, values)
 
 
+def test_lists_of_numbers_are_arrays_and_iterators_stack():
+    """A whole number becomes a batch of the numbers that are given; a list of arrays is still one for each."""
+    tree = {"n": 1, "w": jnp.ones(2)}
+    found = osik.batched(tree, {"n": [0.5, 1.5], "w": [[1.0, 2.0], [3.0, 4.0]]})
+    np.testing.assert_array_equal(found["n"], [0.5, 1.5])
+    np.testing.assert_array_equal(found["w"], [[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(osik.stack({"a": x} for x in (1.0, 2.0))["a"], [1.0, 2.0])
+
+
 class TestWhatDoesNotStack:
     def test_priorities(self, arm, tasks):
         other = {**tasks, "elbow": osik.FrameTask(arm, "link4", rows="position", gain=3.0, priority=1)}

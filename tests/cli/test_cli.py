@@ -177,6 +177,8 @@ def test_ik_finds_a_configuration_or_says_what_stops_it(arm, capsys):
     assert cli.main(["ik", "arm7", "--frame", "hand", "--position", "4", "0", "0", "--seeds", "2"]) == 1
     assert "out of reach" in capsys.readouterr().out
     assert "no frame 'hnd'" in refused(capsys, "ik", "arm7", "--frame", "hnd", "--position", "0", "0", "0")
+    both = "--frame", "hand", "--position", "0", "0", "0", "--hold", "hand"
+    assert "both name 'hand'" in refused(capsys, "ik", "arm7", *both)
 
 
 SCENE = """<mujoco><worldbody>

@@ -68,13 +68,50 @@ def test_parquet_needs_its_extra(tmp_path, monkeypatch) -> None:
         ("time,position.a\n0,1\n", "two or more"),
         ("a,b\n0,1\n", "no column time"),
         ("time,a\n0,1\n", "no columns position.JOINT"),
-        ("time,position.a\n0,x\n", "cannot be read as a table of numbers"),
+        ("time,position.a\n0,x\n", "line 2, column position.a: 'x' is no finite number"),
+        ("time,position.a\n0,nan\n1,2\n", "column position.a: 'nan' is no finite number"),
+        ("", "at least one line of numbers"),
+        ("time,position.a\n", "at least one line of numbers"),
+        ("time,position.a,position.a\n0,1,3\n1,2,4\n", "different names"),
     ],
 )
 def test_what_is_no_motion_is_refused(tmp_path, text, message) -> None:
     (tmp_path / "motion.csv").write_text(text)
-    with pytest.raises(osik.OsikError, match=message):
-        load_motion(tmp_path / "motion.csv")
+    refuses(osik.OsikError, message, load_motion, tmp_path / "motion.csv")
+
+
+def test_marks_and_blank_lines_of_spreadsheets_are_read_over(tmp_path) -> None:
+    (tmp_path / "motion.csv").write_text("\ufefftime,position.a\n0,1\n1,2\n\n", encoding="utf-8")
+    np.testing.assert_array_equal(load_motion(tmp_path / "motion.csv").position, [[1.0], [2.0]])
+
+
+GOOD: dict[str, Any] = dict(time=np.arange(3.0), position=np.zeros((3, 2)), joints=np.array(["a", "b"]))
+
+
+@pytest.mark.parametrize(
+    "wrong, message",
+    [
+        (dict(position=np.zeros((2, 2))), r"position has shape \(2, 2\); expected \(3, 2\)"),
+        (dict(joints=np.array(["a"])), r"position has shape \(3, 2\); expected \(3, 1\)"),
+        (dict(velocity=np.zeros((3, 1))), "velocity has shape"),
+        (dict(acceleration=np.full((3, 2), np.nan)), "acceleration .* finite numbers"),
+        (dict(position=np.full((3, 2), "x")), "position .* finite numbers"),
+        (dict(time=np.array(1.0)), "time has shape"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(tmp_path, wrong, message) -> None:
+    np.savez(tmp_path / "motion.npz", **(GOOD | wrong))
+    refuses(osik.OsikError, message, load_motion, tmp_path / "motion.npz")
+
+
+def test_parquet_that_is_none_is_refused(tmp_path) -> None:
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "a.parquet").write_text("hello")
+    refuses(osik.OsikError, "cannot be read as a Parquet file", load_motion, tmp_path / "a.parquet")
+    for states, message in (([[0.0], [0.0, 1.0]], "position has shape"), ([0.0, 1.0], r"\(2,\); expected \(2, 2\)")):
+        table = arrow.table({"observation.state": states, "timestamp": [0.0, 1.0]})
+        parquet.write_table(table, tmp_path / "b.parquet")
+        refuses(osik.OsikError, message, load_motion, tmp_path / "b.parquet")
 
 
 def test_other_ends_of_names_are_refused(tmp_path) -> None:

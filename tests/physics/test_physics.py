@@ -219,12 +219,77 @@ def test_mistakes_are_told(nao, arm, arm_world):
     refuses(ValueError, "stiffness has to be positive", physics.Servo, 0.0, 1.0)
     refuses(ValueError, "effort has to be positive", physics.Servo, 1.0, 1.0, 0.0)
     refuses(ValueError, "timestep", physics.build_world, arm, timestep=0.0)
+    refuses(ValueError, "floor nan", physics.build_world, arm, floor=np.nan)
+    refuses(TypeError, r"a servo is \(600, 5\)", physics.build_world, arm, servos={"*": (600, 5)})
+    refuses(ValueError, "body_mass of the robot is not", physics.build_world, arm.scaled(mass=2.0))
+    refuses(ValueError, "joint_axis .*to_mjcf", physics.build_world, arm.replace(joint_axis={"joint2": (1, 0, 0)}))
     simulation = physics.Simulation(arm_world)
     refuses(ValueError, "no whole number of timesteps", simulation.step, arm.q0, 0.0015)
     refuses(ValueError, "joint2 is not finite", simulation.step, arm.q0.at[1].set(np.nan), DT)
     refuses(KeyError, "bodies: link0", simulation.push, "torso", (1.0, 0.0, 0.0))
     posture = {"posture": osik.PostureTask(arm, weight=1.0)}
     refuses(ValueError, "one step", physics.simulate, simulation, posture, scheme=osik.WeightedQP(), dt=DT, steps=0)
+
+
+def test_geared_actuators_are_those_of_the_model():
+    """A weight on a geared servo, beside MuJoCo's own simulation, which takes its target behind the gear."""
+    text = """<mujoco><worldbody><body><joint name="j" axis="0 1 0"/><geom size=".05" pos=".3 0 0" mass="1"/></body>
+    </worldbody><actuator><position joint="j" kp="10" kv="1" gear="-5" forcerange="-2 2"/></actuator></mujoco>"""
+    robot = osik.Robot.from_mjcf(text)
+    simulation = physics.Simulation(physics.build_world(robot, timestep=0.002))
+    model = mujoco.MjModel.from_xml_string(
+        text.replace("<worldbody>", '<option integrator="implicitfast"/><worldbody>')
+    )
+    data = mujoco.MjData(model)
+    for target in (0.0, 1.5):  # the second one needs more than the greatest effort at first
+        data.ctrl[:] = -5.0 * target
+        mujoco.mj_step(model, data, 50)
+        simulation.step(np.array([target]), 0.1)
+        np.testing.assert_allclose(simulation.data.qpos, data.qpos, rtol=1e-9)
+    assert simulation.world.servos["j"] == physics.Servo(250.0, 25.0, 10.0)
+
+
+LOOPS = """<mujoco><worldbody>
+<body name="a"><joint name="j1" axis="0 1 0" ref="0.1"/><geom size=".1"/><site name="s" pos=".1 0 .2"/>
+<body name="b" pos=".2 0 0"><joint name="j2" axis="0 1 0"/><geom size=".1"/><site name="e" pos=".2 0 0"/></body></body>
+<body name="c" pos=".2 0 .2"><joint name="j3" axis="0 1 0"/><geom size=".1"/><site name="f" pos=".2 0 -.2"/></body>
+<body name="d" pos=".4 0 0"><joint name="j4" axis="0 1 0"/><geom size=".1"/></body>
+<body name="loose" pos="2 0 1"><freejoint/><geom size=".1"/></body>
+</worldbody><equality>{}</equality><actuator><position joint="j1" kp="100" kv="5"/></actuator></mujoco>"""
+
+
+def test_loops_are_closed(rng):
+    """Violations and their Jacobian at any configuration are those of the model, and the loop does not come apart."""
+    kinds = """<connect name="ends" site1="e" site2="f" solref="0.01 1"/><connect body1="b" body2="d" anchor=".1 0 0"/>
+    <weld body1="a" body2="c" relpose=".1 .2 .3 .8 .6 0 0" torquescale="2"/><weld site1="s" site2="f" active="false"/>
+    <joint joint1="j3" joint2="j4" polycoef=".1 1 .5 0 0"/>"""
+    with pytest.warns(osik.OsikWarning, match="does not keep all"):
+        robot = osik.Robot.from_mjcf(LOOPS.format(kinds))
+    world = physics.build_world(robot, servos={"j*": physics.Servo(10.0, 1.0)})
+    np.testing.assert_array_equal(world.model.eq_solref, robot.mj_model.eq_solref)
+    qpos, seen = rng.standard_normal(world.model.nq), []
+    for model in (robot.mj_model, world.model):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.eq_active[:] = qpos, 1
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        mujoco.mj_forward(model, data)
+        assert data.ne == 3 + 3 + 6 + 6 + 1
+        seen.append((data.efc_pos[: data.ne], data.efc_J.ravel()[: data.ne * model.nv]))
+    for own, there in zip(*seen, strict=True):
+        np.testing.assert_allclose(there, own, atol=1e-13)
+    with pytest.warns(osik.OsikWarning, match="does not keep all"):
+        alone = osik.Robot.from_mjcf(LOOPS.format('<connect site1="e" site2="f"/>'))
+    weak = {"j2": physics.Servo(100.0, 5.0), "j[34]": physics.Servo(1e-3, 0.1)}
+    simulation = physics.Simulation(physics.build_world(alone, servos=weak))
+    simulation.step(alone.q0, 1.0)
+    np.testing.assert_allclose(simulation.frame_pose("e")[0], simulation.frame_pose("f")[0], atol=1e-3)
+
+
+def test_a_loose_object_falls_and_not_the_robot():
+    robot = osik.Robot.from_mjcf(LOOPS.format(""))
+    simulation = physics.Simulation(physics.build_world(robot, servos={"j*": physics.Servo(100.0, 5.0)}))
+    simulation.step(robot.q0, 1.0)
+    assert simulation.data.body("loose").xpos[2] < -1.0 and not robot.floating_base and not simulation.fallen()
 
 
 def test_joints_without_a_servo_are_named():

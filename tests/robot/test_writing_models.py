@@ -159,3 +159,10 @@ def test_a_locked_base_stands_where_it_was():
         for a, b in zip(poses(robot, q)[:2], poses(again, q)[:2], strict=True):
             np.testing.assert_allclose(b[0, again.tree.frame(name)], a[0, robot.tree.frame(name)], rtol=0.0, atol=1e-15)
     np.testing.assert_allclose(again.body_mass.sum(), robot.body_mass[2], rtol=1e-15)
+
+
+def test_a_speed_of_zero_is_kept():
+    held = osik.load_robot("arm7").replace(velocity_limit={"joint2": 0.0}, acceleration_limit={"joint3": 0.0})
+    again = Robot.from_mjcf(held.to_mjcf())
+    np.testing.assert_array_equal(again.velocity_limit, held.velocity_limit)
+    np.testing.assert_array_equal(again.acceleration_limit, held.acceleration_limit)

@@ -88,5 +88,13 @@ def test_inertias_come_back():
 def test_what_urdf_cannot_say_is_refused():
     refuses(ValueError, "joint 'ball' is a ball joint: URDF has none", Robot.from_mjcf(mjcf("odd")).to_urdf)
     refuses(ValueError, "a stack of robots", osik.stack([osik.load_robot("arm7")] * 2).to_urdf)
+    held = osik.load_robot("arm7").replace(acceleration_limit={"joint2": 0.0})
+    refuses(ValueError, "joint 'joint2' is limited to 0, which URDF reads as unknown: lock", held.to_urdf)
     moved = osik.load_robot("arm7").replace(frame_position={"link7": (0.0, 0.0, 0.1)})
     refuses(ValueError, "frame 'link7' is a body or geom of its own and not where that is", moved.to_urdf)
+
+
+def test_fixed_joints_do_not_take_the_names_of_others():
+    text = """<mujoco><worldbody><body><joint name="tip_fixed" axis="0 0 1"/><geom size=".1"/><site name="tip"/></body>
+    </worldbody></mujoco>"""
+    assert Robot.from_urdf(Robot.from_mjcf(text).to_urdf()).joint_names == ("tip_fixed",)

@@ -212,6 +212,17 @@ def test_a_job_of_numpy_that_is_done(tmp_path):
         np.testing.assert_array_equal(found["[1][0]"], np.stack([X[5:7]] * 2, -1))
 
 
+def test_typed_keys_are_lanes_like_others(tmp_path):
+    """In the batch and in ``shared``; other keys are another job."""
+    keys, draw = jax.random.split(jax.random.key(0), 20), jax.vmap(lambda key, add: jax.random.normal(key, (2,)) + add)
+    function = jax.jit(lambda keys, key: draw(keys, jnp.broadcast_to(jax.random.normal(key), keys.shape)))
+    expected = function(keys, jax.random.key(1))
+    for folder in (None, tmp_path):
+        found = run(folder, function, keys, chunk=8, shared=(jax.random.key(1),))
+        np.testing.assert_array_equal(found if folder is None else found[:][""], expected)
+    refuses(ValueError, "shared.* was key<fry>", run, tmp_path, function, keys, chunk=8, shared=(jax.random.key(2),))
+
+
 @pytest.mark.parametrize(
     ("function", "message"),
     [

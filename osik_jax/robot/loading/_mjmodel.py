@@ -132,11 +132,7 @@ def from_mjmodel(
     report = LoadReport(note for note in found if note.name not in {names[j] for j in locked})
     _warn_of_report(report)
     arrays = dict(
-        **_body_arrays(model, bodies, placement),
-        joint_position=model.jnt_pos,
-        joint_axis=model.jnt_axis,
-        dof_armature=model.dof_armature,
-        joint_reference=model.qpos0,
+        **moving_arrays(model),
         frame_position=[frame.pose.position for frame in frames.values()],
         frame_rotation=[frame.pose.rotation for frame in frames.values()],
         **_geom_arrays(model, placement, mesh_places),
@@ -149,6 +145,12 @@ def from_mjmodel(
     )
     holder = ModelHolder(model, report, tuple(meshes), look, path)
     return RobotModel(tree=tree, holder=holder, **{k: to_jax(v, float) for k, v in arrays.items()})
+
+
+def moving_arrays(model: mujoco.MjModel) -> dict[str, ArrayLike]:
+    """Return the numbers of the moving bodies and of all joints, by field of ``RobotModel``."""
+    joints = dict(joint_position=model.jnt_pos, joint_axis=model.jnt_axis, joint_reference=model.qpos0)
+    return {**_body_arrays(model, *_moving_bodies(model)), **joints, "dof_armature": model.dof_armature}
 
 
 def element_names(model: mujoco.MjModel, kind: Literal["body", "joint", "equality"]) -> tuple[str, ...]:
@@ -299,10 +301,10 @@ def _rates(
     out = np.full(len(names), np.inf)
     if not isinstance(given, Mapping):
         raise OsikTypeError(f"{what}_limits is {given!r}; it maps joint names or globs to numbers")
-    for pattern, value in (*own.items(), *given.items()):
+    for pattern, value in (*own.items(), *given.items()):  # a robot's own 0 holds the joint; a given one is a mistake
         for joint in match_names("joint", pattern, names):
             limit = number(value, f"the {what} limit of joint {names[joint]!r}")
-            if not limit > 0.0:
+            if not (limit > 0.0 or limit == 0.0 == own.get(names[joint])):
                 raise OsikValueError(f"the {what} limit of joint {names[joint]!r} is {value}; it has to be positive")
             out[joint] = limit
     return out

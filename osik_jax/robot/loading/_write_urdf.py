@@ -38,7 +38,7 @@ def to_urdf(robot: RobotModel) -> str:
         done |= _add_geom(robot, geom, links[tree.body_names[body]])
     for name, body, pose in other_frames(robot, done):
         put(root, "link", name=name)
-        _add_joint(root, f"{name}_fixed", "fixed", tree.body_names[body], name, pose)
+        _add_joint(root, free_name(f"{name}_fixed", tree.joint_names), "fixed", tree.body_names[body], name, pose)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -67,7 +67,7 @@ def _add_body(robot: RobotModel, body: int, root: ElementTree.Element) -> None:
         _add_moving(robot, place.joint, element, place.axis)
         parent = child
     if parent != name:
-        _add_joint(root, f"{name}_fixed", "fixed", parent, name, pose)
+        _add_joint(root, free_name(f"{name}_fixed", tree.joint_names), "fixed", parent, name, pose)
 
 
 def _base_link(robot: RobotModel) -> int | None:
@@ -98,6 +98,8 @@ def _limits(robot: RobotModel, joint: int) -> tuple[float, float, float, float]:
     name, dof = robot.tree.joint_names[joint], robot.tree.dofs(joint)
     fields = "position_lower", "position_upper", "velocity_limit", "acceleration_limit"
     low, high, speed, acceleration = (one_for_all(getattr(robot, field)[dof], name, field) for field in fields)
+    if min(speed, acceleration) == 0.0:
+        raise OsikValueError(f"a rate of joint {name!r} is limited to 0, which URDF reads as unknown: lock the joint")
     return low, high, speed, acceleration
 
 
