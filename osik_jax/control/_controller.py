@@ -13,7 +13,7 @@ from jaxtyping import ArrayLike, Float, Num
 from .._errors import OsikTypeError
 from ..kinematics import integrate
 from ..kinematics._manifold import plain_integration
-from ..limits import Limits
+from ..limits import Limit, Limits
 from ..numerics._host import is_traced
 from ..robot import Robot
 from ..schemes import Scheme
@@ -72,7 +72,7 @@ class Controller:
         check_setting("Controller(robot, tasks)", robot, scheme, dt)
         check_tasks(tasks, robot)
         self.robot, self.tasks, self.dt = robot, dict(tasks), dt if is_traced(dt) else float(dt)
-        self.limits: Limits = limits or ()
+        self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
         self._velocity: Any = None
         self._started = False
         self._chosen: Scheme | None = scheme_for(tasks, robot.q0.dtype) if scheme is None else None

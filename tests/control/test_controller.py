@@ -252,7 +252,7 @@ def test_exchanged_parts_of_a_controller_are_seen(arm: osik.Robot) -> None:
     controller.scheme = osik.NullSpace()  # where none was given, too
     slow = (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
     for limits in ((), slow, osik.no_limits):
-        controller.limits = limits
+        controller.limits = limits  # pyright: ignore[reportAttributeAccessIssue]  # as the constructor takes them
         assert_same(controller.step(q), compiled(arm, q, tasks, scheme=osik.NullSpace(), limits=limits))
         assert controller._plain.is_of(*list(controller)[:4])  # pyright: ignore[reportOptionalMemberAccess]
     controller = osik.Controller(arm, tasks, dt=DT)
