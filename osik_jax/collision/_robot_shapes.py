@@ -54,11 +54,10 @@ def robot_shapes(robot: Robot, srdf: Given = None) -> RobotShapes:
         raise OsikTypeError("a robot that is traced has no shapes: make them outside of jit, from the robot itself")
     if srdf is True:
         srdf = srdf_beside(robot.holder.path)
-    with jax.ensure_compile_time_eval():  # the call may stand inside a program that has the robot as a constant
-        if srdf is None or isinstance(srdf, Srdf):
-            return _made(robot, srdf)
-        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
-        return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
+    if srdf is None or isinstance(srdf, Srdf):
+        return _made(robot, srdf)
+    is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
+    return _made(robot, None, srdf=srdf if is_text else _stamped(srdf, "SRDF"))
 
 
 def covering_spheres(robot: Robot, given: Spheres | str | os.PathLike[str] | None = None) -> CoveringSpheres:
@@ -100,6 +99,7 @@ def _stamped(path: Any, kind: str) -> tuple[str, int]:
 
 
 @remembered
+@jax.ensure_compile_time_eval()  # the call may stand inside a program that has the robot as a constant
 def _made(robot: Robot, rules: Srdf | None, *, srdf: str | tuple[str, int] | None = None) -> RobotShapes:
     rules = rules if srdf is None else read_srdf(srdf if isinstance(srdf, str) else srdf[0])
     found, solid, shapes = _solid(robot)
