@@ -151,7 +151,7 @@ class Controller:
         self.limits = checked_limits(self.robot, self.limits) or ()
         if is_traced((self.robot, dict(self.tasks), self.scheme, self.limits, self.dt)):
             raise OsikTypeError(_TRACED)
-        if self.scheme is self._chosen:
+        if self.scheme is None or self.scheme is self._chosen:
             chosen = scheme_for(self.tasks, self.robot.q0.dtype)
             self.scheme = self._chosen = self.scheme if type(chosen) is type(self.scheme) else chosen
         warn_of_tasks(self.robot, self.robot.q0, self.tasks, self.scheme, self.dt)

@@ -214,7 +214,8 @@ class PlainStep(Checked):
         """Return whether the arguments have the structure that was laid out."""
         structure = jax.tree.structure
         same = {name: structure(task) for name, task in tasks.items()} == self._structures
-        same = same and structure((robot, with_own_limits(robot, _given(limits)))) == self._structure
+        bounds = None if self._has(robot, limits) else with_own_limits(robot, _given(limits))
+        same = same and (bounds is None or structure((robot, bounds)) == self._structure)
         return same and structure(scheme) == self._scheme_structure and self.fits(tasks)
 
     def fits(self, tasks: Mapping[str, Task]) -> bool:

@@ -104,6 +104,11 @@ def _rotation(given: Float[Numbers, "3 3"] | Float[Numbers, "4"], what: str) -> 
 def check_last_row(matrix: Float[Numbers, "*B 4 4"]) -> None:
     """Raise ValueError unless the last row of each matrix is 0 0 0 1; traced values are not checked."""
     seen = concrete(matrix)
-    for row in () if seen is None else seen[..., 3, :].reshape(-1, 4):
-        if not np.abs(row - [0.0, 0.0, 0.0, 1.0]).max() < _LAST_ROW:
-            raise OsikValueError(f"the last row of a pose's matrix is 0 0 0 1, got {row}; is it transposed?")
+    if seen is None:
+        return
+    rows = seen[..., 3, :].reshape(-1, 4)
+    wrong = ~(np.abs(rows - [0.0, 0.0, 0.0, 1.0]).max(-1) < _LAST_ROW)
+    if wrong.any():
+        raise OsikValueError(
+            f"the last row of a pose's matrix is 0 0 0 1, got {rows[wrong.argmax()]}; is it transposed?"
+        )

@@ -186,7 +186,7 @@ def _from_npz(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
 
 
 def _from_csv(path: Any) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
-    table = read_columns(path)
+    table = read_columns(path, used=lambda name: name == "time" or name.split(".")[0] in _KINDS)
     if "time" not in table:
         raise _missing(path, "column time")
     joints = [name.removeprefix("position.") for name in table if name.startswith("position.")]

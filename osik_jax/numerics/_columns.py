@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -12,11 +12,14 @@ from jaxtyping import Float
 from .._errors import OsikValueError
 
 
-def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> dict[str, Float[np.ndarray, " n"]]:
+def read_columns(
+    path: str | os.PathLike[str], unnamed: Sequence[str] = (), used: Callable[[str], bool] = bool
+) -> dict[str, Float[np.ndarray, " n"]]:
     """Return the finite numbers of a CSV file by the names of its columns; lines that begin with # are left out.
 
     The head names the columns; ``unnamed`` does so for a file that begins with numbers. Lines without any number, and
-    empty cells behind the last column, are those of a spreadsheet.
+    empty cells behind the last column, are those of a spreadsheet. Columns whose names are not ``used`` may hold
+    anything.
     """
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
@@ -28,27 +31,29 @@ def read_columns(path: str | os.PathLike[str], unnamed: Sequence[str] = ()) -> d
     names = [name.strip() for name in lines[0][1]] if lines else []
     while names and not names[-1]:
         names.pop()
-    if len(lines) < 2 or len(set(names)) < len(names):
+    places = [k for k, name in enumerate(names) if used(name) or not name]
+    taken = [names[k] for k in places]
+    if len(lines) < 2 or len(set(taken)) < len(taken):
         raise OsikValueError(f"{path}: a head with different names and at least one line of numbers are expected")
-    table = np.array([_numbers(f"{path}, line {number}", row, names) for number, row in lines[1:]])
-    return dict(zip(names, table.T, strict=True))
+    table = np.array([_numbers(f"{path}, line {number}", row, names, places) for number, row in lines[1:]])
+    return dict(zip(taken, table.T, strict=True))
 
 
 def _says_something(row: Sequence[str]) -> bool:
     return any(cell.strip() for cell in row) and not row[0].startswith("#")
 
 
-def _numbers(where: str, row: Sequence[str], names: Sequence[str]) -> list[float]:
-    """Return the numbers of a line; ``where`` names it in messages."""
+def _numbers(where: str, row: Sequence[str], names: Sequence[str], places: Sequence[int]) -> list[float]:
+    """Return the numbers of a line at some places; ``where`` names it in messages."""
     if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
         raise OsikValueError(
             f"{where}: {len(row)} values, but there are {len(names)} headings; each line has {len(names)} numbers"
         )
-    values = [as_number(cell) for cell in row[: len(names)]]
-    for name, value, cell in zip(names, values, row, strict=False):
+    values = [as_number(row[k]) for k in places]
+    for k, value in zip(places, values, strict=True):
         if not np.isfinite(value):
             raise OsikValueError(
-                f"{where}, column {name}: {cell!r} is no finite number; each line has {len(names)} numbers"
+                f"{where}, column {names[k]}: {row[k]!r} is no finite number; each line has {len(names)} numbers"
             )
     return values
 

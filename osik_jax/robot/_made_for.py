@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
+from collections.abc import Callable
 from functools import cache
 from typing import Any, Self
 
@@ -53,7 +54,11 @@ def check_robot(robot: Any, where: str) -> None:
 def check_single(part: eqx.Module, what: str) -> None:
     """Raise ValueError for a stack: a leaf with more axes than the annotation of its field says."""
     for name, most in _most_axes(type(part)):
-        for leaf in jax.tree.leaves(getattr(part, name)):
+        value = getattr(part, name)
+        if isinstance(value, eqx.Module):
+            check_single(value, f"{what}.{name}")
+            continue
+        for leaf in jax.tree.leaves(value):
             if np.ndim(leaf) > most:
                 raise OsikValueError(
                     f"{what} is a stack, or has too many axes: its {name} has shape {np.shape(leaf)}. "
@@ -62,24 +67,27 @@ def check_single(part: eqx.Module, what: str) -> None:
 
 
 @cache
-def _most_axes(cls: type) -> list[tuple[str, int]]:
+def _most_axes(cls: type) -> list[tuple[str, float]]:
     """Return the fields of a class whose annotations say how many axes their arrays have, with the largest number."""
     try:
         hints = typing.get_type_hints(cls)
-    except NameError:  # a name that only type checkers see
-        return []
-    found = []
-    for name, hint in hints.items():
-        arrays = [one for one in _parts(hint) if hasattr(one, "dims")]
-        if arrays and all(getattr(one, "index_variadic", 0) is None for one in arrays):
-            found.append((name, max(len(one.dims) for one in arrays)))
-    return found
+    except Exception:  # a user's annotation may say anything, or what only type checkers see
+        return _most_axes(cls.__base__) if cls.__base__ else []
+    most = {name: max(map(_axes, _parts(hint))) for name, hint in hints.items()}
+    return [(name, axes) for name, axes in most.items() if 0 <= axes < np.inf]
 
 
 def _parts(hint: Any) -> list[Any]:
     """Return the types that a union or a tuple is made of."""
-    inner = typing.get_args(hint)
+    inner = () if typing.get_origin(hint) is Callable else typing.get_args(hint)
     return [part for one in inner for part in _parts(one)] if inner else [hint]
+
+
+def _axes(hint: Any) -> float:
+    """Return how many axes arrays of this type have at most, -1 for None and modules, which tell of their own."""
+    if hint is type(None) or (isinstance(hint, type) and issubclass(hint, eqx.Module)):
+        return -1
+    return len(hint.dims) if getattr(hint, "index_variadic", 0) is None else np.inf
 
 
 def check_made_for(part: MadeForRobot, robot: Robot, what: str) -> None:

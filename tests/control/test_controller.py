@@ -6,6 +6,7 @@ import copy
 import gc
 import pickle
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -15,6 +16,7 @@ import pytest
 from compilations import Compilations
 from core_checks import needs_core
 from jax.core import Tracer
+from jaxtyping import Float
 from refusals import refuses
 
 import osik_jax as osik
@@ -249,6 +251,8 @@ def test_exchanged_parts_of_a_controller_are_seen(arm: osik.Robot) -> None:
         controller.scheme = scheme
         assert_same(controller.step(q), compiled(arm, q, tasks, scheme=scheme))
     controller = osik.Controller(arm, tasks, dt=DT)
+    controller.scheme = None  # pyright: ignore[reportAttributeAccessIssue]
+    assert_same(controller.step(q), compiled(arm, q, tasks))
     controller.scheme = osik.NullSpace()  # where none was given, too
     slow = (osik.VelocityLimit(arm, velocity={"*": 0.1}),)
     for limits in ((), slow, osik.no_limits):
@@ -318,6 +322,27 @@ def test_a_stack_without_vmap_is_named(arm: osik.Robot, part: str) -> None:
         refuses(ValueError, f"{part}.* is a stack", call, arm, **given)
     alone = jax.vmap(lambda own: osik.solve(arm, arm.q0, **{"tasks": tasks, part: own}).velocity)(stacks[part])
     assert len(alone) == (3 if part == "tasks" else 2)
+
+
+class Odd(osik.Task):
+    """A user's task whose annotations say little of how many axes its arrays have."""
+
+    net: Callable[[Float[jax.Array, " n"]], Float[jax.Array, " m"]]
+    both: tuple[Float[jax.Array, "3"], jax.Array]
+    stiff: Float[jax.Array, ""] | eqx.Module
+    unknown: Nothing  # noqa: F821  # pyright: ignore[reportUndefinedVariable]
+
+    def rows(self, robot: osik.Robot, kinematics: osik.Kinematics, q: jax.Array) -> osik.TaskRows:
+        jacobian = jax.numpy.eye(1, robot.nv)
+        return osik.TaskRows.of(self.net(q[:3])[:1], jacobian, gain=self.gain, weight=jax.numpy.ones(1))
+
+
+def test_annotations_of_ones_own_task_may_say_anything(arm: osik.Robot) -> None:
+    net = eqx.nn.Linear(3, 2, key=jax.random.key(0))
+    odd = Odd(net, jax.device_put((np.zeros(3), np.zeros((4, 4)))), net, None)
+    assert int(osik.solve(arm, arm.q0, {"odd": odd, "posture": osik.PostureTask(arm)}).status) == 0
+    stack = jax.vmap(lambda gain: odd.replace(gain=gain))(np.ones(2))
+    refuses(ValueError, "tasks.* is a stack.*gain", osik.solve, arm, arm.q0, {"odd": stack})
 
 
 def test_few_steps_are_kept(arm: osik.Robot, monkeypatch: pytest.MonkeyPatch) -> None:

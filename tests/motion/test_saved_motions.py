@@ -80,8 +80,9 @@ def test_what_is_no_motion_is_refused(tmp_path, text, message) -> None:
     refuses(osik.OsikError, message, load_motion, tmp_path / "motion.csv")
 
 
-def test_marks_and_blank_lines_of_spreadsheets_are_read_over(tmp_path) -> None:
-    (tmp_path / "motion.csv").write_text("\ufefftime,position.a\n0,1\n1,2\n\n", encoding="utf-8")
+def test_marks_blank_lines_and_other_columns_of_spreadsheets_are_read_over(tmp_path) -> None:
+    text = "\ufefftime,note,position.a,note,effort.a\n0,here,1,,nan\n1,there,2,,\n,,,\n\n"
+    (tmp_path / "motion.csv").write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(load_motion(tmp_path / "motion.csv").position, [[1.0], [2.0]])
 
 

@@ -26,8 +26,8 @@ typedef enum {
   OSIK_SOLVED = 0,
   OSIK_MAX_ITERATIONS = 1, /* no optimum was found; the velocity is inside the limits and no worse than standing still */
   OSIK_INFEASIBLE = 2,     /* two limits contradict each other at this configuration */
-  OSIK_NUMERICAL_ERROR = 3 /* q or a target is not finite, a quaternion is 0, or a matrix no rotation; the velocity is 0,
-                              or the nearest one inside the limits */
+  OSIK_NUMERICAL_ERROR = 3 /* q or a target is not finite, a quaternion or a direction is 0, or a matrix no rotation; the
+                              velocity is 0, or the nearest one inside the limits */
 } osik_status;
 
 /* Vectors with named entries. */
@@ -57,7 +57,7 @@ OSIK_API double osik_period(const osik_controller* controller);
  * q: configuration.
  * targets: of all tasks; NULL for those of the file. A pose is a position [m], "NAME.target[0]", and a rotation matrix
  *   by rows, "NAME.target[1]" (9 entries; rounded ones become the nearest rotation). A centre of mass is "NAME.target"
- *   [m]. A posture is a configuration, "NAME.target".
+ *   [m], a point to look at too; a direction has any length but 0. A posture is a configuration, "NAME.target".
  * velocity: the result, finite whatever the status. */
 OSIK_API osik_status osik_step(osik_controller* controller, const double* q, const double* targets, double* velocity);
 
