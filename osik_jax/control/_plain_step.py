@@ -329,7 +329,7 @@ class PlainStep(Checked):
         self._own, self._own_robot, self._setting = own, robot, (robot, *given)
         return True
 
-    def _takes_scheme(self, scheme: Scheme) -> bool:
+    def _takes_scheme(self, scheme: Any) -> bool:
         """Copy the numbers of a scheme; return whether it has the structure that was laid out."""
         leaves, structure = jax.tree.flatten(scheme)
         self._scheme = _UNKNOWN

@@ -59,7 +59,7 @@ def _rates_of(tree: KinematicTree, kinematics: Kinematics, dofs: Int[np.ndarray,
     )
 
 
-def _cross(angular: Float[Array, "n 3"], vectors: Float[Array, "k 3 *m n"]) -> Float[Array, "k 3 *m n"]:
+def _cross(angular: Float[Array, "n 3"], vectors: Float[Array, "k 3 *m #n"]) -> Float[Array, "k 3 *m n"]:
     """Return w x r for each dof.
 
     Its entries are chosen, not stacked: what XLA stacks it computes for all bodies.

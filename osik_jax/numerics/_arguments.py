@@ -52,7 +52,7 @@ def check_not_nan(value: Array, what: str) -> None:
         raise OsikValueError(f"{what} is {seen}; it has to be numbers, not NaN")
 
 
-def check_finite(value: Array, what: str) -> None:
+def check_finite(value: Any, what: str) -> None:
     """Raise ValueError unless a value is finite; traced values are not checked."""
     seen = concrete(value)
     if seen is not None and not np.isfinite(seen).all():
