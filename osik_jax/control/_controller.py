@@ -75,8 +75,8 @@ class Controller:
         self.limits: tuple[Limit, ...] = checked_limits(robot, limits) or ()
         self._velocity: Any = None
         self._started = False
-        self._chosen: Scheme | None = scheme_for(tasks, robot.q0.dtype) if scheme is None else None
-        self.scheme: Scheme = self._chosen or scheme  # pyright: ignore[reportAttributeAccessIssue]  # one is given
+        self.scheme = scheme_for(tasks, robot.q0.dtype) if scheme is None else scheme
+        self._chosen = self.scheme if scheme is None else None  # replaced where tasks want another one
         self._lay_out()
 
     def __iter__(self) -> Iterator[Any]:

@@ -24,6 +24,12 @@ template <class Real> OSIK_FN Vec3<Real> cross(Vec3<Real> a, Vec3<Real> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
+// The largest absolute entry.
+template <class Real> OSIK_FN Real largest_entry(Vec3<Real> v) {
+  const Real x = fabs(v.x), y = fabs(v.y), z = fabs(v.z), most = select(y > x, y, x);
+  return select(z > most, z, most);
+}
+
 template <class Real> struct Mat3 {
   using V = Vec3<Real>;
   V a, b, c;  // rows

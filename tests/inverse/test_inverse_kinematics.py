@@ -391,7 +391,7 @@ def test_one_target_of_tasks_is_one_answer(arm):
 
 
 def test_a_list_of_two_is_a_batch_of_two(arm):
-    """Of matrices or positions; a tuple of two is a position and a rotation."""
+    """Two matrices, or two positions, in a list are two targets; in a tuple they are a position and a rotation."""
     for one in (np.eye(4), np.array([0.4, 0.1, 0.4])):
         (found, rows, count), wanted = (
             read_poses(arm, {"hand": given}) for given in ([one, one], np.stack([one, one]))

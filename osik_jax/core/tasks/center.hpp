@@ -45,7 +45,7 @@ void center_rows(const CenterGoal<In, Own>& goal, From point, const Columns& col
                                      : along(i, xx, yy, zz);
     to.squares[i] = select(length < Real(0), Real(0), length);  // which roundoff may make it
   }
-  // times the Frobenius norm of the columns of dofs that turn something
+  // the length of the weighted pulls times the Frobenius norm of the columns of dofs that turn something
   to.curvature[0] = pull_length(goal.weight, to.pull, goal.m) * sqrt(turning);
 }
 

@@ -6,8 +6,7 @@ namespace osik {
 
 // A vector over its length, without overflow of squares; 0 stays 0.
 template <class Real> Vec3<Real> unit(Vec3<Real> v) {
-  Real size = fabs(v.x);
-  size = select(fabs(v.y) > size, fabs(v.y), size), size = select(fabs(v.z) > size, fabs(v.z), size);
+  const Real size = largest_entry(v);
   v = select((size > Real(0)) & (size < Real(INFINITE)), Real(1) / size, Real(1)) * v;
   const Real length = sqrt(inner(v, v));
   return select(length > Real(0), Real(1) / length, Real(1)) * v;

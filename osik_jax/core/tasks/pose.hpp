@@ -25,8 +25,7 @@ template <class Real> struct Products {
 // The Frobenius norm of the matrix with entries pull . (axis_i x arm_j), from the products of axes and of arms.
 template <class Real> Real paired(Vec3<Real> pull, const Products<Real>& of_axes, const Products<Real>& of_arms) {
   const Real *axes = of_axes.sums, *arms = of_arms.sums;
-  Real size = fabs(pull.x);
-  size = select(fabs(pull.y) > size, fabs(pull.y), size), size = select(fabs(pull.z) > size, fabs(pull.z), size);
+  const Real size = largest_entry(pull);
   const auto pulls = size > Real(0);
   if (!any(pulls)) return 0;
   const Vec3<Real> unit = Real(1) / size * pull;
